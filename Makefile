@@ -28,7 +28,7 @@ demo: $(VENV)/.ready
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy coordinator services sim tests
+	$(BIN)/mypy -p petrobot -p tests
 
 test: lint
 	$(BIN)/pytest -n 2 -rs -m "not proof"

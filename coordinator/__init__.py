@@ -1,1 +1,7 @@
 """The coordinator: runs the task's net, verifies it and forecasts it."""
+
+if not __name__.startswith("petrobot."):
+    # Found as a folder on the path: its classes would exist twice, and the two would not be equal.
+    raise ModuleNotFoundError(
+        f"{__name__} is a part of petrobot: import petrobot.{__name__}", name=__name__
+    )

@@ -1,7 +1,7 @@
-"""`python -m coordinator` is the `petrobot` command."""
+"""`python -m petrobot.coordinator` is the `petrobot` command."""
 
 import sys
 
-from coordinator.cli import main
+from petrobot.coordinator.cli import main
 
 sys.exit(main())

@@ -1,11 +1,13 @@
-"""Long work on task files and journals, in a process of its own: `python -m coordinator.analysing` reads orders.
+"""Long work on task files and journals, in a process of its own: `python -m
+petrobot.coordinator.analysing` reads orders.
 
-A process below all others in priority and with a hard end: nothing that is asked of a drawing takes time from a mission that
-is running. A thread would: it shares the interpreter with the mission, and then each turn of the loop waits for it.
-Ends are counted in processor time, so that what is said of a drawing does not depend on what else the machine does.
+A process below all others in priority and with a hard end: nothing that is asked of a drawing takes
+time from a mission that is running. A thread would: it shares the interpreter with the mission, and
+then each turn of the loop waits for it. Ends are counted in processor time, so that what is said of
+a drawing does not depend on what else the machine does.
 
-An order is a line of JSON, {work, given}. The answers are lines of JSON text: any number of results, each fuller than the one
-before, or one refusal behind `!`; an empty line ends them.
+An order is a line of JSON, {work, given}. The answers are lines of JSON text: any number of
+results, each fuller than the one before, or one refusal behind `!`; an empty line ends them.
 """
 
 from __future__ import annotations
@@ -20,12 +22,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from services.comm.json_text import json_text
+from petrobot.services.comm.json_text import json_text
 
 STATES, SECONDS, MEMORY = 50_000, 4.0, 256 << 20
 """What one state space may take: markings, seconds of processor time, bytes."""
 HARD_END = 8
-"""Seconds of processor time after which the kernel kills an analysis, whatever it does; what it has said by then counts."""
+"""Seconds of processor time after which the kernel kills an analysis, whatever it does; what it has
+said by then counts."""
 LONGEST = 100
 """The same for all other work: opening a long journal takes a while."""
 PATIENCE = 120.0
@@ -50,7 +53,8 @@ WORDS = {
 
 
 class RefusedError(ValueError):
-    """The work cannot be done, and why; `status` is the HTTP status to answer with, `more` further parts of the answer."""
+    """The work cannot be done, and why; `status` is the HTTP status to answer with, `more` further
+    parts of the answer."""
 
     def __init__(self, status: int, text: str, more: Mapping[str, Any] | None = None) -> None:
         super().__init__(text)
@@ -66,7 +70,8 @@ class Superseded(RefusedError):  # noqa: N818 - no fault: whoever asked has draw
 
 
 class Apart:
-    """One process for long work, started with the first order; one order at a time, the others wait their turn."""
+    """One process for long work, started with the first order; one order at a time, the others wait
+    their turn."""
 
     def __init__(self) -> None:
         self._turn = asyncio.Lock()
@@ -83,7 +88,8 @@ class Apart:
     async def do(self, work: str, given: Mapping[str, Any], desk: str = "") -> bytes:
         """The answer as JSON text, the fullest that there was in time. Raises RefusedError.
 
-        An order of the same `desk` that came before is given up at once: only the newest drawing on a desk matters.
+        An order of the same `desk` that came before is given up at once: only the newest drawing on
+        a desk matters.
         """
         order = object()
         if desk:
@@ -130,11 +136,12 @@ class Apart:
         process = self._process
         if process is None or process.returncode is not None:
             process = self._process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "coordinator.analysing"),
+                *(sys.executable, "-m", "petrobot.coordinator.analysing"),
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=LONGEST_LINE,
-                start_new_session=True,  # Ctrl-C is for the coordinator, which ends it in good order
+                # Ctrl-C is for the coordinator, which ends it in good order
+                start_new_session=True,
             )
         assert process.stdin is not None and process.stdout is not None
         newest, ended = b"", False
@@ -146,7 +153,9 @@ class Apart:
                         if line == b"\n":
                             ended = True
                             break
-                        if not (newest and line.startswith(b"!")):  # what was found before it failed counts
+                        if not (
+                            newest and line.startswith(b"!")
+                        ):  # what was found before it failed counts
                             newest = line.rstrip(b"\n")
         finally:
             self._current = None
@@ -157,24 +166,28 @@ class Apart:
 
 
 async def analyse_apart(text: str, filename: str) -> dict[str, Any]:
-    """What `analysed` says, from a process of its own; without the forecast if that takes too long. Raises ValueError."""
+    """What `analysed` says, from a process of its own; without the forecast if that takes too long.
+    Raises ValueError."""
     apart = Apart()
     try:
-        answer: dict[str, Any] = json.loads(await apart.do("analysis", {"text": text, "filename": filename}))
+        answer: dict[str, Any] = json.loads(
+            await apart.do("analysis", {"text": text, "filename": filename})
+        )
     finally:
         await apart.close()
     return answer
 
 
 def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]:
-    """{complete, markings, verdicts, notes, heat}; a verdict is {name, words, holds, reason, assumption, witness}.
+    """{complete, markings, verdicts, notes, heat}; a verdict is {name, words, holds, reason,
+    assumption, witness}.
 
-    With the view `gspn` there is also the forecast: `heat` is the share of the time that each action place takes.
-    Raises TaskFileError.
+    With the view `gspn` there is also the forecast: `heat` is the share of the time that each
+    action place takes. Raises TaskFileError.
     """
-    from coordinator.analysis.report import analyse, heat
-    from coordinator.analysis.space import Limits
-    from coordinator.taskfile import loads
+    from petrobot.coordinator.analysis.report import analyse, heat
+    from petrobot.coordinator.analysis.space import Limits
+    from petrobot.coordinator.taskfile import loads
 
     limits = Limits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
     analysis = analyse(loads(text, filename), view=view, limits=limits)
@@ -187,7 +200,9 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
     for recovery in analysis.robot.recoveries if analysis.robot else ():
         verdict = recovery.possible
         words = f"A way back after {recovery.error_exit}"
-        verdicts.append({"name": f"recovery {recovery.error_exit}", "words": words, **verdict.to_json()})
+        verdicts.append(
+            {"name": f"recovery {recovery.error_exit}", "words": words, **verdict.to_json()}
+        )
     order = {False: 0, None: 1, True: 2}
     verdicts.sort(key=lambda verdict: order[verdict["holds"]])
     return {
@@ -206,21 +221,23 @@ def _analysis(text: str, filename: str) -> Iterator[dict[str, Any]]:
 
 
 def work_of(name: str) -> Callable[..., Any]:
-    """What carries out an order: it takes what is given by name, and returns JSON data or an iterator of such.
+    """What carries out an order: it takes what is given by name, and returns JSON data or an
+    iterator of such.
 
-    Only the room that is needed is imported: all of them would take most of a second. Raises KeyError.
+    Only the room that is needed is imported: all of them would take most of a second. Raises
+    KeyError.
     """
     if name == "analysis":
         return _analysis
     if name == "form":
-        from coordinator.operator import start_order
+        from petrobot.coordinator.operator import start_order
 
         return start_order.WORKS[name]
     if name in ("run", "runs"):
-        from coordinator.hmi import journals
+        from petrobot.coordinator.hmi import journals
 
         return journals.WORKS[name]
-    from coordinator.hmi import verdicts
+    from petrobot.coordinator.hmi import verdicts
 
     return verdicts.WORKS[name]
 
@@ -244,7 +261,9 @@ def _limit(seconds: int) -> None:
     """From now on the process may take so much processor time."""
     spent = resource.getrusage(resource.RUSAGE_SELF)
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    resource.setrlimit(resource.RLIMIT_CPU, (int(spent.ru_utime + spent.ru_stime) + 1 + seconds, hard))
+    resource.setrlimit(
+        resource.RLIMIT_CPU, (int(spent.ru_utime + spent.ru_stime) + 1 + seconds, hard)
+    )
 
 
 def _said(order: Mapping[str, Any]) -> Iterator[str]:
@@ -253,14 +272,22 @@ def _said(order: Mapping[str, Any]) -> Iterator[str]:
         for value in result if isinstance(result, Iterator) else (result,):
             yield json_text(value)
     except RefusedError as refusal:
-        yield "!" + json_text({"status": refusal.status, "text": str(refusal), "more": refusal.more})
+        yield "!" + json_text(
+            {"status": refusal.status, "text": str(refusal), "more": refusal.more}
+        )
     except (ValueError, ArithmeticError) as fault:
         yield "!" + json_text({"status": 422, "text": str(fault)})
-    except Exception as fault:  # of the work, not of this process: the next order is carried out again
-        yield "!" + json_text({"status": 500, "text": f"{order['work']} failed: {type(fault).__name__}: {fault}"})
+    except (
+        Exception
+    ) as fault:  # of the work, not of this process: the next order is carried out again
+        yield "!" + json_text(
+            {"status": 500, "text": f"{order['work']} failed: {type(fault).__name__}: {fault}"}
+        )
 
 
 if __name__ == "__main__":
-    from coordinator import analysing  # the module that all work imports; this one is a second copy of it
+    from petrobot.coordinator import (
+        analysing,  # the module that all work imports; this one is a second copy of it
+    )
 
     sys.exit(analysing.main())

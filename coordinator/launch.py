@@ -1,4 +1,5 @@
-"""The composition root: puts coordinator, nodes and laboratory together. The rooms are loaded by import path."""
+"""The composition root: puts coordinator, nodes and laboratory together. The rooms are loaded by
+import path."""
 
 from __future__ import annotations
 
@@ -11,33 +12,48 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Engine, Point
-from coordinator.mission.executor import Executor
-from coordinator.mission.lockstep_party import NAME, CoordinatorParty
-from coordinator.mission.mission import Mission
-from coordinator.mission.partners import FirstAlternative, Forgetful, Observer, Selector, Store
-from coordinator.record.journal import Journal, JournalWriter
-from coordinator.record.recording import EPOCH, JournalStore, as_recorded, last_epoch, origin_of, replay, stages
-from coordinator.supervisor import Program, is_local
-from coordinator.task import Task
-from services.comm.caller import Caller
-from services.comm.cell import Cell, Delays
-from services.comm.directory import Directory, NodeEntry
-from services.comm.lockstep import Member
-from services.comm.lockstep_process import cell_key
-from services.comm.messages import Hello
-from services.comm.party import Party
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.coordinator.engine import Engine, Point
+from petrobot.coordinator.mission.executor import Executor
+from petrobot.coordinator.mission.lockstep_party import NAME, CoordinatorParty
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.partners import (
+    FirstAlternative,
+    Forgetful,
+    Observer,
+    Selector,
+    Store,
+)
+from petrobot.coordinator.record.journal import Journal, JournalWriter
+from petrobot.coordinator.record.recording import (
+    EPOCH,
+    JournalStore,
+    as_recorded,
+    last_epoch,
+    origin_of,
+    replay,
+    stages,
+)
+from petrobot.coordinator.supervisor import Program, is_local
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.cell import Cell, Delays
+from petrobot.services.comm.directory import Directory, NodeEntry, module_name
+from petrobot.services.comm.lockstep import Member
+from petrobot.services.comm.lockstep_process import cell_key
+from petrobot.services.comm.messages import Hello
+from petrobot.services.comm.party import Party
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 
-NODE_PARTY = "services.lockstep_node:LockstepNode"
-SCRIPTED = "services.scripted:load"
+NODE_PARTY = "petrobot.services.lockstep_node:LockstepNode"
+SCRIPTED = "petrobot.services.scripted:load"
 
 Substitutes = Mapping[str, Callable[..., Any]]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a mission run is given: the task with its parameters, runs and seed, and who selects actions."""
+    """What a mission run is given: the task with its parameters, runs and seed, and who selects
+    actions."""
 
     task: Task
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -49,30 +65,48 @@ class Setting:
 
 
 def load_object(path: str) -> Any:
-    """The object at an import path "module:name"."""
+    """The object at an import path "module:name". Raises ImportError, AttributeError."""
     module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
+    return getattr(importlib.import_module(module_name(module)), name)
 
 
 def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:
-    """The task with so many tokens in its runs place (None: as many as the file says); gives that number too."""
+    """The task with so many tokens in its runs place (None: as many as the file says); gives that
+    number too."""
     place = task.places.get(task.runs_place) if task.runs_place else None
     if place is None:
         return task, 1
     runs = place.tokens if runs is None else runs
     capacity = None if place.capacity is None else max(place.capacity, runs)
-    return replace(task, places={**task.places, place.name: replace(place, tokens=runs, capacity=capacity)}), runs
+    return replace(
+        task, places={**task.places, place.name: replace(place, tokens=runs, capacity=capacity)}
+    ), runs
 
 
 def make_mission(
-    directory: Directory, setting: Setting, mission: str, boot: str, store: Store | None = None, name: str = NAME
+    directory: Directory,
+    setting: Setting,
+    mission: str,
+    boot: str,
+    store: Store | None = None,
+    name: str = NAME,
 ) -> Mission:
-    """A mission run with a caller for each node of the directory; `name` is how its coordinator is known to them."""
+    """A mission run with a caller for each node of the directory; `name` is how its coordinator is
+    known to them."""
     task, runs = with_runs(setting.task, setting.runs)
     callers = make_callers(directory, boot, 1, name)
     devices = {a.name: a.device for a in directory.actions.values() if a.device}
     engine = Engine(task, devices)
-    executor = Executor(task, engine, directory, callers, mission, setting.seed, setting.selector, store or Forgetful())
+    executor = Executor(
+        task,
+        engine,
+        directory,
+        callers,
+        mission,
+        setting.seed,
+        setting.selector,
+        store or Forgetful(),
+    )
     if isinstance(setting.selector, Observer):
         executor.observers.append(setting.selector)
     made = Mission(executor, {**task.parameters, **setting.parameters}, runs)
@@ -80,17 +114,20 @@ def make_mission(
     return made
 
 
-def make_callers(directory: Directory, boot: str, epoch: int, name: str = NAME) -> dict[str, Caller]:
+def make_callers(
+    directory: Directory, boot: str, epoch: int, name: str = NAME
+) -> dict[str, Caller]:
     """A caller for each node, all introduced as the coordinator of this name in this epoch."""
     hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", name, boot, epoch, directory.hash)
     return {node: Caller(node, hello) for node in directory.nodes}
 
 
-# --- lock step ---------------------------------------------------------------------------------------------------------
+# --- lock step --------------------------------------------------------------------------------
 
 
 def lockstep_id(setting: Setting) -> str:
-    """The id of a mission run in lock step: it depends on task and seed alone, so that the same seed gives the same run."""
+    """The id of a mission run in lock step: it depends on task and seed alone, so that the same
+    seed gives the same run."""
     return f"{setting.task.name}/{setting.seed}"
 
 
@@ -99,7 +136,9 @@ def lockstep_mission(directory: Directory, setting: Setting, store: Store | None
     return make_mission(directory, setting, lockstep_id(setting), "lock step", store)
 
 
-def lockstep_party(directory: Directory, node: NodeEntry, substitutes: Substitutes | None = None) -> Party:
+def lockstep_party(
+    directory: Directory, node: NodeEntry, substitutes: Substitutes | None = None
+) -> Party:
     """The party of a node: a laboratory's own, or a node with its drivers and actions inline."""
     if node.sim:
         party: Party = load_object(node.sim)(directory, node.name)
@@ -130,27 +169,40 @@ def lockstep_member(
 ) -> tuple[Member, CoordinatorParty]:
     """The coordinator's process of a cell in which each node has a process of its own.
 
-    With `begin` it joins a cell that goes on, in place of a coordinator that died, and begins by that.
+    With `begin` it joins a cell that goes on, in place of a coordinator that died, and begins by
+    that.
     """
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching, begin)
     delays, key = Delays(directory.delays()), cell_key(directory)
     addresses, rejoins = directory.members(), begin is not None
-    member = Member(NAME, [coordinator], addresses, delays=delays, directory=directory.hash, key=key, rejoins=rejoins)
+    member = Member(
+        NAME,
+        [coordinator],
+        addresses,
+        delays=delays,
+        directory=directory.hash,
+        key=key,
+        rejoins=rejoins,
+    )
     return member, coordinator
 
 
-# --- real time ---------------------------------------------------------------------------------------------------------
+# --- real time --------------------------------------------------------------------------------
 
 
 def mission_id(task: Task) -> str:
-    """An id of its own for a mission run: nodes never take its calls for those of an earlier one."""
+    """An id of its own for a mission run: nodes never take its calls for those of an earlier
+    one."""
     return f"{task.name}-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
 
 
-def realtime_mission(directory: Directory, setting: Setting, mission: str, store: Store | None = None) -> Mission:
-    """A mission run on the wall clock. Its coordinator goes by the mission's own id: so its epochs count resumes of this run
-    alone, what nodes keep for it is never taken for another's, and a second coordinator is another holder of leases."""
+def realtime_mission(
+    directory: Directory, setting: Setting, mission: str, store: Store | None = None
+) -> Mission:
+    """A mission run on the wall clock. Its coordinator goes by the mission's own id: so its epochs
+    count resumes of this run alone, what nodes keep for it is never taken for another's, and a
+    second coordinator is another holder of leases."""
     return make_mission(directory, setting, mission, secrets.token_hex(8), store, name=mission)
 
 
@@ -165,8 +217,8 @@ def resumed_mission(
 ) -> tuple[Mission, Callable[[float], None]]:
     """A mission run as its journal left it, and what makes it go on once the nodes are there.
 
-    A selector that learns has to be among the observers too: the recorded steps bring it to where it was.
-    Raises ReplayError when the engine does not derive what the journal says.
+    A selector that learns has to be among the observers too: the recorded steps bring it to where
+    it was. Raises ReplayError when the engine does not derive what the journal says.
     """
     header = journal.header
     engine = as_recorded(engine, header)
@@ -183,8 +235,13 @@ def resumed_mission(
     origin = origin_of(header, now, steps[-1].time if steps else 0.0)
     name = NAME if header["mode"] == "lockstep" else header["mission"]
     callers = make_callers(directory, secrets.token_hex(8), epoch, name)
-    store, chosen = JournalStore(writer, origin, durable=header.get("durable", False)), selector or FirstAlternative()
-    executor = Executor(task, engine, directory, callers, header["mission"], header["seed"], chosen, store)
+    store, chosen = (
+        JournalStore(writer, origin, durable=header.get("durable", False)),
+        selector or FirstAlternative(),
+    )
+    executor = Executor(
+        task, engine, directory, callers, header["mission"], header["seed"], chosen, store
+    )
     mission = Mission(executor, header["parameters"], header["runs"])
     executor.observers.extend(observers)
     for step in steps:
@@ -199,13 +256,17 @@ def local_programs(
 
     In lock step they wait `awaited` seconds (wall time) for a coordinator that died.
     """
-    local = sorted((n for n in directory.nodes.values() if is_local(n.host)), key=lambda node: not node.sim)
+    local = sorted(
+        (n for n in directory.nodes.values() if is_local(n.host)), key=lambda node: not node.sim
+    )
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
     scripted = ["--mock", str(mock)] if mock else []
     return [
-        Program(node.name, [sys.executable, "-m", "sim", *options], first=True)
+        Program(node.name, [sys.executable, "-m", "petrobot.sim", *options], first=True)
         if node.sim
-        else Program(node.name, [sys.executable, "-m", "services", node.name, *options, *scripted])
+        else Program(
+            node.name, [sys.executable, "-m", "petrobot.services", node.name, *options, *scripted]
+        )
         for node in local
     ]

@@ -1,4 +1,5 @@
-"""An ordinary Petri net with weighted and inhibitor arcs: places, transitions, marking, enabled, fire."""
+"""An ordinary Petri net with weighted and inhibitor arcs: places, transitions, marking, enabled,
+fire."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ Marking = tuple[int, ...]
 """Tokens by place, in place order."""
 
 Arcs = tuple[tuple[int, int], ...]
-"""Pairs (place index, weight), sorted by place, weights >= 1; for inhibitors the weight is the threshold."""
+"""Pairs (place index, weight), sorted by place, weights >= 1; for inhibitors the weight is the
+threshold."""
 
 
 class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers may ask for
@@ -20,9 +22,10 @@ class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers
 class Net:
     """An immutable net (P, T, Pre, Post, Inhibit, M0, capacities, priorities).
 
-    `consume[t]`, `produce[t]`, `inhibit[t]` are the arcs of transition t. A transition is enabled in M when
-    M(p) >= w for every consumed (p, w), M(p) < k for every inhibitor (p, k), no capacity would be exceeded, and no
-    transition of higher `priority` is enabled (ISO/IEC 15909-1 for the firing rule; priorities as in GSPN).
+    `consume[t]`, `produce[t]`, `inhibit[t]` are the arcs of transition t. A transition is enabled
+    in M when M(p) >= w for every consumed (p, w), M(p) < k for every inhibitor (p, k), no capacity
+    would be exceeded, and no transition of higher `priority` is enabled (ISO/IEC 15909-1 for the
+    firing rule; priorities as in GSPN).
     """
 
     places: tuple[str, ...]
@@ -45,11 +48,21 @@ class Net:
         n, m = len(self.places), len(self.transitions)
         if not len(self.initial) == len(self.capacity) == n:
             raise ValueError("initial marking and capacities need one entry for each place")
-        if not len(self.consume) == len(self.produce) == len(self.inhibit) == len(self.priority) == m:
+        if (
+            not len(self.consume)
+            == len(self.produce)
+            == len(self.inhibit)
+            == len(self.priority)
+            == m
+        ):
             raise ValueError("arcs and priorities need one entry for each transition")
         for arcs in (*self.consume, *self.produce, *self.inhibit):
-            if any(not 0 <= p < n or w < 1 for p, w in arcs) or len({p for p, _ in arcs}) != len(arcs):
-                raise ValueError("an arc names an unknown place, names it twice or has a weight below 1")
+            if any(not 0 <= p < n or w < 1 for p, w in arcs) or len({p for p, _ in arcs}) != len(
+                arcs
+            ):
+                raise ValueError(
+                    "an arc names an unknown place, names it twice or has a weight below 1"
+                )
         object.__setattr__(self, "place_index", {p: i for i, p in enumerate(self.places)})
         object.__setattr__(self, "transition_index", {t: i for i, t in enumerate(self.transitions)})
 
@@ -63,7 +76,8 @@ class Net:
         capacity: Mapping[str, int] | None = None,
         priority: Mapping[str, int] | None = None,
     ) -> Net:
-        """A net from names: initial tokens by place, and (consumed, produced) weights by place for each transition."""
+        """A net from names: initial tokens by place, and (consumed, produced) weights by place for
+        each transition."""
         index = {p: i for i, p in enumerate(places)}
         inhibitors, capacity, priority = inhibitors or {}, capacity or {}, priority or {}
 
@@ -86,7 +100,9 @@ class Net:
 
     def has_concession(self, marking: Marking, t: int) -> bool:
         """Whether tokens, inhibitors and capacities allow transition t, priorities aside."""
-        if any(marking[p] < w for p, w in self.consume[t]) or any(marking[p] >= k for p, k in self.inhibit[t]):
+        if any(marking[p] < w for p, w in self.consume[t]) or any(
+            marking[p] >= k for p, k in self.inhibit[t]
+        ):
             return False
         return not any(
             limit is not None and marking[p] + w - self._weight(self.consume[t], p) > limit
@@ -119,7 +135,8 @@ class Net:
         return tuple(after)
 
     def replay(self, firings: Iterable[str], marking: Marking | None = None) -> Iterator[Marking]:
-        """The markings along a firing sequence of transition names, starting with the given or initial one."""
+        """The markings along a firing sequence of transition names, starting with the given or
+        initial one."""
         current = self.initial if marking is None else marking
         yield current
         for name in firings:
@@ -129,7 +146,10 @@ class Net:
     def describe(self, marking: Marking) -> str:
         """The marking for people: marked places with their tokens."""
         return (
-            " ".join(f"{p}:{n}" if n != 1 else p for p, n in zip(self.places, marking, strict=True) if n) or "(empty)"
+            " ".join(
+                f"{p}:{n}" if n != 1 else p for p, n in zip(self.places, marking, strict=True) if n
+            )
+            or "(empty)"
         )
 
     @staticmethod

@@ -1,4 +1,5 @@
-"""Launches the node processes of this host, watches them, and starts dead ones again with a growing pause."""
+"""Launches the node processes of this host, watches them, and starts dead ones again with a growing
+pause."""
 
 from __future__ import annotations
 
@@ -15,12 +16,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from services.comm.whole_file import make_folder
+from petrobot.services.comm.whole_file import make_folder
 
 PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
 FIRST_PAUSE = 0.25
 LONGEST_PAUSE = 8.0
-LAST_WORDS = 0.5  # for the rest of what an ended program has said (s); what it has left running may never stop talking
+# for the rest of what an ended program has said (s); what it has left running may never stop
+# talking
+LAST_WORDS = 0.5
 STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
 
 
@@ -67,14 +70,16 @@ _LIBC = ctypes.CDLL(None)
 
 
 def _end_with(launcher: int) -> None:
-    """In the child, before it becomes the program: a launcher that ended meanwhile would send no signal any more."""
+    """In the child, before it becomes the program: a launcher that ended meanwhile would send no
+    signal any more."""
     _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != launcher:
         os._exit(0)
 
 
 class Supervisor:
-    """Keeps programs alive. Each writes to its own log and says `ready` in the first line that it prints."""
+    """Keeps programs alive. Each writes to its own log and says `ready` in the first line that it
+    prints."""
 
     def __init__(
         self,
@@ -109,7 +114,9 @@ class Supervisor:
         for first in (True, False):
             group = [child for child in self._children if child.program.first is first]
             for child in group:
-                child.task = asyncio.create_task(self._keep(child), name=f"keep {child.program.name}")
+                child.task = asyncio.create_task(
+                    self._keep(child), name=f"keep {child.program.name}"
+                )
             for child in group:
                 await self._until_ready(child, timeout)
 
@@ -134,7 +141,11 @@ class Supervisor:
 
     def process_ids(self) -> dict[str, int]:
         """Process id of each running program by name."""
-        return {c.program.name: c.process.pid for c in self._children if c.process and c.process.returncode is None}
+        return {
+            c.program.name: c.process.pid
+            for c in self._children
+            if c.process and c.process.returncode is None
+        }
 
     def starts(self, name: str) -> int:
         """How often a program has been started."""
@@ -143,7 +154,9 @@ class Supervisor:
     async def _until_ready(self, child: _Child, timeout: float) -> None:
         ready = asyncio.create_task(child.ready.wait())
         assert child.task is not None
-        done, _ = await asyncio.wait({ready, child.task}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+        done, _ = await asyncio.wait(
+            {ready, child.task}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED
+        )
         if ready in done:
             return
         ready.cancel()
@@ -152,7 +165,9 @@ class Supervisor:
         said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
         tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
         why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
-        raise LaunchError(f"node {child.program.name} {why}; its log {child.log} ends with:\n{tail}")
+        raise LaunchError(
+            f"node {child.program.name} {why}; its log {child.log} ends with:\n{tail}"
+        )
 
     async def _keep(self, child: _Child) -> None:
         loop, pause = asyncio.get_running_loop(), FIRST_PAUSE
@@ -161,7 +176,11 @@ class Supervisor:
             await self._run_once(child)
             if self._stopping or not self._respawn or not child.ready.is_set():
                 return
-            pause = FIRST_PAUSE if loop.time() - started > STABLE_AFTER else min(2 * pause, LONGEST_PAUSE)
+            pause = (
+                FIRST_PAUSE
+                if loop.time() - started > STABLE_AFTER
+                else min(2 * pause, LONGEST_PAUSE)
+            )
             self._notice(f"node {child.program.name} died; starting it again in {pause:g} s")
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
@@ -193,10 +212,11 @@ class Supervisor:
 
 @asynccontextmanager
 async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asyncio.StreamReader]]:
-    """A pipe for the output of a child: the end to pass to it, to be closed once it is started, and what comes out.
+    """A pipe for the output of a child: the end to pass to it, to be closed once it is started, and
+    what comes out.
 
-    A pipe of asyncio's own (`stdout=PIPE`) would be part of the process: `wait` would then wait for the end of the pipe, which
-    whatever the child has left running may hold open for ever.
+    A pipe of asyncio's own (`stdout=PIPE`) would be part of the process: `wait` would then wait for
+    the end of the pipe, which whatever the child has left running may hold open for ever.
     """
     reading, writing = os.pipe()
     reader = asyncio.StreamReader(limit)
@@ -214,14 +234,17 @@ async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asy
 async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
     """Write what a program prints to its log. It is ready when it says so.
 
-    A program is ended if its log cannot be written before it is ready; later it matters more than its log.
+    A program is ended if its log cannot be written before it is ready; later it matters more than
+    its log.
     """
     async for line in output:
         try:
             log.write(line)
         except OSError as fault:
             if not child.ready.is_set():
-                child.log_fault = child.log_fault or OSError(fault.errno, fault.strerror, str(child.log))
+                child.log_fault = child.log_fault or OSError(
+                    fault.errno, fault.strerror, str(child.log)
+                )
                 _signal(child, signal.SIGTERM)
         if b"ready" in line and child.log_fault is None:
             child.ready.set()

@@ -1,4 +1,5 @@
-"""Launches one node of services.toml on this host: `python -m services NAME [--services FILE] [--lockstep]`."""
+"""Launches one node of services.toml on this host: `python -m petrobot.services NAME [--services
+FILE] [--lockstep]`."""
 
 from __future__ import annotations
 
@@ -9,32 +10,41 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import Directory, DirectoryError, parse, read_text, verify_imports
-from services.comm.directory_file import nearest
-from services.comm.lockstep import CellError
-from services.comm.lockstep_process import run_member
-from services.comm.parentage import die_with, wanted_with_parent
-from services.comm.quantities import number
-from services.comm.security import KeyFileError, KeyNeededError
-from services.lockstep_node import LockstepNode
-from services.scripted import ScriptError
-from services.scripted import load as load_script
-from services.shell import serve
-from services.worker import log_to_stderr
+from petrobot.services.comm.directory import (
+    Directory,
+    DirectoryError,
+    parse,
+    read_text,
+    verify_imports,
+)
+from petrobot.services.comm.directory_file import nearest
+from petrobot.services.comm.lockstep import CellError
+from petrobot.services.comm.lockstep_process import run_member
+from petrobot.services.comm.parentage import die_with, wanted_with_parent
+from petrobot.services.comm.quantities import number
+from petrobot.services.comm.security import KeyFileError, KeyNeededError
+from petrobot.services.lockstep_node import LockstepNode
+from petrobot.services.scripted import ScriptError
+from petrobot.services.scripted import load as load_script
+from petrobot.services.shell import serve
+from petrobot.services.worker import log_to_stderr
 
-EXAMPLE = "example:\n  python -m services vision --services services.toml"
+EXAMPLE = "example:\n  python -m petrobot.services vision --services services.toml"
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = argparse.ArgumentParser(
-        prog="python -m services",
+        prog="python -m petrobot.services",
         description=__doc__,
-        epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or device, 3 the cell lost a party",
+        epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or device, "
+        "3 the cell lost a party",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands.add_argument("name", help="the node's name in services.toml")
-    commands.add_argument("--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file")
+    commands.add_argument(
+        "--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file"
+    )
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
     commands.add_argument(
         "--await-coordinator",
@@ -43,21 +53,33 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         help="lock step: wait so long for a coordinator that died and is resumed (s of wall time)",
     )
-    commands.add_argument("--mock", metavar="FILE", default="", help="replace the actions that this file scripts")
+    commands.add_argument(
+        "--mock", metavar="FILE", default="", help="replace the actions that this file scripts"
+    )
     return commands
 
 
 def read(path: Path, name: str) -> tuple[Directory, str]:
-    """The location file and its text. Raises DirectoryError when it is bad or this node cannot run here."""
+    """The location file and its text. Raises DirectoryError when it is bad or this node cannot run
+    here."""
     try:
         text = read_text(path)
     except OSError as fault:
-        raise DirectoryError((f"{path}: {fault.strerror}; name the file with --services",)) from fault
+        raise DirectoryError(
+            (f"{path}: {fault.strerror}; name the file with --services",)
+        ) from fault
     directory = parse(text, path)
     if name not in directory.nodes:
-        raise DirectoryError((f"{path}: no node is named {name!r}{nearest(name, directory.nodes)}",))
+        raise DirectoryError(
+            (f"{path}: no node is named {name!r}{nearest(name, directory.nodes)}",)
+        )
     if directory.nodes[name].sim:
-        raise DirectoryError((f"{path}: {name!r} is the simulated laboratory; launch it with python -m sim",))
+        raise DirectoryError(
+            (
+                f"{path}: {name!r} is the simulated laboratory; launch it with python -m "
+                "petrobot.sim",
+            )
+        )
     faults = verify_imports(directory, name)
     if faults:
         raise DirectoryError(faults)
@@ -82,10 +104,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             memory = directory.nodes[options.name].worker_memory_mb << 20
             asyncio.run(serve(directory, options.name, text, mock=options.mock, memory=memory))
     except (DirectoryError, ScriptError, KeyNeededError, KeyFileError, OSError) as fault:
-        print(f"python -m services {options.name}: {fault}", file=sys.stderr)
+        print(f"python -m petrobot.services {options.name}: {fault}", file=sys.stderr)
         return 2
     except CellError as fault:
-        print(f"python -m services {options.name}: {fault}", file=sys.stderr)
+        print(f"python -m petrobot.services {options.name}: {fault}", file=sys.stderr)
         return 3
     return 0
 

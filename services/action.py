@@ -1,8 +1,10 @@
-"""How a primitive action is written: status, result, and the context through which alone it touches the world.
+"""How a primitive action is written: status, result, and the context through which alone it touches
+the world.
 
-An action is a callable named by import path (`module:function`). Its first parameter is the context, all others are
-keyword parameters of plain data. `def` actions compute and return; `async def` actions may also wait, but only through
-their context, so the same code runs in a warm worker process on the wall clock and inline in a lock-step cell.
+An action is a callable named by import path (`module:function`). Its first parameter is the
+context, all others are keyword parameters of plain data. `def` actions compute and return; `async
+def` actions may also wait, but only through their context, so the same code runs in a warm worker
+process on the wall clock and inline in a lock-step cell.
 
     async def locate(ctx: Context, *, timeout: float = 5.0) -> Result:
         image = await ctx.device.read(timeout)
@@ -36,8 +38,8 @@ class Status(StrEnum):
 class Result:
     """What an action returns: its status, what it writes, and why when it is not SUCCESS.
 
-    `values` are plain data; the task file's `out` says which of them go to which variable. `cause` is a short code
-    that programs compare (`"ball_lost"`), `text` is for people.
+    `values` are plain data; the task file's `out` says which of them go to which variable. `cause`
+    is a short code that programs compare (`"ball_lost"`), `text` is for people.
     """
 
     status: Status
@@ -45,7 +47,8 @@ class Result:
     cause: str = ""
     text: str = ""
     deferred: bool = False
-    """The status is provisional: it routes the task now, and a later verdict may correct it once for the estimates."""
+    """The status is provisional: it routes the task now, and a later verdict may correct it once
+    for the estimates."""
 
 
 def success(**values: Any) -> Result:
@@ -64,20 +67,24 @@ def error(cause: str, text: str = "", **values: Any) -> Result:
 
 
 def provisional(result: Result) -> Result:
-    """The same result, as far as is known yet: it routes the task now, and a later verdict (`Context.verdict`, or the
-    task's score) may correct its status once, for the estimates alone. If none comes it stands."""
+    """The same result, as far as is known yet: it routes the task now, and a later verdict
+    (`Context.verdict`, or the task's score) may correct its status once, for the estimates alone.
+    If none comes it stands."""
     return replace(result, deferred=True)
 
 
 class Cancelled(BaseException):
-    """Thrown into an action at its current wait when its run is cancelled; clean up and let it pass."""
+    """Thrown into an action at its current wait when its run is cancelled; clean up and let it
+    pass."""
 
 
 class Wait:
-    """What an action's coroutine yields: go on when `ready()` holds or when the clock reaches `due` (s; None: never).
+    """What an action's coroutine yields: go on when `ready()` holds or when the clock reaches `due`
+    (s; None: never).
 
-    Awaiting it gives True if it was ready, False if its time was over. Who runs the action sends that verdict, so that
-    `ready` is asked no more once it held (it may have taken what it found); sent None, it is asked again.
+    Awaiting it gives True if it was ready, False if its time was over. Who runs the action sends
+    that verdict, so that `ready` is asked no more once it held (it may have taken what it found);
+    sent None, it is asked again.
     """
 
     __slots__ = ("due", "ready")
@@ -92,12 +99,13 @@ class Wait:
 
 
 class Context(Protocol):
-    """What a run may use besides its arguments. Times are seconds on the cell's clock; durations cross the wire, times never."""
+    """What a run may use besides its arguments. Times are seconds on the cell's clock; durations
+    cross the wire, times never."""
 
     @property
     def now(self) -> float:
-        """The cell's clock: simulated time in lock step, monotonic time otherwise (s). It stands still while the operator holds
-        the run, so what is left of a timeout stays left."""
+        """The cell's clock: simulated time in lock step, monotonic time otherwise (s). It stands
+        still while the operator holds the run, so what is left of a timeout stays left."""
 
     @property
     def run(self) -> str:
@@ -105,7 +113,8 @@ class Context(Protocol):
 
     @property
     def device(self) -> Any:
-        """The handle of the action's device: its driver, or a `Remote` of it when the driver is cyclic; None without a device."""
+        """The handle of the action's device: its driver, or a `Remote` of it when the driver is
+        cyclic; None without a device."""
 
     def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
         """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
@@ -114,23 +123,28 @@ class Context(Protocol):
         """Awaitable: goes on after so many seconds of the cell's clock."""
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
-        """Send newest set point to a stream; whoever receives it sees only the newest. Repeated by the sender while the run
-        goes on and stands by it."""
+        """Send newest set point to a stream; whoever receives it sees only the newest. Repeated by
+        the sender while the run goes on and stands by it."""
 
     def withdraw(self, stream: str) -> None:
-        """Stop standing by the last set point of a stream; its receiver holds after three periods."""
+        """Stop standing by the last set point of a stream; its receiver holds after three
+        periods."""
 
     def raise_event(self, name: str, **data: Any) -> None:
         """Raise a named internal event while the run goes on."""
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
-        """Judge an earlier run whose result was `provisional`: its status is corrected once, for the estimates
-        alone. `run` is what that run's own context gave as `ctx.run`; on whichever node either of them lives."""
+        """Judge an earlier run whose result was `provisional`: its status is corrected once, for
+        the estimates alone. `run` is what that run's own context gave as `ctx.run`; on whichever
+        node either of them lives."""
 
     def progress(self, fraction: float, **data: Any) -> None:
-        """Tell the coordinator how far the run is, 0 to 1, with plain data for people to look at."""
+        """Tell the coordinator how far the run is, 0 to 1, with plain data for people to look
+        at."""
 
-    async def call(self, service: str, /, deadline: float | None = None, **arguments: Any) -> Result:
+    async def call(
+        self, service: str, /, deadline: float | None = None, **arguments: Any
+    ) -> Result:
         """Call any network service by its name, wherever it is."""
 
     async def get(self, name: str) -> Any:

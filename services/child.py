@@ -1,6 +1,7 @@
 """One child process of a node and the pipe to it, in the node's asyncio loop.
 
-Its end is that of the process, never that of the pipe: what user code has left running may hold the pipe open, or close it.
+Its end is that of the process, never that of the pipe: what user code has left running may hold the
+pipe open, or close it.
 """
 
 from __future__ import annotations
@@ -15,23 +16,26 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from services.comm.parentage import STOP_ROUTINE, until_ended
-from services.keeper import KILL_ORDER
-from services.pipe import Counter, counter_memory, pipe_pair
-from services.worker import BORN, Setup
+from petrobot.services.comm.parentage import STOP_ROUTINE, until_ended
+from petrobot.services.keeper import KILL_ORDER
+from petrobot.services.pipe import Counter, counter_memory, pipe_pair
+from petrobot.services.worker import BORN, Setup
 
 NONE = -1
 LEAVE_LIMIT = 4.0
 """Seconds that a process has to end in good order."""
 PIPE_LIMIT = 0.5
-"""Seconds after the end of its pipe when a process is killed: the node can neither order nor hear anything any more."""
+"""Seconds after the end of its pipe when a process is killed: the node can neither order nor hear
+anything any more."""
 KEEPER_LIMIT = 3.0
-"""Seconds that a keeper has to carry out the order to kill; then it is killed itself, and its worker by the kernel."""
+"""Seconds that a keeper has to carry out the order to kill; then it is killed itself, and its
+worker by the kernel."""
 
 
 class Child:
-    """A running process of `services.worker` under its keeper. `heard(child, items)` receives each list that it sends;
-    `ended(child)` is called once, when neither it nor anything that it has started runs any more."""
+    """A running process of `services.worker` under its keeper. `heard(child, items)` receives each
+    list that it sends; `ended(child)` is called once, when neither it nor anything that it has
+    started runs any more."""
 
     def __init__(
         self,
@@ -40,7 +44,8 @@ class Child:
         ended: Callable[[Child], None],
         link: socket.socket | None = None,
     ) -> None:
-        """Start it; `link` is the worker's end of the link to its device, closed here. Raises OSError when that fails."""
+        """Start it; `link` is the worker's end of the link to its device, closed here. Raises
+        OSError when that fails."""
         self._heard = heard
         self._ended = ended
         self._loop = asyncio.get_running_loop()
@@ -48,15 +53,26 @@ class Child:
         self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         passed = [pipe_end, descriptors_end, *([link] if link else [])]
         memory = counter_memory()
-        numbers = [pipe_end.fileno(), descriptors_end.fileno(), link.fileno() if link else NONE, memory]
+        numbers = [
+            pipe_end.fileno(),
+            descriptors_end.fileno(),
+            link.fileno() if link else NONE,
+            memory,
+        ]
         # Only what owns a device has something to do after the node's end: its stop routine.
         patience = int(STOP_ROUTINE) if setup.device and link is None else 0
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "services.keeper", *map(str, (os.getpid(), patience, *numbers))],
+                [
+                    sys.executable,
+                    "-m",
+                    "petrobot.services.keeper",
+                    *map(str, (os.getpid(), patience, *numbers)),
+                ],
                 pass_fds=[number for number in numbers if number != NONE],
                 stdin=subprocess.DEVNULL,
-                start_new_session=True,  # a Ctrl-C in the node's terminal is for the node: it ends its children in order
+                # a Ctrl-C in the node's terminal is for the node: it ends its children in order
+                start_new_session=True,
             )
         except OSError:
             self.pipe.close()
@@ -87,7 +103,8 @@ class Child:
 
     @property
     def begun(self) -> int:
-        """How many of the runs that it was given it has begun. What it has not begun when it dies was not executed."""
+        """How many of the runs that it was given it has begun. What it has not begun when it dies
+        was not executed."""
         return self._begun.value
 
     @property
@@ -121,7 +138,8 @@ class Child:
             self._limit(KEEPER_LIMIT, self.process.kill)
 
     def leave(self) -> None:
-        """Let it end in good order: its pipe closes, so that it stops its device and leaves. Killed after `LEAVE_LIMIT`."""
+        """Let it end in good order: its pipe closes, so that it stops its device and leaves. Killed
+        after `LEAVE_LIMIT`."""
         if not self._let_go:
             self._close_pipe()
             self._limit(LEAVE_LIMIT, self.kill)
@@ -171,7 +189,8 @@ class Child:
         for limit in self._limits:
             limit.cancel()
         if self._worker:
-            # It has ended before its keeper, unless that was killed: then it ends now, as the kernel sees to.
+            # It has ended before its keeper, unless that was killed: then it ends now, as the
+            # kernel sees to.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LEAVE_LIMIT):
                     await until_ended(self._worker)

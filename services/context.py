@@ -9,15 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from services.action import Result, Status, Wait
-from services.callables import describe, words_of
-from services.comm.codec import ProtocolError, encode
-from services.comm.frequent import NAME_LENGTH
-from services.comm.messages import Call, Event, Feedback, Message, Outcome
-from services.comm.plain import plain
-from services.comm.verdicts import VerdictSaid, mission_of, verdict_event
-from services.outlets import Outlets
-from services.runs import Answered, Asked, Begin, Dropped, Judged, Progressed, Raised, Report
+from petrobot.services.action import Result, Status, Wait
+from petrobot.services.callables import describe, words_of
+from petrobot.services.comm.codec import ProtocolError, encode
+from petrobot.services.comm.frequent import NAME_LENGTH
+from petrobot.services.comm.messages import Call, Event, Feedback, Message, Outcome
+from petrobot.services.comm.plain import plain
+from petrobot.services.comm.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.services.outlets import Outlets
+from petrobot.services.runs import (
+    Answered,
+    Asked,
+    Begin,
+    Dropped,
+    Judged,
+    Progressed,
+    Raised,
+    Report,
+)
 
 
 class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
@@ -34,7 +43,8 @@ def never() -> bool:
 
 
 def checked(message: Message) -> None:
-    """Refuse what no peer would take, where the value is made: later it could only cost the connection. Raises ValueError."""
+    """Refuse what no peer would take, where the value is made: later it could only cost the
+    connection. Raises ValueError."""
     try:
         encode(message)
     except ProtocolError as fault:
@@ -42,8 +52,8 @@ def checked(message: Message) -> None:
 
 
 def checked_result(identity: str, returned: Any, where: str = "result") -> Result:
-    """What an action or a service returned as a result in plain data that can be sent. Raises ValueError for any other, naming
-    its values as `where` says."""
+    """What an action or a service returned as a result in plain data that can be sent. Raises
+    ValueError for any other, naming its values as `where` says."""
     if not isinstance(returned, Result):
         name = type(returned).__name__
         raise ValueError(f"returned a {name}; return success(), failure() or error()")
@@ -53,7 +63,11 @@ def checked_result(identity: str, returned: Any, where: str = "result") -> Resul
             raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
         said = (plain(str(returned.cause)), plain(str(returned.text)), bool(returned.deferred))
         result = Result(Status(returned.status), values, *said)
-        checked(Outcome(identity, result.status, values, result.cause, result.text, deferred=result.deferred))
+        checked(
+            Outcome(
+                identity, result.status, values, result.cause, result.text, deferred=result.deferred
+            )
+        )
     except (TypeError, ValueError, MemoryError) as fault:
         raise ValueError(words_of(fault) or type(fault).__name__) from None
     except Exception as fault:  # the value's own code: an object may raise whatever is asked of it
@@ -108,7 +122,8 @@ class RunContext:
         return Wait(never, self._clock() + seconds)
 
     def publish(self, stream: str, values: Sequence[float]) -> None:
-        """Make `values` the newest set point of a stream; repeated while the run goes on and stands by it."""
+        """Make `values` the newest set point of a stream; repeated while the run goes on and stands
+        by it."""
         self._outlets.publish(self._clock(), self.run, stream, values)
 
     def withdraw(self, stream: str) -> None:
@@ -122,7 +137,8 @@ class RunContext:
         self._report(raised)
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
-        """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's id or no status."""
+        """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's
+        id or no status."""
         said = VerdictSaid(run, Status(status).value, str(cause), str(text))
         name = verdict_event(mission_of(run))
         checked(Outcome(run, said.status, cause=said.cause, text=said.text))
@@ -137,18 +153,28 @@ class RunContext:
         checked(Feedback(self.run, progressed.fraction, progressed.data))
         self._report(progressed)
 
-    async def call(self, service: str, /, deadline: float | None = None, **arguments: Any) -> Result:
-        """Call any network service by its name; a call still open when the run is cancelled is cancelled with it. Raises
-        ValueError or TypeError for what cannot be sent."""
+    async def call(
+        self, service: str, /, deadline: float | None = None, **arguments: Any
+    ) -> Result:
+        """Call any network service by its name; a call still open when the run is cancelled is
+        cancelled with it. Raises ValueError or TypeError for what cannot be sent."""
         self._children += 1
         child = f"{self.run}/{self._children}"
         limit = None if deadline is None else float(deadline)
         asked = Asked(
-            self.run, child, plain(service, "service"), plain(arguments, "arguments"), limit, self._begin.seed
+            self.run,
+            child,
+            plain(service, "service"),
+            plain(arguments, "arguments"),
+            limit,
+            self._begin.seed,
         )
-        # The node adds the boot of its peer: as long as any name of it, so that what passes here passes there.
+        # The node adds the boot of its peer: as long as any name of it, so that what passes here
+        # passes there.
         boot = "b" * NAME_LENGTH
-        checked(Call(child, asked.service, asked.arguments, limit, 0, boot, self.run, self._begin.seed))
+        checked(
+            Call(child, asked.service, asked.arguments, limit, 0, boot, self.run, self._begin.seed)
+        )
         self._report(asked)
         self._waiting.add(child)
         try:
@@ -168,8 +194,11 @@ class RunContext:
         return int((await self._memory("memory.put", name=name, value=value)).values["version"])
 
     async def compare_and_set(self, name: str, version: int, value: Any) -> bool:
-        """Write a variable if its version is still the given one (0: never written). Raises CallFailed."""
-        result = await self._memory("memory.compare_and_set", name=name, version=version, value=value)
+        """Write a variable if its version is still the given one (0: never written). Raises
+        CallFailed."""
+        result = await self._memory(
+            "memory.compare_and_set", name=name, version=version, value=value
+        )
         return result.status is Status.SUCCESS
 
     async def _memory(self, service: str, **arguments: Any) -> Result:
@@ -190,5 +219,7 @@ class RunContext:
         """Take the end of a call; False when this run does not wait for it."""
         if answered.id not in self._waiting:
             return False
-        self._answers[answered.id] = Result(Status(answered.status), answered.values, answered.cause, answered.text)
+        self._answers[answered.id] = Result(
+            Status(answered.status), answered.values, answered.cause, answered.text
+        )
         return True

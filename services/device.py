@@ -1,9 +1,10 @@
 """How a device driver is written: what owns a camera, an arm or a rover on its node.
 
-A driver is a class named by import path in services.toml (`[devices.NAME] driver = "module:Class"`), constructed as
-`Class(config, ports)`. One without a `period` lives in the worker process of its device, and actions use it directly as
-`ctx.device`. One with a `period` is *cyclic*: in real time it lives in a process of its own, paced by absolute deadline,
-so no user code delays it; actions see a `Remote` of it: `send` a command, read `state`. In lock step both live inline.
+A driver is a class named by import path in services.toml (`[devices.NAME] driver =
+"module:Class"`), constructed as `Class(config, ports)`. One without a `period` lives in the worker
+process of its device, and actions use it directly as `ctx.device`. One with a `period` is *cyclic*:
+in real time it lives in a process of its own, paced by absolute deadline, so no user code delays
+it; actions see a `Remote` of it: `send` a command, read `state`. In lock step both live inline.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ import logging
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from services.comm.canbus import CanBus
-from services.comm.directory_file import nearest
-from services.comm.image import ImageSource
-from services.comm.plain import plain
+from petrobot.services.comm.canbus import CanBus
+from petrobot.services.comm.directory_file import nearest
+from petrobot.services.comm.image import ImageSource
+from petrobot.services.comm.plain import plain
 
 _log = logging.getLogger(__name__)
 
@@ -25,7 +26,8 @@ class Setpoint(Protocol):
 
     @property
     def values(self) -> tuple[float, ...] | None:
-        """The newest set point, None before the first or when it is stale (older than three of its periods)."""
+        """The newest set point, None before the first or when it is stale (older than three of its
+        periods)."""
 
     @property
     def age(self) -> float:
@@ -33,8 +35,9 @@ class Setpoint(Protocol):
 
     @property
     def held(self) -> float:
-        """Seconds since its sender first sent these values (inf before the first), but for their way here: a repeat makes
-        them no younger. What a value that means "from now on" must be reduced by; never less than `age`."""
+        """Seconds since its sender first sent these values (inf before the first), but for their
+        way here: a repeat makes them no younger. What a value that means "from now on" must be
+        reduced by; never less than `age`."""
 
     @property
     def count(self) -> int:
@@ -69,8 +72,8 @@ PORT_KEYS = ("interface", "channel", "bitrate", "can", "source", "address", "lat
 
 
 def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None:
-    """Raise ValueError if a device's table has a key that is neither its driver's `own` nor its ports': a mistyped one would
-    silently be no setting at all. For a driver's constructor."""
+    """Raise ValueError if a device's table has a key that is neither its driver's `own` nor its
+    ports': a mistyped one would silently be no setting at all. For a driver's constructor."""
     for key in config:
         if key not in own and key not in PORT_KEYS:
             raise ValueError(f"unknown key {key!r}{nearest(key, [*own, *PORT_KEYS])}")
@@ -79,17 +82,19 @@ def refuse_unknown_keys(config: Mapping[str, Any], own: Collection[str]) -> None
 class Driver(Protocol):
     """One device. Nothing here blocks; `now` is the cell's clock (s).
 
-    A method that raises has broken the driver, but for `command` (which refuses so) and `picture`: the device is stopped, its
-    run ends in ERROR with the exception's words, and the traceback goes to the node's log. In real time the driver is then made
-    again in a new process; in lock step, where nothing could have made it break but its code, its device works no more.
+    A method that raises has broken the driver, but for `command` (which refuses so) and `picture`:
+    the device is stopped, its run ends in ERROR with the exception's words, and the traceback goes
+    to the node's log. In real time the driver is then made again in a new process; in lock step,
+    where nothing could have made it break but its code, its device works no more.
     """
 
     period: float | None
     """Seconds between calls of `step`; None for a driver without cyclic duty."""
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command from an action (cyclic drivers). A bad one raises ValueError: it is refused, and ends its run in ERROR
-        with these words unless the action reads them in `Remote.refused`. Any other exception refuses it, too."""
+        """Take a command from an action (cyclic drivers). A bad one raises ValueError: it is
+        refused, and ends its run in ERROR with these words unless the action reads them in
+        `Remote.refused`. Any other exception refuses it, too."""
 
     def step(self, now: float) -> None:
         """One cycle (cyclic drivers)."""
@@ -98,7 +103,8 @@ class Driver(Protocol):
         """Plain data for actions, operator and report, published each cycle."""
 
     def stop(self, now: float) -> None:
-        """Stop routine: bring the device to a safe standstill. May be called at any time and again."""
+        """Stop routine: bring the device to a safe standstill. May be called at any time and
+        again."""
 
     def stopped(self) -> bool:
         """Whether the device is known to stand still."""
@@ -118,7 +124,8 @@ class QuickStopping(Protocol):
     """A driver that can stop harder than its stop routine does."""
 
     def quick_stop(self, now: float) -> None:
-        """Emergency stop (IEC 60204-1, category 0 or 1): stop at once. It stays stopped: no command comes until it is cleared."""
+        """Emergency stop (IEC 60204-1, category 0 or 1): stop at once. It stays stopped: no command
+        comes until it is cleared."""
 
 
 PICTURE = "picture"
@@ -130,14 +137,18 @@ class Watched(Protocol):
     """A driver that can show its operator a picture of what it sees."""
 
     def picture(self) -> Mapping[str, Any]:
-        """The newest one: `mime`, `data` (bytes), `width`, `height` (px), `age` (s), `note` and `detections` as in
-        docs/operator-protocol.md; empty when there is none. Asked for a few times a second, and only while somebody looks."""
+        """The newest one: `mime`, `data` (bytes), `width`, `height` (px), `age` (s), `note` and
+        `detections` as in docs/operator-protocol.md; empty when there is none. Asked for a few
+        times a second, and only while somebody looks."""
 
 
 def picture_of(driver: Driver | None) -> Mapping[str, Any]:
-    """The picture of a device, empty for one that has none. One that cannot be had goes to the log: the device moves on."""
+    """The picture of a device, empty for one that has none. One that cannot be had goes to the log:
+    the device moves on."""
     try:
-        picture: Mapping[str, Any] = plain(driver.picture(), "picture") if isinstance(driver, Watched) else {}
+        picture: Mapping[str, Any] = (
+            plain(driver.picture(), "picture") if isinstance(driver, Watched) else {}
+        )
     except Exception:
         _log.exception("a driver gives no picture")
         return {}
@@ -145,7 +156,8 @@ def picture_of(driver: Driver | None) -> Mapping[str, Any]:
 
 
 def stop_at_once(driver: Driver, now: float) -> None:
-    """Emergency stop of a device: its driver's `quick_stop` if there is one, else its stop routine."""
+    """Emergency stop of a device: its driver's `quick_stop` if there is one, else its stop
+    routine."""
     if isinstance(driver, QuickStopping):
         driver.quick_stop(now)
     else:
@@ -156,7 +168,8 @@ class Remote(Protocol):
     """A cyclic driver as its actions see it."""
 
     def send(self, body: Mapping[str, Any]) -> int:
-        """Send a command; gives its number, which `handled` reaches once the driver has taken it."""
+        """Send a command; gives its number, which `handled` reaches once the driver has taken
+        it."""
 
     @property
     def handled(self) -> int:
@@ -164,8 +177,8 @@ class Remote(Protocol):
 
     @property
     def refused(self) -> str:
-        """Why the last command was refused; empty if it was not. A refusal that the action does not read ends its run in
-        ERROR, cause `command_refused`."""
+        """Why the last command was refused; empty if it was not. A refusal that the action does not
+        read ends its run in ERROR, cause `command_refused`."""
 
     @property
     def state(self) -> Mapping[str, Any]:

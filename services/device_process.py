@@ -1,8 +1,9 @@
 """The process of a cyclic driver: paced by absolute deadline, no user code of actions in it.
 
-Commands of actions come and states go over a `NewestLink` to the device's worker; the node's orders come over its pipe. When
-the worker is gone the stop routine is called; when the node is gone the device is stopped and the process ends. When the node
-is silent, or its latch says that somebody has stopped the device in an emergency, the device is stopped and stays so.
+Commands of actions come and states go over a `NewestLink` to the device's worker; the node's orders
+come over its pipe. When the worker is gone the stop routine is called; when the node is gone the
+device is stopped and the process ends. When the node is silent, or its latch says that somebody has
+stopped the device in an emergency, the device is stopped and stays so.
 """
 
 from __future__ import annotations
@@ -15,15 +16,22 @@ import socket
 import time
 from typing import Any
 
-from services.callables import describe
-from services.comm.plain import plain
-from services.device import PICTURE, Driver, picture_of, stop_at_once
-from services.emergency_stops import BEAT, Guard
-from services.pipe import NewestLink, Pipe
-from services.ports import ProcessPorts
-from services.remote import BARRED, CLEAR_EMERGENCY, EMERGENCY_STOP, NODE_SILENT, CyclicDriver, DeviceCommand
-from services.runner import STOP_LIMIT
-from services.runs import Told, flat
+from petrobot.services.callables import describe
+from petrobot.services.comm.plain import plain
+from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
+from petrobot.services.emergency_stops import BEAT, Guard
+from petrobot.services.pipe import NewestLink, Pipe
+from petrobot.services.ports import ProcessPorts
+from petrobot.services.remote import (
+    BARRED,
+    CLEAR_EMERGENCY,
+    EMERGENCY_STOP,
+    NODE_SILENT,
+    CyclicDriver,
+    DeviceCommand,
+)
+from petrobot.services.runner import STOP_LIMIT
+from petrobot.services.runs import Told, flat
 
 LINKED = "linked"
 """What the node says when it has passed the link of a new worker."""
@@ -37,7 +45,8 @@ PRIORITY = 50
 
 
 def take_priority() -> bool:
-    """Ask for real-time scheduling; False where it is not permitted (needs CAP_SYS_NICE or an rtprio limit)."""
+    """Ask for real-time scheduling; False where it is not permitted (needs CAP_SYS_NICE or an
+    rtprio limit)."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (PermissionError, OSError):
@@ -46,7 +55,8 @@ def take_priority() -> bool:
 
 
 class DeviceError(Exception):
-    """A driver has raised what it must not; the text says what and where. Its device was stopped as far as it still could be."""
+    """A driver has raised what it must not; the text says what and where. Its device was stopped as
+    far as it still could be."""
 
 
 class DeviceLoop:
@@ -76,7 +86,8 @@ class DeviceLoop:
         self._tell_due = 0.0
 
     def run(self) -> None:
-        """Step until the node is gone and the device stands still (or the stop routine's time is over). Raises DeviceError."""
+        """Step until the node is gone and the device stands still (or the stop routine's time is
+        over). Raises DeviceError."""
         gc.collect()
         gc.freeze()
         try:
@@ -94,7 +105,8 @@ class DeviceLoop:
                 self._worker.close()
 
     def _stop_broken(self) -> None:
-        """Stop a device whose driver has failed: as long as it still can be stepped, until it stands or time is over."""
+        """Stop a device whose driver has failed: as long as it still can be stepped, until it
+        stands or time is over."""
         end = time.monotonic() + STOP_LIMIT
         try:
             stop_at_once(self._driver, time.monotonic())
@@ -125,7 +137,8 @@ class DeviceLoop:
         return now
 
     def _next(self, due: float, now: float) -> float:
-        """The next point of the grid. Missed cycles are left out: made up for in a burst, they would make a drive jump."""
+        """The next point of the grid. Missed cycles are left out: made up for in a burst, they
+        would make a drive jump."""
         missed = max(0, math.floor((now - due) / self._period))
         if missed:
             self._overruns += missed
@@ -133,7 +146,12 @@ class DeviceLoop:
             self._latest = max(self._latest, late)
             if late >= TELL_OVERRUN and now >= self._tell_due:
                 self._tell_due = now + 10 * TELL_OVERRUN
-                _log.warning("a cycle of %g s took %.3f s: %d cycles were left out", self._period, now - due, missed)
+                _log.warning(
+                    "a cycle of %g s took %.3f s: %d cycles were left out",
+                    self._period,
+                    now - due,
+                    missed,
+                )
         return due + (missed + 1) * self._period
 
     def _cycle(self, now: float) -> None:
@@ -149,7 +167,16 @@ class DeviceLoop:
         state = self._cyclic.step(now)
         if self._worker is not None:
             published = plain(state.state, "state")
-            self._worker.send([state.handled, state.refused, state.stopped, published, state.refusal, state.barred])
+            self._worker.send(
+                [
+                    state.handled,
+                    state.refused,
+                    state.stopped,
+                    published,
+                    state.refusal,
+                    state.barred,
+                ]
+            )
         for id_, until in list(self._stopping.items()):
             if state.stopped or now >= until:
                 del self._stopping[id_]
@@ -169,7 +196,10 @@ class DeviceLoop:
         else:
             self._cyclic.node_speaks()
         if self._cyclic.barred != before:
-            _log.warning("%s", BARRED.get(self._cyclic.barred, "the node speaks again: commands are taken again"))
+            _log.warning(
+                "%s",
+                BARRED.get(self._cyclic.barred, "the node speaks again: commands are taken again"),
+            )
 
     def _take_commands(self, now: float) -> None:
         if self._worker is None:

@@ -1,25 +1,28 @@
-"""Devices of a node that were stopped in an emergency and obey nobody, as the latch on disk says and keeps it.
+"""Devices of a node that were stopped in an emergency and obey nobody, as the latch on disk says
+and keeps it.
 
-The node looks at the latch, and so does each process that has a driver: a node that is frozen, or whose loop is blocked, can
-stop nothing.
+The node looks at the latch, and so does each process that has a driver: a node that is frozen, or
+whose loop is blocked, can stop nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 
-from services.comm.latch import ALL, Latch, LatchError
-from services.remote import EMERGENCY_STOP, NODE_SILENT
+from petrobot.services.comm.latch import ALL, Latch, LatchError
+from petrobot.services.remote import EMERGENCY_STOP, NODE_SILENT
 
 LOOK = 0.25
-"""Seconds between looks at the latch: somebody may have set it in this node's place while it could not be asked."""
+"""Seconds between looks at the latch: somebody may have set it in this node's place while it could
+not be asked."""
 NEVER = float("inf")
 BEAT = "beat"
-"""What a node says to its processes every `BEAT_EVERY` seconds, so that they know that its loop runs."""
+"""What a node says to its processes every `BEAT_EVERY` seconds, so that they know that its loop
+runs."""
 BEAT_EVERY = 0.2
 SILENCE = 0.8
-"""Seconds without any word of the node after which its processes stop their devices: with the time that a stop takes to get to
-the drives that is less than a second."""
+"""Seconds without any word of the node after which its processes stop their devices: with the time
+that a stop takes to get to the drives that is less than a second."""
 AGAIN = 0.2
 """Seconds that a silent node gets to be heard after this process itself stood still."""
 GUARD_LOOK = 0.05
@@ -27,10 +30,11 @@ GUARD_LOOK = 0.05
 
 
 class Guard:
-    """What a process with a driver watches by itself: the latch of its node, and whether its node speaks.
+    """What a process with a driver watches by itself: the latch of its node, and whether its node
+    speaks.
 
-    Silence counts from the node's first beat on. A process that was not scheduled itself for a while gives its node another
-    moment: what that one said meanwhile still has to be read.
+    Silence counts from the node's first beat on. A process that was not scheduled itself for a
+    while gives its node another moment: what that one said meanwhile still has to be read.
     """
 
     def __init__(self, device: str, latch: Latch) -> None:
@@ -49,7 +53,8 @@ class Guard:
             self._heard, self._again = now, False
 
     def look(self, now: float) -> str:
-        """Cause for which the device must stand: EMERGENCY_STOP, NODE_SILENT, or empty. Call it when `due`, after reading."""
+        """Cause for which the device must stand: EMERGENCY_STOP, NODE_SILENT, or empty. Call it
+        when `due`, after reading."""
         if now - self.due > SILENCE / 2 and self._heard < NEVER and not self._again:
             # Once only: a process that is late at each look must not wait for ever.
             self._heard, self._again = max(self._heard, now - SILENCE + AGAIN), True
@@ -79,7 +84,8 @@ class EmergencyStops:
         return tuple(sorted(self._stopped))
 
     def at_start(self) -> list[str]:
-        """Devices that come up stopped: by the latch, or all of them where none can be kept, since perhaps one was not."""
+        """Devices that come up stopped: by the latch, or all of them where none can be kept, since
+        perhaps one was not."""
         unsure = self._latch is not None and not self._latch.kept
         return self._add(self._devices) if unsure else self.look(0.0)
 
@@ -89,7 +95,9 @@ class EmergencyStops:
             return []
         self.due = now + LOOK if self._devices else NEVER
         stopped = self._latch.stopped()
-        return self._add(d for d in self._devices if d in stopped or ALL in stopped) if stopped else []
+        return (
+            self._add(d for d in self._devices if d in stopped or ALL in stopped) if stopped else []
+        )
 
     def stop(self, devices: Collection[str]) -> str:
         """These are stopped; gives why that is not kept on disk, empty if it is."""

@@ -11,11 +11,11 @@ from enum import Enum, auto
 from functools import partial
 from typing import Any
 
-from services.action import Result, Wait
-from services.callables import describe, from_outside
-from services.comm.directory import ActionEntry
-from services.context import RunContext, never
-from services.runs import Begin
+from petrobot.services.action import Result, Wait
+from petrobot.services.callables import describe, from_outside
+from petrobot.services.comm.directory import ActionEntry
+from petrobot.services.context import RunContext, never
+from petrobot.services.runs import Begin
 
 STEPS = 10_000
 """How often a coroutine may go on without time passing before it is taken for an endless loop."""
@@ -40,7 +40,10 @@ class Hung(BaseException):
     """Raised by the watchdog of lock step into code that has not come back for too long."""
 
     def __str__(self) -> str:
-        return "did not come back in time; an action waits with ctx.wait or ctx.sleep, and loops that do not end are faults"
+        return (
+            "did not come back in time; an action waits with ctx.wait or ctx.sleep, and "
+            "loops that do not end are faults"
+        )
 
 
 class Returned(Exception):  # noqa: N818 - not an error
@@ -73,7 +76,8 @@ class Execution:
     cause: str = ""
     text: str = ""
     abandoned: bool = False
-    """The action could not bring its device to a safe state itself: standing still is not enough."""
+    """The action could not bring its device to a safe state itself: standing still is not
+    enough."""
     stop_called: bool = False
 
     @property
@@ -97,7 +101,8 @@ class Execution:
         return min((t for t in times if t is not None), default=None)
 
     def call(self, function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
-        """Call the action up to its first wait. Raises Returned when it is over, else whatever it raised."""
+        """Call the action up to its first wait. Raises Returned when it is over, else whatever it
+        raised."""
         returned = self._timed(lambda: function(self.context, **arguments))
         if not inspect.iscoroutine(returned):
             raise Returned(returned)
@@ -117,7 +122,8 @@ class Execution:
             self.go_on(ready)
 
     def go_on(self, verdict: bool | BaseException | None) -> None:
-        """Tell its wait the verdict (or raise it there), and run until it waits for something that is not there yet.
+        """Tell its wait the verdict (or raise it there), and run until it waits for something that
+        is not there yet.
 
         Raises as `call` does.
         """
@@ -142,7 +148,9 @@ class Execution:
                 raise Returned(returned.value) from None
             if isinstance(wait, Wait):
                 return wait
-            verdict = TypeError(f"awaits a {type(wait).__name__}; an action awaits only what its context gives it")
+            verdict = TypeError(
+                f"awaits a {type(wait).__name__}; an action awaits only what its context gives it"
+            )
         raise RuntimeError("awaits only what its context did not give it")
 
     def close(self) -> str:

@@ -1,4 +1,5 @@
-"""A general-purpose service written as a plain function, answered on the spot in the node's loop."""
+"""A general-purpose service written as a plain function, answered on the spot in the node's
+loop."""
 
 from __future__ import annotations
 
@@ -6,15 +7,15 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from services.action import Status
-from services.callables import check_arguments, describe, from_outside
-from services.comm.callee import Inline
-from services.comm.directory import ServiceEntry, resolve
-from services.comm.messages import Call, Executed, Outcome
-from services.context import RunContext, checked_result
-from services.execution import Hung
-from services.outlets import Outlets
-from services.runs import Begin, Judged, Raised, Report
+from petrobot.services.action import Status
+from petrobot.services.callables import check_arguments, describe, from_outside
+from petrobot.services.comm.callee import Inline
+from petrobot.services.comm.directory import ServiceEntry, resolve
+from petrobot.services.comm.messages import Call, Executed, Outcome
+from petrobot.services.context import RunContext, checked_result
+from petrobot.services.execution import Hung
+from petrobot.services.outlets import Outlets
+from petrobot.services.runs import Begin, Judged, Raised, Report
 
 EventSink = Callable[[str, str, Mapping[str, Any]], None]
 """Takes (service, event, data) of an event that a service raises."""
@@ -25,7 +26,8 @@ VerdictSink = Callable[[str, Judged], None]
 def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink) -> Inline:
     """The callee's end of such a service. Raises ImportError when its function cannot be loaded.
 
-    The function takes a context and keyword arguments like an action; of its context it may use what does not wait.
+    The function takes a context and keyword arguments like an action; of its context it may use
+    what does not wait.
     """
     function = resolve(service.run)
 
@@ -36,25 +38,39 @@ def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink
             judged(service.name, told)
 
     def answer(now: float, call: Call) -> Outcome:
-        context = RunContext(Begin(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report)
+        context = RunContext(
+            Begin(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report
+        )
         try:
             check_arguments(function, call.arguments)
         except TypeError as fault:
-            return Outcome(call.id, Status.ERROR, {}, "bad_arguments", f"{service.name}: {fault}", Executed.NO)
+            return Outcome(
+                call.id, Status.ERROR, {}, "bad_arguments", f"{service.name}: {fault}", Executed.NO
+            )
         before = time.process_time()
         try:
             result = function(context, **call.arguments)
-        except BaseException as fault:  # a service may raise SystemExit or its like: that must not end the node
+        except (
+            BaseException
+        ) as fault:  # a service may raise SystemExit or its like: that must not end the node
             if from_outside(fault):
                 raise
             return Outcome(
-                call.id, Status.ERROR, {}, "hung" if isinstance(fault, Hung) else "exception", describe(fault)
+                call.id,
+                Status.ERROR,
+                {},
+                "hung" if isinstance(fault, Hung) else "exception",
+                describe(fault),
             )
         try:
             result = checked_result(call.id, result, "values")
         except ValueError as fault:
-            return Outcome(call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}")
+            return Outcome(
+                call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}"
+            )
         cpu = time.process_time() - before
-        return Outcome(call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu)
+        return Outcome(
+            call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu
+        )
 
     return answer

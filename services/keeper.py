@@ -1,13 +1,16 @@
-"""The process between a node and one of its workers: whatever the worker's user code leaves behind ends with the worker.
+"""The process between a node and one of its workers: whatever the worker's user code leaves behind
+ends with the worker.
 
-An action or a driver may fork, start daemons or leave programs running. A worker that dies cannot clean up after itself, and its
-node is not the parent of what it started. So each worker has a keeper: the subreaper (prctl(2)) to which every orphan of the
-worker falls, whatever sessions and process groups it has made for itself. The keeper runs no user code and imports next to nothing.
-It kills its worker when the node orders it or dies, kills what is left once the worker has ended, and then ends as the worker
-did. So the end of this process says that nothing of the worker runs any more.
+An action or a driver may fork, start daemons or leave programs running. A worker that dies cannot
+clean up after itself, and its node is not the parent of what it started. So each worker has a
+keeper: the subreaper (prctl(2)) to which every orphan of the worker falls, whatever sessions and
+process groups it has made for itself. The keeper runs no user code and imports next to nothing. It
+kills its worker when the node orders it or dies, kills what is left once the worker has ended, and
+then ends as the worker did. So the end of this process says that nothing of the worker runs any
+more.
 
-What escapes: a process that user code starts as another user (set-user-ID programs cannot be signalled), one that hangs in the
-kernel, and all of them if user code kills the keeper itself.
+What escapes: a process that user code starts as another user (set-user-ID programs cannot be
+signalled), one that hangs in the kernel, and all of them if user code kills the keeper itself.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ import sys
 import time
 from pathlib import Path
 
-from services.comm.parentage import adopt_orphans, die_with, notify_of_end
+from petrobot.services.comm.parentage import adopt_orphans, die_with, notify_of_end
 
 KILL_ORDER = signal.SIGUSR2
 """From the node: kill the worker and all that it has started."""
@@ -30,12 +33,14 @@ _WATCHED = (signal.SIGCHLD, KILL_ORDER, NODE_ENDED)
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """The node decides when its children end."""
 CLEAN_UP = 1.0
-"""Seconds for what the worker has left to die: one that hangs in the kernel must not hide that the worker has ended."""
+"""Seconds for what the worker has left to die: one that hangs in the kernel must not hide that the
+worker has ended."""
 LOOK_AGAIN = 0.01
 
 
 def keep(worker: int, patience: float) -> int:
-    """Wait for the worker's end; return its wait status. `patience` is how long it may outlive its node (s)."""
+    """Wait for the worker's end; return its wait status. `patience` is how long it may outlive its
+    node (s)."""
     limit: float | None = None
     while True:
         if limit is not None and time.monotonic() >= limit:
@@ -59,7 +64,8 @@ def keep(worker: int, patience: float) -> int:
 
 
 def clean_up() -> None:
-    """Kill all descendants of this process: a killed one's children become its own, until there are none."""
+    """Kill all descendants of this process: a killed one's children become its own, until there are
+    none."""
     until = time.monotonic() + CLEAN_UP
     while time.monotonic() < until:
         try:
@@ -74,7 +80,8 @@ def clean_up() -> None:
 
 
 def _children(parent: int) -> list[int]:
-    """Processes whose parent this is, from /proc (`children` there needs a kernel option; `stat` is always there)."""
+    """Processes whose parent this is, from /proc (`children` there needs a kernel option; `stat` is
+    always there)."""
     found = []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
@@ -86,7 +93,8 @@ def _children(parent: int) -> list[int]:
 
 
 def end_as(status: int) -> None:
-    """End this process as a wait status says that the worker has: by the same signal, or with the same exit code."""
+    """End this process as a wait status says that the worker has: by the same signal, or with the
+    same exit code."""
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -98,7 +106,8 @@ def end_as(status: int) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Entry point of the process: `NODE PATIENCE PIPE DESCRIPTORS LINK BEGUN`, the last four as `services.worker` takes them."""
+    """Entry point of the process: `NODE PATIENCE PIPE DESCRIPTORS LINK BEGUN`, the last four as
+    `services.worker` takes them."""
     node, patience, sockets = int(arguments[0]), float(arguments[1]), arguments[2:]
     for ignored in _IGNORED:
         signal.signal(ignored, signal.SIG_IGN)
@@ -111,8 +120,9 @@ def main(arguments: list[str]) -> None:
         die_with(keeper)
         os.setsid()  # a signal to the worker's whole process group does not reach its keeper
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _WATCHED)
-        # Imported in the worker alone: here it would start threads of libraries before the fork, and take memory.
-        from services import worker as program
+        # Imported in the worker alone: here it would start threads of libraries before the fork,
+        # and take memory.
+        from petrobot.services import worker as program
 
         program.main(sockets)
         return

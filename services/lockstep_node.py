@@ -1,22 +1,35 @@
-"""A node as a party of a lock-step cell: drivers and actions inline, the outside world through envelopes."""
+"""A node as a party of a lock-step cell: drivers and actions inline, the outside world through
+envelopes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from services.callables import describe
-from services.comm.cell import CellError
-from services.comm.channels import set_point_body
-from services.comm.directory import Directory
-from services.comm.messages import Accept, Answer, Call, Event, Feedback, Hello, Message, Outcome, Pong, Refuse, Welcome
-from services.comm.party import Envelope
-from services.drivers import make_driver
-from services.execution import Hung
-from services.lockstep_ports import LockstepPorts
-from services.node import GENERAL, Node
-from services.place import InlinePlace, Place
-from services.watchdog import Watchdog
+from petrobot.services.callables import describe
+from petrobot.services.comm.cell import CellError
+from petrobot.services.comm.channels import set_point_body
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.messages import (
+    Accept,
+    Answer,
+    Call,
+    Event,
+    Feedback,
+    Hello,
+    Message,
+    Outcome,
+    Pong,
+    Refuse,
+    Welcome,
+)
+from petrobot.services.comm.party import Envelope
+from petrobot.services.drivers import make_driver
+from petrobot.services.execution import Hung
+from petrobot.services.lockstep_ports import LockstepPorts
+from petrobot.services.node import GENERAL, Node
+from petrobot.services.place import InlinePlace, Place
+from petrobot.services.watchdog import Watchdog
 
 Substitutes = Mapping[str, Callable[..., Any]]
 _ANSWERS = (Welcome, Refuse, Accept, Feedback, Outcome, Event, Answer, Pong)
@@ -24,13 +37,17 @@ _ANSWERS = (Welcome, Refuse, Accept, Feedback, Outcome, Event, Answer, Pong)
 
 
 class LockstepNode:
-    """Implements `services.comm.party.Party` for one node of services.toml. Raises DirectoryError when a driver refuses.
+    """Implements `services.comm.party.Party` for one node of services.toml. Raises DirectoryError
+    when a driver refuses.
 
-    Endpoints send under their own names (action, device, service, timer), whatever node they live on, and a call to one's
-    own node takes the same way as any other: so moving an action to another node changes nothing.
+    Endpoints send under their own names (action, device, service, timer), whatever node they live
+    on, and a call to one's own node takes the same way as any other: so moving an action to another
+    node changes nothing.
     """
 
-    def __init__(self, directory: Directory, name: str, *, substitutes: Substitutes | None = None) -> None:
+    def __init__(
+        self, directory: Directory, name: str, *, substitutes: Substitutes | None = None
+    ) -> None:
         self.name = name
         self._directory = directory
         self._substitutes = substitutes
@@ -59,10 +76,16 @@ class LockstepNode:
         directory, driver = self._directory, None
         if device != GENERAL:
             entry = directory.devices[device]
-            ports = self._ports[device] = LockstepPorts(directory, entry, self._clock, self._out.append)
+            ports = self._ports[device] = LockstepPorts(
+                directory, entry, self._clock, self._out.append
+            )
             driver = make_driver(directory, entry, ports)
         return InlinePlace(
-            {a.name: a for a in directory.actions.values() if a.node == self.name and a.device == device},
+            {
+                a.name: a
+                for a in directory.actions.values()
+                if a.node == self.name and a.device == device
+            },
             clock=self._clock,
             driver=driver,
             streams={s.name: s.period for s in directory.streams.values()},
@@ -70,7 +93,7 @@ class LockstepNode:
             virtual=True,
         )
 
-    # --- party -------------------------------------------------------------------------------------------------------
+    # --- party --------------------------------------------------------------------------------
 
     def receive(self, now: float, envelope: Envelope) -> None:
         """Take an envelope that is due. Raises CellError when code that is called hangs."""
@@ -110,8 +133,8 @@ class LockstepNode:
             self._send_messages(now)
 
     def _advance_node(self, now: float) -> bool:
-        """Let the node do all that is due; says whether anything may have come of it. In most ticks no message has come, and the
-        ends of calls need not be looked at."""
+        """Let the node do all that is due; says whether anything may have come of it. In most ticks
+        no message has come, and the ends of calls need not be looked at."""
         node = self.node
         if self._heard or not node.ends_quiet(now):
             self._heard = False
@@ -126,7 +149,9 @@ class LockstepNode:
         for action, sent in self.node.sent:
             stream = self._directory.streams[sent.stream]
             body = set_point_body(sent.stream, sent.values, sent.elapsed, stream.period)
-            self._out.append(Envelope(self._directory.where(sent.stream), action, stream.to, "stream", body))
+            self._out.append(
+                Envelope(self._directory.where(sent.stream), action, stream.to, "stream", body)
+            )
         self.node.sent.clear()
 
     def drain(self) -> Sequence[Envelope]:
@@ -142,7 +167,7 @@ class LockstepNode:
         self._watchdog.close()
         self.node.close(self._now)
 
-    # --- messages ----------------------------------------------------------------------------------------------------
+    # --- messages -----------------------------------------------------------------------------
 
     def _receive_message(self, now: float, envelope: Envelope, message: Message) -> None:
         peer = self._parties.get(envelope.source)
@@ -152,7 +177,9 @@ class LockstepNode:
             self.node.caller(peer).receive(now, message)
         elif isinstance(message, Hello):
             local = self._directory.same_host(self.name, peer)
-            self._post(peer, self.name, peer, self.node.callee.link_up(now, peer, message, local=local))
+            self._post(
+                peer, self.name, peer, self.node.callee.link_up(now, peer, message, local=local)
+            )
         else:
             if isinstance(message, Call):
                 self._ends[message.id] = (envelope.source, message.service)

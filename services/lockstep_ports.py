@@ -1,20 +1,27 @@
-"""What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side envelopes."""
+"""What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side
+envelopes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from services.comm.camera import MemoryImages, open_images
-from services.comm.canbus import Frame
-from services.comm.channels import can_body, images_wanted, read_can, read_image, read_set_point
-from services.comm.directory import DeviceEntry, Directory
-from services.comm.image import ImageSource
-from services.comm.messages import Event
-from services.comm.party import Envelope
-from services.comm.plain import plain
-from services.context import checked
-from services.setpoints import SetpointReceiver
+from petrobot.services.comm.camera import MemoryImages, open_images
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.channels import (
+    can_body,
+    images_wanted,
+    read_can,
+    read_image,
+    read_set_point,
+)
+from petrobot.services.comm.directory import DeviceEntry, Directory
+from petrobot.services.comm.image import ImageSource
+from petrobot.services.comm.messages import Event
+from petrobot.services.comm.party import Envelope
+from petrobot.services.comm.plain import plain
+from petrobot.services.context import checked
+from petrobot.services.setpoints import SetpointReceiver
 
 
 class MemoryCan:
@@ -47,10 +54,15 @@ class MemoryCan:
 
 
 class LockstepPorts:
-    """Implements `services.device.Ports` for one device; `post` takes what goes out to the laboratory."""
+    """Implements `services.device.Ports` for one device; `post` takes what goes out to the
+    laboratory."""
 
     def __init__(
-        self, directory: Directory, device: DeviceEntry, clock: Callable[[], float], post: Callable[[Envelope], None]
+        self,
+        directory: Directory,
+        device: DeviceEntry,
+        clock: Callable[[], float],
+        post: Callable[[Envelope], None],
     ) -> None:
         self._directory = directory
         self._device = device
@@ -76,7 +88,8 @@ class LockstepPorts:
         return self._can
 
     def images(self) -> ImageSource:
-        """The laboratory's camera when the device says `source = "sim"`, else what it names (a file)."""
+        """The laboratory's camera when the device says `source = "sim"`, else what it names (a
+        file)."""
         if self._device.config.get("source") != "sim":
             return open_images(self._device.config, self._clock)
         if self._images is None:
@@ -85,10 +98,13 @@ class LockstepPorts:
         return self._images
 
     def stream(self, name: str) -> SetpointReceiver:
-        """The receiving end of a stream that services.toml leads to this device. Raises ValueError for any other."""
+        """The receiving end of a stream that services.toml leads to this device. Raises ValueError
+        for any other."""
         entry = self._directory.streams.get(name)
         if entry is None or entry.to != self._device.name:
-            raise ValueError(f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}")
+            raise ValueError(
+                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
+            )
         return self._streams.setdefault(name, SetpointReceiver(entry.period, self._clock))
 
     def raise_event(self, name: str, **data: Any) -> None:
@@ -139,5 +155,8 @@ class LockstepPorts:
         if not self._lives_at:
             self._lives_at = self._directory.laboratory()
         if not self._lives_at:
-            raise ValueError('lock step needs a simulated node; write sim = "module:function" in one [nodes.NAME]')
+            raise ValueError(
+                'lock step needs a simulated node; write sim = "module:function" in one '
+                "[nodes.NAME]"
+            )
         return self._lives_at

@@ -1,4 +1,5 @@
-"""The global memory: named values with a version, read and written from every node, watched by whoever subscribes."""
+"""The global memory: named values with a version, read and written from every node, watched by
+whoever subscribes."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from typing import Any
 
 import msgpack
 
-from services.action import Result, error, failure, success
-from services.comm.directory import MEMORY_CALLS
+from petrobot.services.action import Result, error, failure, success
+from petrobot.services.comm.directory import MEMORY_CALLS
 
 VALUE_BYTES = 1 << 20
 """Largest value (bytes as msgpack). The event that tells it is allowed twice as much."""
@@ -35,17 +36,21 @@ class Variable:
 
 
 class Memory:
-    """A machine without clock: `call` answers the services `memory.*`; each change goes to `changed(name, value, version)`."""
+    """A machine without clock: `call` answers the services `memory.*`; each change goes to
+    `changed(name, value, version)`."""
 
     def __init__(self, changed: Callable[[str, Any, int], None]) -> None:
         self._changed = changed
         self._variables: dict[str, Variable] = {}
         self._bytes = 0
         answers = (self._get, self._put, self._compare_and_set, self._list)
-        self._answers: dict[str, Callable[..., Result]] = dict(zip(MEMORY_CALLS, answers, strict=True))
+        self._answers: dict[str, Callable[..., Result]] = dict(
+            zip(MEMORY_CALLS, answers, strict=True)
+        )
 
     def call(self, service: str, arguments: Mapping[str, Any]) -> Result:
-        """Answer a call of one of `MEMORY_CALLS`. Bad arguments give ERROR with cause `bad_arguments`."""
+        """Answer a call of one of `MEMORY_CALLS`. Bad arguments give ERROR with cause
+        `bad_arguments`."""
         try:
             return self._answers[service](**arguments)
         except TypeError as fault:
@@ -67,15 +72,22 @@ class Memory:
     def _compare_and_set(self, name: str, version: int, value: Any) -> Result:
         present = self._variables.get(_checked(name))
         if not isinstance(version, int) or isinstance(version, bool):
-            raise TypeError(f"version is {version!r}; give the integer that memory.get told, 0 for never written")
+            raise TypeError(
+                f"version is {version!r}; give the integer that memory.get told, 0 for never "
+                "written"
+            )
         current = present.version if present else 0
         if current != version:
             text = f"{name!r} has version {current}, not {version}"
-            return failure("changed", text, value=present.value if present else None, version=current)
+            return failure(
+                "changed", text, value=present.value if present else None, version=current
+            )
         return self._write(name, value)
 
     def _list(self) -> Result:
-        return success(versions={name: variable.version for name, variable in sorted(self._variables.items())})
+        return success(
+            versions={name: variable.version for name, variable in sorted(self._variables.items())}
+        )
 
     def _write(self, name: str, value: Any) -> Result:
         size = len(msgpack.packb(value))
@@ -83,10 +95,14 @@ class Memory:
         total = self._bytes + size - (present.size if present else 0)
         if size > VALUE_BYTES:
             return error(
-                "too_large", f"{name!r} would take {size} bytes, the limit is {VALUE_BYTES}; store a file name"
+                "too_large",
+                f"{name!r} would take {size} bytes, the limit is {VALUE_BYTES}; store a file name",
             )
         if total > TOTAL_BYTES or (present is None and len(self._variables) >= VARIABLES):
-            return error("memory_full", f"no room for {name!r}: {len(self._variables)} variables, {self._bytes} bytes")
+            return error(
+                "memory_full",
+                f"no room for {name!r}: {len(self._variables)} variables, {self._bytes} bytes",
+            )
         version = present.version + 1 if present else 1
         self._variables[name] = Variable(value, version, size)
         self._bytes = total

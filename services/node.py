@@ -1,4 +1,5 @@
-"""A node as one machine for lock step and real time: its offers, the places of its runs, its memory, timers and calls."""
+"""A node as one machine for lock step and real time: its offers, the places of its runs, its
+memory, timers and calls."""
 
 from __future__ import annotations
 
@@ -7,25 +8,54 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from services.action import Status
-from services.comm.callee import Callee, CancelRun, Commanded, Inline, Offer, Order, StartRun
-from services.comm.caller import Caller
-from services.comm.directory import MEMORY, MEMORY_CALLS, ActionEntry, Directory, DirectoryError, ServiceEntry, resolve
-from services.comm.latch import Latch
-from services.comm.messages import Call, Executed, Hello, Outcome
-from services.comm.notice import Ended as CallEnded
-from services.comm.notice import Notice
-from services.comm.peers import COORDINATOR, NODE
-from services.comm.verdicts import VerdictSaid, mission_of, verdict_event
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
-from services.device import PICTURE
-from services.emergency_stops import NEVER, EmergencyStops
-from services.inline_service import inline_service
-from services.memory import Memory, event_name
-from services.place import InlinePlace, Place
-from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
-from services.runs import Answered, Asked, Begin, Dropped, Ended, Judged, Progressed, Raised, Report, Sent, Stop, Told
-from services.timers import Timers
+from petrobot.services.action import Status
+from petrobot.services.comm.callee import (
+    Callee,
+    CancelRun,
+    Commanded,
+    Inline,
+    Offer,
+    Order,
+    StartRun,
+)
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.directory import (
+    MEMORY,
+    MEMORY_CALLS,
+    ActionEntry,
+    Directory,
+    DirectoryError,
+    ServiceEntry,
+    resolve,
+)
+from petrobot.services.comm.latch import Latch
+from petrobot.services.comm.messages import Call, Executed, Hello, Outcome
+from petrobot.services.comm.notice import Ended as CallEnded
+from petrobot.services.comm.notice import Notice
+from petrobot.services.comm.peers import COORDINATOR, NODE
+from petrobot.services.comm.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.device import PICTURE
+from petrobot.services.emergency_stops import NEVER, EmergencyStops
+from petrobot.services.inline_service import inline_service
+from petrobot.services.memory import Memory, event_name
+from petrobot.services.place import InlinePlace, Place
+from petrobot.services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
+from petrobot.services.runs import (
+    Answered,
+    Asked,
+    Begin,
+    Dropped,
+    Ended,
+    Judged,
+    Progressed,
+    Raised,
+    Report,
+    Sent,
+    Stop,
+    Told,
+)
+from petrobot.services.timers import Timers
 
 GENERAL = ""
 """Key of the place of actions that need no device."""
@@ -33,7 +63,8 @@ LOOP = "*"
 """Key of the place of services that wait, in the node's own loop."""
 STREAM_PREFIX = "stream:"
 SENDERS = frozenset((COORDINATOR, NODE))
-"""Roles that may ask for the ticket of a stream: an action of a node sends set points, a coordinator may order anything."""
+"""Roles that may ask for the ticket of a stream: an action of a node sends set points, a
+coordinator may order anything."""
 """Name of a stream's address service: this and the stream's name."""
 ANSWER_WITHIN = 1.0
 """Seconds that the devices have to answer an operator's command."""
@@ -59,8 +90,9 @@ class _Commanded:
 class Node:
     """Everything of a node but sockets, processes and the clock.
 
-    `callee` and `callers` (one for each peer) are driven by a shell: it brings them what comes in and takes out what goes.
-    `places` are by device, `GENERAL` for actions without. Then `advance(now)` does all that is due; `due()` says when next.
+    `callee` and `callers` (one for each peer) are driven by a shell: it brings them what comes in
+    and takes out what goes. `places` are by device, `GENERAL` for actions without. Then
+    `advance(now)` does all that is due; `due()` says when next.
     """
 
     def __init__(
@@ -76,27 +108,38 @@ class Node:
         stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
         latch: Latch | None = None,
     ) -> None:
-        """`connect(peer)` is called when the first call to a peer is about to be made; `stream_address(stream)` tells where a
-        set-point stream of this node is received; `latch` keeps an emergency stop over a restart."""
+        """`connect(peer)` is called when the first call to a peer is about to be made;
+        `stream_address(stream)` tells where a set-point stream of this node is received; `latch`
+        keeps an emergency stop over a restart."""
         self.directory = directory
         self.name = name
         self.boot = boot
         services = [s for s in directory.services.values() if s.node == name and s.run]
-        waiting = {s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))}
-        self.places: dict[str, Place] = {**places, LOOP: InlinePlace(waiting, clock=clock, virtual=virtual)}
+        waiting = {
+            s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))
+        }
+        self.places: dict[str, Place] = {
+            **places,
+            LOOP: InlinePlace(waiting, clock=clock, virtual=virtual),
+        }
         self.memory = Memory(self._memory_changed)
         self._connect = connect
         self._stream_address = stream_address
         self.callee = Callee(name, boot, self._offers(waiting), directory=directory.hash)
         self.callers: dict[str, Caller] = {}
         self.sent: list[tuple[str, Sent]] = []
-        """Set points that left since the shell looked, with the action that published them (inline places only)."""
-        self._timers = Timers({t.name: t.period for t in directory.timers.values() if t.node == name})
+        """Set points that left since the shell looked, with the action that published them (inline
+        places only)."""
+        self._timers = Timers(
+            {t.name: t.period for t in directory.timers.values() if t.node == name}
+        )
         self._now = 0.0
         self._at: dict[str, str] = {}
         self._asked: dict[str, str] = {}
         self._commands: dict[str, _Commanded] = {}
-        self._stops = EmergencyStops([key for key in self.places if key not in (LOOP, GENERAL)], latch)
+        self._stops = EmergencyStops(
+            [key for key in self.places if key not in (LOOP, GENERAL)], latch
+        )
         self._stop_places(0.0, self._stops.at_start())
 
     def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
@@ -111,7 +154,9 @@ class Node:
                 offers.update(self._service_offers(service, scope, service.name in waiting))
         if self._stream_address is not None:
             streams = [s for s in self.directory.streams if self.directory.where(s) == self.name]
-            offers.update({stream_service(s): Offer(inline=self._stream_call, roles=SENDERS) for s in streams})
+            offers.update(
+                {stream_service(s): Offer(inline=self._stream_call, roles=SENDERS) for s in streams}
+            )
         return offers
 
     def _service_offers(self, service: ServiceEntry, scope: str, waits: bool) -> dict[str, Offer]:
@@ -132,13 +177,16 @@ class Node:
 
     def hello(self) -> Hello:
         """How this node introduces itself to a peer."""
-        return Hello(OLDEST_VERSION, NEWEST_VERSION, "node", self.name, self.boot, 0, self.directory.hash)
+        return Hello(
+            OLDEST_VERSION, NEWEST_VERSION, "node", self.name, self.boot, 0, self.directory.hash
+        )
 
     def action_of(self, run: str) -> str:
-        """Action or service that a run or call under way belongs to; the node's name when it is unknown."""
+        """Action or service that a run or call under way belongs to; the node's name when it is
+        unknown."""
         return self.callee.running().get(run, self.name)
 
-    # --- time --------------------------------------------------------------------------------------------------------
+    # --- time ---------------------------------------------------------------------------------
 
     def advance(self, now: float) -> None:
         """Do all that is due: orders of callers, runs, devices, timers, and what comes of them."""
@@ -152,8 +200,9 @@ class Node:
         self.settle(now)
 
     def advance_places(self, now: float) -> bool:
-        """Timers, runs and devices alone; says whether anything came of it. That is all that `advance` does while nothing has
-        come in and `ends_quiet` holds: a shell that knows may call this instead, then `settle` if something came."""
+        """Timers, runs and devices alone; says whether anything came of it. That is all that
+        `advance` does while nothing has come in and `ends_quiet` holds: a shell that knows may call
+        this instead, then `settle` if something came."""
         self._now = now
         news = False
         for name in self._timers.advance(now):
@@ -180,7 +229,8 @@ class Node:
         return all(now < caller.soonest for caller in self.callers.values())
 
     def _advance_ends(self, now: float) -> None:
-        """What time does at both ends of calls; asking for the next due time keeps `soonest` up to date."""
+        """What time does at both ends of calls; asking for the next due time keeps `soonest` up to
+        date."""
         ends: tuple[Callee | Caller, ...] = (self.callee, *self.callers.values())
         for end in ends:
             if now >= end.soonest:
@@ -188,7 +238,8 @@ class Node:
                 end.due()
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s), None if only what comes in can matter."""
+        """When `advance` has something to do at the latest (s), None if only what comes in can
+        matter."""
         times = [self._stops.due if self._stops.due < NEVER else None]
         times += [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
         times += [caller.due() for caller in self.callers.values()]
@@ -200,7 +251,7 @@ class Node:
         for place in self.places.values():
             place.close(now)
 
-    # --- orders of callers -------------------------------------------------------------------------------------------
+    # --- orders of callers --------------------------------------------------------------------
 
     def obey(self, now: float, orders: Iterable[Order]) -> None:
         """Carry out what the callee orders."""
@@ -221,16 +272,25 @@ class Node:
             deadline = action.deadline
         self._stop_places(now, self._stops.look(now))
         if key in self._stops:
-            self.callee.finish(now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO)
+            self.callee.finish(
+                now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO
+            )
             return
         self._at[call.id] = key
-        self.places[key].take(now, Begin(call.id, call.service, call.arguments, deadline, call.seed))
+        self.places[key].take(
+            now, Begin(call.id, call.service, call.arguments, deadline, call.seed)
+        )
 
     def _command(self, now: float, order: Commanded) -> None:
         command = order.command
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
         if command.verb not in VERBS:
-            self.callee.answer(now, command.id, False, {"cause": "unknown_verb", "text": f"no verb {command.verb!r}"})
+            self.callee.answer(
+                now,
+                command.id,
+                False,
+                {"cause": "unknown_verb", "text": f"no verb {command.verb!r}"},
+            )
         elif not keys and command.target:
             text = f"{self.name} has no device {command.target!r}"
             self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
@@ -241,8 +301,12 @@ class Node:
             self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
             for key in keys:
                 self.places[key].command(now, command.id, command.verb)
-            if command.verb == EMERGENCY_STOP:  # the devices first, the disk then; both before the answer
-                self._commands[command.id].note = self._stops.stop([key for key in keys if key != GENERAL])
+            if (
+                command.verb == EMERGENCY_STOP
+            ):  # the devices first, the disk then; both before the answer
+                self._commands[command.id].note = self._stops.stop(
+                    [key for key in keys if key != GENERAL]
+                )
 
     def stopped_in_emergency(self) -> tuple[str, ...]:
         """Devices that obey nobody until that is cleared."""
@@ -258,7 +322,10 @@ class Node:
         for id_, command in list(self._commands.items()):
             if not command.missing or now >= command.due:
                 del self._commands[id_]
-                answers = {**command.answers, **{key or self.name: "no answer" for key in command.missing}}
+                answers = {
+                    **command.answers,
+                    **{key or self.name: "no answer" for key in command.missing},
+                }
                 held = command.verb != "hold" or all(a in _WELL_HELD for a in answers.values())
                 data: dict[str, Any] = {"answers": answers, "devices": command.data}
                 if command.note:
@@ -267,7 +334,7 @@ class Node:
                     data["emergency"] = list(self.stopped_in_emergency())
                 self.callee.answer(now, id_, held and not command.missing, data)
 
-    # --- reports of places -------------------------------------------------------------------------------------------
+    # --- reports of places --------------------------------------------------------------------
 
     def _take_report(self, now: float, key: str, report: Report) -> None:
         if isinstance(report, Ended):
@@ -313,13 +380,18 @@ class Node:
 
     def _raise(self, now: float, key: str, raised: Raised) -> None:
         if not raised.run:
-            self.callee.raise_event(now, raised.name, raised.data, source=key or self.name, latched=True)
+            self.callee.raise_event(
+                now, raised.name, raised.data, source=key or self.name, latched=True
+            )
         elif raised.run in self._at:
             source = self.action_of(raised.run)
-            self.callee.raise_event(now, raised.name, raised.data, source=source, latched=True, run=raised.run)
+            self.callee.raise_event(
+                now, raised.name, raised.data, source=source, latched=True, run=raised.run
+            )
 
     def _judge(self, source: str, judged: Judged) -> None:
-        """The verdict goes to the coordinator of the judged run: latched, so that a lost link only delays it."""
+        """The verdict goes to the coordinator of the judged run: latched, so that a lost link only
+        delays it."""
         said = VerdictSaid(judged.run, judged.status, judged.cause, judged.text)
         name = verdict_event(mission_of(judged.run))
         self.callee.raise_event(self._now, name, said.to_data(), source=source, latched=True)
@@ -328,10 +400,19 @@ class Node:
         try:
             peer = self.directory.where(asked.service)
         except DirectoryError as fault:
-            self.places[key].take(now, Answered(asked.id, Status.ERROR, {}, "unknown_service", str(fault)))
+            self.places[key].take(
+                now, Answered(asked.id, Status.ERROR, {}, "unknown_service", str(fault))
+            )
             return
         self._asked[asked.id] = key
-        call = Call(asked.id, asked.service, asked.arguments, asked.deadline, parent=asked.run, seed=asked.seed)
+        call = Call(
+            asked.id,
+            asked.service,
+            asked.arguments,
+            asked.deadline,
+            parent=asked.run,
+            seed=asked.seed,
+        )
         self.caller(peer).call(now, call)
 
     def _answer_runs(self, now: float) -> None:
@@ -347,9 +428,11 @@ class Node:
                 end = notice.outcome
                 key = self._asked.pop(end.id, None)
                 if key is not None:
-                    self.places[key].take(now, Answered(end.id, end.status, end.values, end.cause, end.text))
+                    self.places[key].take(
+                        now, Answered(end.id, end.status, end.values, end.cause, end.text)
+                    )
 
-    # --- services of the node itself ---------------------------------------------------------------------------------
+    # --- services of the node itself ----------------------------------------------------------
 
     def _memory_call(self, now: float, call: Call) -> Outcome:
         self._now = now

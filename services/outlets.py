@@ -1,4 +1,5 @@
-"""The sending ends of set-point streams: newest value wins, paced by absolute deadline, repeated while its run stands by it."""
+"""The sending ends of set-point streams: newest value wins, paced by absolute deadline, repeated
+while its run stands by it."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from services.comm.codec import LIMITS
-from services.comm.messages import SetPoint
-from services.runs import Sent
+from petrobot.services.comm.codec import LIMITS
+from petrobot.services.comm.messages import SetPoint
+from petrobot.services.runs import Sent
 
 MOST = (LIMITS[SetPoint.KIND] - 64) // 9
 """Numbers of a set point: 9 bytes each in its message, and room for the rest of it."""
@@ -26,20 +27,27 @@ class _Outlet:
 
 
 class Outlets:
-    """All streams that the runs of one place may send to; a machine: `publish`, `advance`, `due`."""
+    """All streams that the runs of one place may send to; a machine: `publish`, `advance`,
+    `due`."""
 
     def __init__(self, periods: Mapping[str, float]) -> None:
         self._outlets = {name: _Outlet(period) for name, period in periods.items()}
         self._open: dict[str, _Outlet] = {}
 
     def publish(self, now: float, run: str, stream: str, values: Sequence[float]) -> None:
-        """Make `values` the newest of a stream. Raises ValueError for an unknown stream or numbers that are not finite."""
+        """Make `values` the newest of a stream. Raises ValueError for an unknown stream or numbers
+        that are not finite."""
         outlet = self._outlets.get(stream)
         if outlet is None:
-            raise ValueError(f"no stream is named {stream!r}; services.toml has: {', '.join(self._outlets) or 'none'}")
+            raise ValueError(
+                f"no stream is named {stream!r}; services.toml has: "
+                f"{', '.join(self._outlets) or 'none'}"
+            )
         numbers = tuple(float(v) for v in values)
         if len(numbers) > MOST:
-            raise ValueError(f"set point of {stream!r}: expected at most {MOST} numbers, found {len(numbers):,}")
+            raise ValueError(
+                f"set point of {stream!r}: expected at most {MOST} numbers, found {len(numbers):,}"
+            )
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"set point of {stream!r} is not finite: {numbers}")
         if stream not in self._open:
@@ -58,13 +66,15 @@ class Outlets:
             del self._open[stream]
 
     def advance(self, now: float) -> list[Sent]:
-        """What is to be sent now: of each open stream at most one value in a period, new or repeated."""
+        """What is to be sent now: of each open stream at most one value in a period, new or
+        repeated."""
         sent = []
         for stream, outlet in self._open.items():
             if now + SLACK < outlet.next:
                 continue
             late = now - outlet.next
-            # absolute deadlines keep the rate; after a gap of more than a period the grid starts anew
+            # absolute deadlines keep the rate; after a gap of more than a period the grid starts
+            # anew
             outlet.next = (outlet.next if late < outlet.period else now) + outlet.period
             sent.append(Sent(outlet.run, stream, outlet.values, max(0.0, now - outlet.published)))
         return sent

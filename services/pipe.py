@@ -1,4 +1,5 @@
-"""Records between a node and its own processes: msgpack over a local socket pair, nothing blocks."""
+"""Records between a node and its own processes: msgpack over a local socket pair, nothing
+blocks."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ CHUNK = 1 << 18
 _NUMBER = struct.Struct("=Q")
 
 _ENDS: weakref.WeakSet[socket.socket] = weakref.WeakSet()
-"""Sockets of this process that none that it forks may hold: the other side would take it for this one."""
+"""Sockets of this process that none that it forks may hold: the other side would take it for this
+one."""
 
 
 class _Copy:
@@ -29,10 +31,11 @@ class _Copy:
 
 
 def keep_from_copies(*ends: socket.socket) -> None:
-    """From now on these sockets, and all pipes and links of this process, are closed in every process that it forks or executes.
+    """From now on these sockets, and all pipes and links of this process, are closed in every
+    process that it forks or executes.
 
-    A copy that comes back from the action that forked it, and uses the pipe to the node, ends there: two processes must not
-    both serve one run, nor both stop one device.
+    A copy that comes back from the action that forked it, and uses the pipe to the node, ends
+    there: two processes must not both serve one run, nor both stop one device.
     """
     _ENDS.update(ends)
     for end in _ENDS:
@@ -47,8 +50,8 @@ def _become_copy() -> None:
 
 
 class Pipe:
-    """One end. `post` takes a list and sends what fits; `read` gives whole lists. `closed` once the other end is gone; what it
-    has sent before can still be read."""
+    """One end. `post` takes a list and sends what fits; `read` gives whole lists. `closed` once the
+    other end is gone; what it has sent before can still be read."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -91,7 +94,8 @@ class Pipe:
                     self._unsent.clear()
 
     def read(self) -> list[list[Any]]:
-        """All lists that have come. Raises ValueError for what is not msgpack: user code has written into the pipe."""
+        """All lists that have come. Raises ValueError for what is not msgpack: user code has
+        written into the pipe."""
         if _Copy.made:
             os._exit(0)
         items: list[list[Any]] = []
@@ -107,7 +111,8 @@ class Pipe:
                     self.closed = self._ended = True
                     break
                 self._feed(data)
-                # Taken out before more is read: several large records that came together are more than its buffer holds.
+                # Taken out before more is read: several large records that came together are more
+                # than its buffer holds.
                 items += [item for item in self._unpacker if isinstance(item, list)]
         return items
 
@@ -124,7 +129,8 @@ class Pipe:
 
 
 class Counter:
-    """A number in memory that two processes share; it can be read after the death of the one that counts."""
+    """A number in memory that two processes share; it can be read after the death of the one that
+    counts."""
 
     def __init__(self, descriptor: int) -> None:
         """Take over a descriptor of `counter_memory`."""
@@ -155,7 +161,8 @@ def counter_memory() -> int:
 
 
 class NewestLink:
-    """Commands one way, states the other, as whole datagrams of a SOCK_SEQPACKET pair: of the states only the newest counts."""
+    """Commands one way, states the other, as whole datagrams of a SOCK_SEQPACKET pair: of the
+    states only the newest counts."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -168,7 +175,8 @@ class NewestLink:
         return self.socket.fileno()
 
     def send(self, items: list[Any]) -> bool:
-        """Send one datagram. False when the other end does not read or is gone; ValueError for more than fits into one."""
+        """Send one datagram. False when the other end does not read or is gone; ValueError for more
+        than fits into one."""
         data = msgpack.packb(items)
         try:
             self.socket.send(data)
@@ -176,7 +184,9 @@ class NewestLink:
             return False
         except OSError as fault:
             if fault.errno == errno.EMSGSIZE:
-                raise ValueError(f"{len(data)} bytes do not fit into one datagram; send less") from fault
+                raise ValueError(
+                    f"{len(data)} bytes do not fit into one datagram; send less"
+                ) from fault
             self.closed = True
             return False
         return True

@@ -1,4 +1,5 @@
-"""Where the runs of one device (or of none) take place; inline: the device's driver and its actions in the node itself."""
+"""Where the runs of one device (or of none) take place; inline: the device's driver and its actions
+in the node itself."""
 
 from __future__ import annotations
 
@@ -7,13 +8,13 @@ import logging
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from services.action import Status
-from services.callables import describe
-from services.comm.directory import ActionEntry
-from services.comm.messages import Executed
-from services.comm.plain import plain
-from services.device import PICTURE, Driver, picture_of, stop_at_once
-from services.remote import (
+from petrobot.services.action import Status
+from petrobot.services.callables import describe
+from petrobot.services.comm.directory import ActionEntry
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.plain import plain
+from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
+from petrobot.services.remote import (
     BARRED,
     CLEAR_EMERGENCY,
     EMERGENCY_STOP,
@@ -22,8 +23,8 @@ from services.remote import (
     DirectDevice,
     RemoteDriver,
 )
-from services.runner import DeviceControl, Runner
-from services.runs import Begin, Ended, Hold, Order, Report, Stop, Told
+from petrobot.services.runner import DeviceControl, Runner
+from petrobot.services.runs import Begin, Ended, Hold, Order, Report, Stop, Told
 
 _log = logging.getLogger(__name__)
 
@@ -31,18 +32,20 @@ SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
 class Place(Protocol):
-    """Runs of one device, or of all actions that need none. Orders in, reports out, nothing blocks."""
+    """Runs of one device, or of all actions that need none. Orders in, reports out, nothing
+    blocks."""
 
     @property
     def idle(self) -> bool:
-        """Whether `advance` would do nothing and `reports` say nothing until an order or a command comes."""
+        """Whether `advance` would do nothing and `reports` say nothing until an order or a command
+        comes."""
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
-        """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency`, `status` or `picture`;
-        a report `Told` with this id answers it."""
+        """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency`,
+        `status` or `picture`; a report `Told` with this id answers it."""
 
     def advance(self, now: float) -> None:
         """Do all that is due."""
@@ -58,7 +61,8 @@ class Place(Protocol):
 
 
 class InlinePlace:
-    """A place whose actions run in this process: in lock step, in a worker, and for services of the node's loop.
+    """A place whose actions run in this process: in lock step, in a worker, and for services of the
+    node's loop.
 
     Its device is a `driver` of this process, or one elsewhere at the end of a `remote`, or none.
     """
@@ -80,7 +84,8 @@ class InlinePlace:
         self._remote = RemoteDriver(self._post, clock)
         self._outside = remote if isinstance(remote, RemoteDriver) else None
         self.failed = ""
-        """Why the driver works no more: what it raised, and where. Its runs have ended, and no other begins."""
+        """Why the driver works no more: what it raised, and where. Its runs have ended, and no
+        other begins."""
         if self._cyclic is not None:
             self._remote.expect(self._cyclic.state)
         self._commands: list[DeviceCommand] = []
@@ -105,7 +110,8 @@ class InlinePlace:
         self._commands.append(command)
 
     def warm(self) -> None:
-        """Import all actions now, so that no call waits for it. One that fails says so when it is called."""
+        """Import all actions now, so that no call waits for it. One that fails says so when it is
+        called."""
         for action in self._actions:
             with contextlib.suppress(ImportError):
                 self._runner.load(action)
@@ -141,7 +147,8 @@ class InlinePlace:
             self._fail(now, fault)
 
     def _fail(self, now: float, fault: Exception) -> None:
-        """The driver has raised what it must not: its runs end, and it is stopped as far as it still can be."""
+        """The driver has raised what it must not: its runs end, and it is stopped as far as it
+        still can be."""
         self.failed = f"its driver failed: {describe(fault)}"
         _log.error("the driver of a device failed", exc_info=fault)
         driver, self._driver, self._cyclic = self._driver, None, None
@@ -209,7 +216,9 @@ class InlinePlace:
             return
         try:
             self._advance(now)
-        except Exception as fault:  # code of actions is guarded where it is called: this was the driver's
+        except (
+            Exception
+        ) as fault:  # code of actions is guarded where it is called: this was the driver's
             self._fail(now, fault)
 
     def _advance(self, now: float) -> None:

@@ -1,19 +1,20 @@
-"""What a driver may reach in real time: a real or simulated bus, a camera, and the receiving ends of streams."""
+"""What a driver may reach in real time: a real or simulated bus, a camera, and the receiving ends
+of streams."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from services.comm.canbus import CanBus
-from services.comm.credentials import credentials
-from services.comm.directory import DeviceEntry, Directory
-from services.comm.image import ImageSource
-from services.comm.messages import Event
-from services.comm.plain import plain
-from services.comm.stream import Incoming, StreamReceiver
-from services.context import checked
-from services.setpoints import SetpointReceiver
+from petrobot.services.comm.canbus import CanBus
+from petrobot.services.comm.credentials import credentials
+from petrobot.services.comm.directory import DeviceEntry, Directory
+from petrobot.services.comm.image import ImageSource
+from petrobot.services.comm.messages import Event
+from petrobot.services.comm.plain import plain
+from petrobot.services.comm.stream import Incoming, StreamReceiver
+from petrobot.services.context import checked
+from petrobot.services.setpoints import SetpointReceiver
 
 CAN_KEYS = ("interface", "channel", "bitrate")
 
@@ -22,7 +23,11 @@ class ProcessPorts:
     """Implements `services.device.Ports` for the driver of one device in its process."""
 
     def __init__(
-        self, directory: Directory, device: DeviceEntry, clock: Callable[[], float], tickets: Mapping[str, str]
+        self,
+        directory: Directory,
+        device: DeviceEntry,
+        clock: Callable[[], float],
+        tickets: Mapping[str, str],
     ) -> None:
         self._directory = directory
         self._device = device
@@ -41,44 +46,57 @@ class ProcessPorts:
         return self._clock()
 
     def can(self) -> CanBus:
-        """The bus that the device's keys `interface`, `channel`, `bitrate` (or its table `can`) name, as for python-can."""
+        """The bus that the device's keys `interface`, `channel`, `bitrate` (or its table `can`)
+        name, as for python-can."""
         if self._can is None:
-            from services.comm.can_ports import open_can  # python-can takes long to import; few processes need it
+            from petrobot.services.comm.can_ports import (
+                open_can,  # python-can takes long to import; few processes need it
+            )
 
             config = self._device.config
-            self._can = open_can(config.get("can") or {key: config[key] for key in CAN_KEYS if key in config})
+            self._can = open_can(
+                config.get("can") or {key: config[key] for key in CAN_KEYS if key in config}
+            )
         return self._can
 
     def images(self) -> ImageSource:
         """The image source that the device's key `source` names."""
         if self._images is None:
-            from services.comm.camera import open_images
+            from petrobot.services.comm.camera import open_images
 
             self._images = open_images(self._located(self._device.config), self._clock)
         return self._images
 
     def _located(self, config: Mapping[str, Any]) -> Mapping[str, Any]:
-        """With the path of a recording taken relative to services.toml. Raises ValueError if it is not there."""
+        """With the path of a recording taken relative to services.toml. Raises ValueError if it is
+        not there."""
         kind, _, path = str(config.get("source", "")).partition(":")
         if kind != "file" or not path:
             return config
         recording = self._directory.file(path)
         if not recording.is_file():
-            raise ValueError(f'source = "file:{path}": no file {recording}; write the path of a recording')
+            raise ValueError(
+                f'source = "file:{path}": no file {recording}; write the path of a recording'
+            )
         return {**config, "source": f"file:{recording}"}
 
     def stream(self, name: str) -> SetpointReceiver:
-        """The receiving end of a stream that services.toml leads to this device. Raises ValueError for any other."""
+        """The receiving end of a stream that services.toml leads to this device. Raises ValueError
+        for any other."""
         entry = self._directory.streams.get(name)
         if entry is None or entry.to != self._device.name:
-            raise ValueError(f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}")
+            raise ValueError(
+                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
+            )
         if name not in self._setpoints:
             self._setpoints[name] = setpoint = SetpointReceiver(entry.period, self._clock)
             self._incoming[name] = Incoming(entry.period, setpoint, self._tickets[name])
         if self._receiver is None:
             host = self._directory.nodes[self._device.node].host
             key = credentials(self._directory, self._device.node).stream_key(self._tickets[name])
-            self._receiver = StreamReceiver(self._device.name, self._incoming, host=host, key=key, clock=self._clock)
+            self._receiver = StreamReceiver(
+                self._device.name, self._incoming, host=host, key=key, clock=self._clock
+            )
         return self._setpoints[name]
 
     def raise_event(self, name: str, **data: Any) -> None:
@@ -93,7 +111,11 @@ class ProcessPorts:
 
     def stream_ports(self) -> dict[str, int]:
         """Port of each stream that is received here."""
-        return {} if self._receiver is None else dict.fromkeys(self._setpoints, self._receiver.address[1])
+        return (
+            {}
+            if self._receiver is None
+            else dict.fromkeys(self._setpoints, self._receiver.address[1])
+        )
 
     def poll(self) -> None:
         """Take in the set points that have come."""

@@ -1,4 +1,5 @@
-"""Tries an action out on a simulated clock, without node, device or network: for the tests of whoever writes actions."""
+"""Tries an action out on a simulated clock, without node, device or network: for the tests of
+whoever writes actions."""
 
 from __future__ import annotations
 
@@ -6,12 +7,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from services.action import Result, Status, error
-from services.comm.directory import MEMORY_CALLS, ActionEntry
-from services.comm.party import TICK
-from services.memory import Memory
-from services.place import InlinePlace
-from services.runs import Answered, Asked, Begin, Ended, Judged, Progressed, Raised, Report, Sent, Stop
+from petrobot.services.action import Result, Status, error
+from petrobot.services.comm.directory import MEMORY_CALLS, ActionEntry
+from petrobot.services.comm.party import TICK
+from petrobot.services.memory import Memory
+from petrobot.services.place import InlinePlace
+from petrobot.services.runs import (
+    Answered,
+    Asked,
+    Begin,
+    Ended,
+    Judged,
+    Progressed,
+    Raised,
+    Report,
+    Sent,
+    Stop,
+)
 
 NAME, RUN = "action", "rehearsal"
 
@@ -22,7 +34,8 @@ class StillRunningError(AssertionError):
 
 @dataclass
 class Rehearsal:
-    """What an action did: its result, and all that it told the world, with the simulated time since its begin (s)."""
+    """What an action did: its result, and all that it told the world, with the simulated time since
+    its begin (s)."""
 
     result: Result
     seconds: float
@@ -53,10 +66,11 @@ def rehearse(
 ) -> Rehearsal:
     """Run an action to its end in ticks of 4 ms of simulated time; takes milliseconds of real time.
 
-    `device` is a driver (`services.device.Driver`; a cyclic one is stepped), or whatever the action uses as `ctx.device`.
-    `services` answer its calls by name (the global memory is there anyway), `streams` gives the periods of those it
-    publishes to (s). `world(now)` is called each tick before the action, to let something happen. With `cancel_after` it is
-    cancelled then. Raises StillRunningError when it has not ended after `limit` seconds.
+    `device` is a driver (`services.device.Driver`; a cyclic one is stepped), or whatever the action
+    uses as `ctx.device`. `services` answer its calls by name (the global memory is there anyway),
+    `streams` gives the periods of those it publishes to (s). `world(now)` is called each tick
+    before the action, to let something happen. With `cancel_after` it is cancelled then. Raises
+    StillRunningError when it has not ended after `limit` seconds.
     """
     stage = _Stage(action, device, services or {}, streams or {})
     stage.place.take(0.0, Begin(RUN, NAME, arguments, None, seed))
@@ -69,7 +83,9 @@ def rehearse(
             cancel_after = None
         if stage.step():
             return stage.played
-    raise StillRunningError(f"the action has not ended after {limit:g} s; it has told: {stage.played}")
+    raise StillRunningError(
+        f"the action has not ended after {limit:g} s; it has told: {stage.played}"
+    )
 
 
 class _Prop:
@@ -143,4 +159,7 @@ class _Stage:
             return self._services[asked.service](**asked.arguments)
         if asked.service in MEMORY_CALLS:
             return self.played.memory.call(asked.service, asked.arguments)
-        return error("unknown_service", f"this rehearsal has no service {asked.service!r}; pass it in services")
+        return error(
+            "unknown_service",
+            f"this rehearsal has no service {asked.service!r}; pass it in services",
+        )

@@ -1,4 +1,5 @@
-"""A cyclic driver and the actions that use it, one command line apart: both ends as machines, inline and across processes."""
+"""A cyclic driver and the actions that use it, one command line apart: both ends as machines,
+inline and across processes."""
 
 from __future__ import annotations
 
@@ -7,18 +8,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
-from services.callables import describe, words_of
-from services.comm.plain import plain
-from services.device import Driver, stop_at_once
+from petrobot.services.callables import describe, words_of
+from petrobot.services.comm.plain import plain
+from petrobot.services.device import Driver, stop_at_once
 
 _log = logging.getLogger(__name__)
 
 COMMAND, STOP = "command", "stop"
 EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
-"""An operator's verbs: stop at once and obey no action any more; obey actions again (nothing moves by that alone)."""
+"""An operator's verbs: stop at once and obey no action any more; obey actions again (nothing moves
+by that alone)."""
 IN_EMERGENCY = "emergency stop: clear it with `petrobot estop --clear` when the cell is safe"
 NODE_SILENT = "node_silent"
-NODE_IS_SILENT = "the device's node was silent, so the device was stopped: look why the node stood still"
+NODE_IS_SILENT = (
+    "the device's node was silent, so the device was stopped: look why the node stood still"
+)
 BARRED: Mapping[str, str] = {EMERGENCY_STOP: IN_EMERGENCY, NODE_SILENT: NODE_IS_SILENT}
 """Why a device accepts no commands, in words: by the cause that its runs end with."""
 
@@ -43,9 +47,11 @@ class DeviceState:
     stopped: bool = False
     state: Mapping[str, Any] = field(default_factory=dict)
     refusal: tuple[int, str] = (0, "")
-    """Number of the last command that was refused (0: none), and why: a later command does not hide it."""
+    """Number of the last command that was refused (0: none), and why: a later command does not hide
+    it."""
     barred: str = ""
-    """Cause for which the device was stopped and accepts no commands (a key of `BARRED`); empty if it accepts them."""
+    """Cause for which the device was stopped and accepts no commands (a key of `BARRED`); empty if
+    it accepts them."""
 
 
 @runtime_checkable
@@ -61,15 +67,16 @@ class Refusing(Protocol):
         """Seconds since the driver last published its state."""
 
     def refusal(self, since: int) -> str | None:
-        """Why a command after number `since` was refused that no action has looked at; empty if none was, None as long as
-        the driver still has commands to take."""
+        """Why a command after number `since` was refused that no action has looked at; empty if
+        none was, None as long as the driver still has commands to take."""
 
 
 class RemoteDriver:
-    """The actions' end: implements `services.device.Remote` for them and `services.runner.DeviceControl` for the runner.
+    """The actions' end: implements `services.device.Remote` for them and
+    `services.runner.DeviceControl` for the runner.
 
-    `post` sends a command; `take` is given each newer state. Where the driver lives in the same process, `expect` is told
-    instead where to get it: nothing is put together that nobody looks at.
+    `post` sends a command; `take` is given each newer state. Where the driver lives in the same
+    process, `expect` is told instead where to get it: nothing is put together that nobody looks at.
     """
 
     def __init__(self, post: Callable[[DeviceCommand], None], clock: Callable[[], float]) -> None:
@@ -94,7 +101,8 @@ class RemoteDriver:
         return self
 
     def send(self, body: Mapping[str, Any]) -> int:
-        """Send a command; gives its number. Raises ConnectionError when the driver's process is gone."""
+        """Send a command; gives its number. Raises ConnectionError when the driver's process is
+        gone."""
         return self._number(COMMAND, plain(body, "command"))
 
     @property
@@ -104,8 +112,8 @@ class RemoteDriver:
 
     @property
     def refused(self) -> str:
-        """Why the last command was refused; empty if it was not. An action that reads the words decides what they mean; a refusal
-        that it never reads ends its run in ERROR."""
+        """Why the last command was refused; empty if it was not. An action that reads the words
+        decides what they mean; a refusal that it never reads ends its run in ERROR."""
         newest = self._newest
         if newest.refused:
             self._seen = newest.refusal[0]
@@ -182,7 +190,8 @@ class CyclicDriver:
         self._emergency = False
 
     def node_silent(self, now: float) -> None:
-        """Stop, and refuse every command until `node_speaks`: nobody could stop what the device does."""
+        """Stop, and refuse every command until `node_speaks`: nobody could stop what the device
+        does."""
         self._silent = True
         self.driver.stop(now)
 
@@ -229,7 +238,9 @@ class CyclicDriver:
         refused = why if number == self._handled else ""
         # A driver that computes with numpy answers with a numpy bool, which no message carries.
         stopped = bool(self.driver.stopped())
-        return DeviceState(self._handled, refused, stopped, self.driver.state(), self._refusal, self.barred)
+        return DeviceState(
+            self._handled, refused, stopped, self.driver.state(), self._refusal, self.barred
+        )
 
     def forget(self) -> None:
         """The actions' end is another one now: its numbers begin anew."""

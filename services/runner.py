@@ -1,4 +1,5 @@
-"""Runs actions: a machine that polls their coroutines, cancels them, holds them to their deadlines and guards their device."""
+"""Runs actions: a machine that polls their coroutines, cancels them, holds them to their deadlines
+and guards their device."""
 
 from __future__ import annotations
 
@@ -8,25 +9,28 @@ from dataclasses import replace
 from math import inf
 from typing import Any, Protocol
 
-from services.action import Cancelled, Result, Status
-from services.callables import check_arguments, describe, from_outside
-from services.comm.directory import ActionEntry, resolve
-from services.comm.messages import Executed
-from services.comm.plain import plain
-from services.context import RunContext, checked_result
-from services.execution import Execution, Hung, Phase, Returned
-from services.outlets import Outlets
-from services.remote import Refusing
-from services.runs import Answered, Begin, Ended, Hold, Order, Report, Stop
+from petrobot.services.action import Cancelled, Result, Status
+from petrobot.services.callables import check_arguments, describe, from_outside
+from petrobot.services.comm.directory import ActionEntry, resolve
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.plain import plain
+from petrobot.services.context import RunContext, checked_result
+from petrobot.services.execution import Execution, Hung, Phase, Returned
+from petrobot.services.outlets import Outlets
+from petrobot.services.remote import Refusing
+from petrobot.services.runs import Answered, Begin, Ended, Hold, Order, Report, Stop
 
 _log = logging.getLogger(__name__)
 
 GRACE = 0.5
-"""Seconds that a cancelled action has to clean up and its device to stand still before the stop routine is called."""
+"""Seconds that a cancelled action has to clean up and its device to stand still before the stop
+routine is called."""
 STOP_LIMIT = 2.0
-"""Seconds after the stop routine when the run ends although its device is not known to stand still; the device stays fenced."""
+"""Seconds after the stop routine when the run ends although its device is not known to stand still;
+the device stays fenced."""
 TAKEN_WITHIN = 1.0
-"""Seconds that a driver has to take the commands of a run that has returned: until then nobody knows whether it refuses one."""
+"""Seconds that a driver has to take the commands of a run that has returned: until then nobody
+knows whether it refuses one."""
 _AFTER = (Phase.STOPPING, Phase.SETTLING)
 
 
@@ -45,11 +49,13 @@ class DeviceControl(Protocol):
 
 
 class Runner:
-    """Runs of one place: of one device, at most one at a time (besides those that start at once), or of none, any number.
+    """Runs of one place: of one device, at most one at a time (besides those that start at once),
+    or of none, any number.
 
-    Orders come in by `take`, reports go out by `reports`; in between `advance(now)` does what is due. `clock` is what
-    `ctx.now` reads. `substitutes` replace actions by other callables. With `virtual` the declared computing time passes. With
-    `fenced` no run begins before the device is known to stand still.
+    Orders come in by `take`, reports go out by `reports`; in between `advance(now)` does what is
+    due. `clock` is what `ctx.now` reads. `substitutes` replace actions by other callables. With
+    `virtual` the declared computing time passes. With `fenced` no run begins before the device is
+    known to stand still.
     """
 
     def __init__(
@@ -129,7 +135,8 @@ class Runner:
         self._reports.append(report)
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s), None if only something that comes in can matter."""
+        """When `advance` has something to do at the latest (s), None if only something that comes
+        in can matter."""
         held = self._held_since is not None
         times = [] if held else [self._outlets.due()]
         times += [run.due() for run in self._runs.values() if not held or run.phase in _AFTER]
@@ -153,7 +160,8 @@ class Runner:
             self._reports += self._outlets.advance(now)
 
     def commands_taken(self, now: float) -> None:
-        """The driver has just been stepped: end the runs that only waited for it to take their last commands."""
+        """The driver has just been stepped: end the runs that only waited for it to take their last
+        commands."""
         for run in [run for run in self._runs.values() if run.phase is Phase.TAKING]:
             self._await_taking(now, run)
 
@@ -170,7 +178,7 @@ class Runner:
         self._runs.clear()
         return ends
 
-    # --- begin -------------------------------------------------------------------------------------------------------
+    # --- begin --------------------------------------------------------------------------------
 
     def _begin(self, begin: Begin) -> None:
         entry = self._actions.get(begin.action)
@@ -180,7 +188,9 @@ class Runner:
         if entry is None:
             self._refuse(begin, "unknown_service", f"no action {begin.action!r} here")
         elif self._fenced and not entry.at_once:
-            self._refuse(begin, "fenced", "the device is not known to stand still after an earlier run")
+            self._refuse(
+                begin, "fenced", "the device is not known to stand still after an earlier run"
+            )
         elif busy := self._taken_by(entry):
             self._refuse(begin, "busy", f"the device is taken by run {busy}")
         else:
@@ -189,7 +199,9 @@ class Runner:
     def _taken_by(self, entry: ActionEntry) -> str:
         if self._device is None:
             return ""
-        return next((i for i, run in self._runs.items() if not (entry.at_once and run.phase in _AFTER)), "")
+        return next(
+            (i for i, run in self._runs.items() if not (entry.at_once and run.phase in _AFTER)), ""
+        )
 
     def _refuse(self, begin: Begin, cause: str, text: str) -> None:
         self._reports.append(Ended(begin.id, Status.ERROR, {}, cause, text, Executed.NO))
@@ -217,7 +229,7 @@ class Runner:
         run.limit = None if begin.deadline is None else now + begin.deadline
         self._in_action(now, run, lambda: run.call(function, arguments))
 
-    # --- go on -------------------------------------------------------------------------------------------------------
+    # --- go on --------------------------------------------------------------------------------
 
     def _look_at_fence(self) -> None:
         if self._fenced and (self._device is None or self._device.stopped()):
@@ -241,7 +253,8 @@ class Runner:
             step()
         except Returned as returned:
             self._returned(now, run, returned.value)
-        except BaseException as fault:  # an action may raise SystemExit or its like: that ends its run, not the others'
+        # an action may raise SystemExit or its like: that ends its run, not the others'
+        except BaseException as fault:
             if from_outside(fault):
                 raise
             run.close()
@@ -260,7 +273,9 @@ class Runner:
             return
         if not isinstance(returned, Result):
             name = type(returned).__name__
-            self._give_up(now, run, "bad_result", f"returned a {name}; return success(), failure() or error()")
+            self._give_up(
+                now, run, "bad_result", f"returned a {name}; return success(), failure() or error()"
+            )
             return
         try:
             result = checked_result(run.begin.id, returned)
@@ -268,12 +283,17 @@ class Runner:
             self._give_up(now, run, "bad_result", self._with_refusal(run, str(fault)))
             return
         if self._virtual and run.entry.compute_time > 0:
-            run.phase, run.result, run.ready_at = Phase.COMPUTED, result, now + run.entry.compute_time
+            run.phase, run.result, run.ready_at = (
+                Phase.COMPUTED,
+                result,
+                now + run.entry.compute_time,
+            )
         else:
             self._finish(now, run, result)
 
     def _finish(self, now: float, run: Execution, result: Result) -> None:
-        """End the run as its action said, as soon as it is known that the driver has refused none of its commands."""
+        """End the run as its action said, as soon as it is known that the driver has refused none
+        of its commands."""
         if result.status is Status.ERROR:
             text = self._with_refusal(run, result.text)
             self._end(now, run, replace(result, text=text))
@@ -288,14 +308,17 @@ class Runner:
             text = f"the driver refused a command, and the action did not look at that: {refusal}"
             self._give_up(now, run, "command_refused", text)
         elif refusal is None and now >= run.ready_at - 1e-9:
-            text = f"the action returned, but the driver did not take its last command within {TAKEN_WITHIN:g} s"
+            text = (
+                "the action returned, but the driver did not take its last command "
+                f"within {TAKEN_WITHIN:g} s"
+            )
             self._give_up(now, run, "command_not_taken", text)
         elif refusal == "" and run.result is not None:
             self._end(now, run, run.result)
 
     def _with_refusal(self, run: Execution, text: str) -> str:
-        """The text of an ERROR, and what the driver refused without the action's looking, or that it is silent: that is often
-        the reason."""
+        """The text of an ERROR, and what the driver refused without the action's looking, or that
+        it is silent: that is often the reason."""
         if self._refusing is None:
             return text
         if refusal := self._refusing.refusal(run.sent_before):
@@ -304,12 +327,18 @@ class Runner:
             text = f"{text}; the driver has published nothing for {age:.1f} s"
         return text.lstrip("; ")
 
-    # --- end ---------------------------------------------------------------------------------------------------------
+    # --- end ----------------------------------------------------------------------------------
 
     @staticmethod
     def _give_up(now: float, run: Execution, cause: str, text: str) -> None:
         """The action broke: nobody leads its device any more, so the stop routine comes at once."""
-        run.phase, run.cause, run.text, run.abandoned, run.limit = Phase.SETTLING, cause, text, True, now
+        run.phase, run.cause, run.text, run.abandoned, run.limit = (
+            Phase.SETTLING,
+            cause,
+            text,
+            True,
+            now,
+        )
 
     def _stop(self, now: float, run: Execution, cause: str, text: str) -> None:
         if run.phase is Phase.NEW:
@@ -317,7 +346,8 @@ class Runner:
         elif run.phase not in _AFTER:
             text = self._with_refusal(run, text) if cause == "deadline" else text
             run.cause, run.text, run.result, run.limit = cause, text, None, now + GRACE
-            # A held device stands without having been stopped: released, it would go on without its run.
+            # A held device stands without having been stopped: released, it would go on without its
+            # run.
             run.abandoned = self.held
             self._outlets.close(run.begin.id)
             run.phase = Phase.SETTLING if run.over else Phase.STOPPING
@@ -334,11 +364,14 @@ class Runner:
             run.note(f"did not let itself be closed: {fault}")
 
     def _settle(self, now: float, run: Execution) -> None:
-        """End the run when its device stands still; call the stop routine when its grace is over."""
+        """End the run when its device stands still; call the stop routine when its grace is
+        over."""
         assert run.limit is not None
         self._outlets.close(run.begin.id)
         failed = Result(Status.ERROR, {}, run.cause, run.text)
-        if self._device is None or (self._device.stopped() and (run.stop_called or not run.abandoned)):
+        if self._device is None or (
+            self._device.stopped() and (run.stop_called or not run.abandoned)
+        ):
             self._end(now, run, failed)
         elif now < run.limit:
             return

@@ -1,4 +1,5 @@
-"""What a node and the place where its actions run say to each other about runs, as plain records that cross a socket."""
+"""What a node and the place where its actions run say to each other about runs, as plain records
+that cross a socket."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
-from services.comm.messages import Executed
+from petrobot.services.comm.messages import Executed
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ class Progressed:
 
 @dataclass(frozen=True, slots=True)
 class Raised:
-    """An internal event of a run (`run` is its id), or an external one of a device (`run` is empty)."""
+    """An internal event of a run (`run` is its id), or an external one of a device (`run` is
+    empty)."""
 
     KIND: ClassVar[str] = "raised"
     run: str
@@ -124,7 +126,8 @@ class Dropped:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A set point leaves: the newest value of a stream and how long ago its action published it (s)."""
+    """A set point leaves: the newest value of a stream and how long ago its action published it
+    (s)."""
 
     KIND: ClassVar[str] = "sent"
     run: str
@@ -147,7 +150,20 @@ Order = Begin | Stop | Answered | Hold
 Report = Ended | Judged | Progressed | Raised | Asked | Dropped | Sent | Told
 _RECORDS: dict[str, type[Order] | type[Report]] = {
     kind.KIND: kind
-    for kind in (Begin, Stop, Answered, Hold, Ended, Judged, Progressed, Raised, Asked, Dropped, Sent, Told)
+    for kind in (
+        Begin,
+        Stop,
+        Answered,
+        Hold,
+        Ended,
+        Judged,
+        Progressed,
+        Raised,
+        Asked,
+        Dropped,
+        Sent,
+        Told,
+    )
 }
 
 

@@ -1,4 +1,5 @@
-"""Scripted stand-ins for actions (`--mock FILE`): what each run of an action answers, after how long, with which events.
+"""Scripted stand-ins for actions (`--mock FILE`): what each run of an action answers, after how
+long, with which events.
 
 schema = 1
 [actions.locate_ball]            # one rule for all runs ...
@@ -23,8 +24,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from services.action import Context, Result, Status
-from services.comm.directory_file import nearest
+from petrobot.services.action import Context, Result, Status
+from petrobot.services.comm.directory_file import nearest
 
 _KEYS = ("status", "seconds", "values", "cause", "text", "events", "deferred")
 _EVENT_KEYS = ("after", "name", "data")
@@ -45,7 +46,8 @@ class Cue:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """What one run does: status, cause and values after a time drawn from `seconds` = (shortest, longest)."""
+    """What one run does: status, cause and values after a time drawn from `seconds` = (shortest,
+    longest)."""
 
     status: Status = Status.SUCCESS
     seconds: tuple[float, float] = (0.0, 0.0)
@@ -58,7 +60,8 @@ class Line:
 
 
 class Scripted:
-    """A callable action that plays its lines one run after the other, over and over. Takes any arguments."""
+    """A callable action that plays its lines one run after the other, over and over. Takes any
+    arguments."""
 
     def __init__(self, lines: Iterable[Line]) -> None:
         self._lines = tuple(lines)
@@ -74,7 +77,9 @@ class Scripted:
 async def _play(ctx: Context, line: Line) -> Result:
     begun = ctx.now
     shortest, longest = line.seconds
-    seconds = shortest if shortest == longest else float(ctx.random("script").uniform(shortest, longest))
+    seconds = (
+        shortest if shortest == longest else float(ctx.random("script").uniform(shortest, longest))
+    )
     for cue in sorted(line.events, key=lambda c: c.after):
         if cue.after > seconds:
             break
@@ -86,7 +91,8 @@ async def _play(ctx: Context, line: Line) -> Result:
 
 
 def load(path: str | Path) -> dict[str, Callable[..., Any]]:
-    """Scripted actions by name. Raises ScriptError with every fault of the file, OSError when it cannot be read."""
+    """Scripted actions by name. Raises ScriptError with every fault of the file, OSError when it
+    cannot be read."""
     source = Path(path)
     try:
         data = tomllib.loads(source.read_text(encoding="utf-8"))
@@ -132,7 +138,9 @@ def _line(table: Any) -> Line:
     deferred = table.get("deferred", False)
     if not isinstance(deferred, bool):
         raise ValueError(f"deferred is {deferred!r}; write true if its status is provisional")
-    return Line(Status(status), _seconds(table.get("seconds", 0.0)), values, cause, text, cues, deferred)
+    return Line(
+        Status(status), _seconds(table.get("seconds", 0.0)), values, cause, text, cues, deferred
+    )
 
 
 def _seconds(value: Any) -> tuple[float, float]:
@@ -144,6 +152,10 @@ def _seconds(value: Any) -> tuple[float, float]:
 
 
 def _cue(table: Any) -> Cue:
-    if not isinstance(table, dict) or set(table) - set(_EVENT_KEYS) or not isinstance(table.get("name"), str):
+    if (
+        not isinstance(table, dict)
+        or set(table) - set(_EVENT_KEYS)
+        or not isinstance(table.get("name"), str)
+    ):
         raise ValueError(f"event {table!r}; write {{ after = seconds, name = text, data = table }}")
     return Cue(_seconds(table.get("after", 0.0))[0], table["name"], table.get("data", {}))

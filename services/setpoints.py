@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from services.comm.stream import STALE_AFTER
+from petrobot.services.comm.stream import STALE_AFTER
 
 SLACK = 1e-6  # s: three periods to the tick are not yet too old
 
 
 class SetpointReceiver:
-    """Implements `services.device.Setpoint` for the driver, and the `Sink` of whoever receives the stream's messages."""
+    """Implements `services.device.Setpoint` for the driver, and the `Sink` of whoever receives the
+    stream's messages."""
 
     def __init__(self, period: float, clock: Callable[[], float]) -> None:
         self._limit = STALE_AFTER * period + SLACK
@@ -23,7 +24,8 @@ class SetpointReceiver:
 
     @property
     def values(self) -> tuple[float, ...] | None:
-        """The newest set point, None before the first or when it is stale (older than three of its periods)."""
+        """The newest set point, None before the first or when it is stale (older than three of its
+        periods)."""
         return self._values if self.age <= self._limit else None
 
     @property
@@ -33,7 +35,8 @@ class SetpointReceiver:
 
     @property
     def held(self) -> float:
-        """Seconds since the sender first sent these values, but for their way here: a repeat makes them no younger."""
+        """Seconds since the sender first sent these values, but for their way here: a repeat makes
+        them no younger."""
         return self._clock() - self._published
 
     @property

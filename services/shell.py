@@ -1,4 +1,5 @@
-"""The asyncio shell of a node in real time: its server, its clients to other nodes, its processes, and the clock."""
+"""The asyncio shell of a node in real time: its server, its clients to other nodes, its processes,
+and the clock."""
 
 from __future__ import annotations
 
@@ -11,31 +12,35 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from services.action import Status
-from services.comm.callee import Order
-from services.comm.client import Client
-from services.comm.credentials import credentials
-from services.comm.directory import Directory, DirectoryError
-from services.comm.latch import STATE, latch_of
-from services.comm.listening import listening, refuse_unusable
-from services.comm.notice import Notice
-from services.comm.parentage import GOOD_ORDER, outlive, wanted_with_parent
-from services.comm.security import require_key
-from services.comm.server import Server
-from services.emergency_stops import BEAT, BEAT_EVERY
-from services.node import GENERAL, Node, stream_service
-from services.place import Place
-from services.remote import IN_EMERGENCY
-from services.worker import Setup
-from services.worker_place import START_LIMIT, WorkerPlace
-from services.worker_pool import WorkerPool
+from petrobot.services.action import Status
+from petrobot.services.comm.callee import Order
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import credentials
+from petrobot.services.comm.directory import Directory, DirectoryError
+from petrobot.services.comm.latch import STATE, latch_of
+from petrobot.services.comm.listening import listening, refuse_unusable
+from petrobot.services.comm.notice import Notice
+from petrobot.services.comm.parentage import GOOD_ORDER, outlive, wanted_with_parent
+from petrobot.services.comm.security import require_key
+from petrobot.services.comm.server import Server
+from petrobot.services.emergency_stops import BEAT, BEAT_EVERY
+from petrobot.services.node import GENERAL, Node, stream_service
+from petrobot.services.place import Place
+from petrobot.services.remote import IN_EMERGENCY
+from petrobot.services.worker import Setup
+from petrobot.services.worker_place import START_LIMIT, WorkerPlace
+from petrobot.services.worker_pool import WorkerPool
 
 
 class NodeShell:
-    """A running node. Between `start` and `close` it serves; its loop does protocol and quick services only."""
+    """A running node. Between `start` and `close` it serves; its loop does protocol and quick
+    services only."""
 
-    def __init__(self, directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0) -> None:
-        """`text` is that of services.toml, as all processes of the node shall know it; `memory` limits workers (bytes)."""
+    def __init__(
+        self, directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0
+    ) -> None:
+        """`text` is that of services.toml, as all processes of the node shall know it; `memory`
+        limits workers (bytes)."""
         self._directory = directory
         self._name = name
         self._loop = asyncio.get_running_loop()
@@ -68,7 +73,9 @@ class NodeShell:
 
     def _devices(self) -> list[str]:
         devices = [d.name for d in self._directory.devices.values() if d.node == self._name]
-        general = any(a.node == self._name and not a.device for a in self._directory.actions.values())
+        general = any(
+            a.node == self._name and not a.device for a in self._directory.actions.values()
+        )
         return [*devices, GENERAL] if general else devices
 
     def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
@@ -82,11 +89,11 @@ class NodeShell:
             return WorkerPool(setup, clock=clock, changed=self._changed, wanted=wanted, most=most)
         return WorkerPlace(setup, clock=clock, changed=self._changed, wanted=wanted)
 
-    # --- life --------------------------------------------------------------------------------------------------------
+    # --- life ---------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started or the address cannot be had,
-        KeyNeededError."""
+        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started
+        or the address cannot be had, KeyNeededError."""
         host, port = self._directory.address(self._name)
         require_key(self._name, host, self._credentials.guarded)
         refuse_unusable(self._directory, self._name)
@@ -101,15 +108,20 @@ class NodeShell:
             self._serving = True
         except TimeoutError:
             await self.close()
-            late = ", ".join(device or "actions" for device, place in self._workers.items() if not place.ready)
-            raise DirectoryError((f"node {self._name}: {late} not up within {START_LIMIT:g} s",)) from None
+            late = ", ".join(
+                device or "actions" for device, place in self._workers.items() if not place.ready
+            )
+            raise DirectoryError(
+                (f"node {self._name}: {late} not up within {START_LIMIT:g} s",)
+            ) from None
         except BaseException:
             await self.close()
             raise
         self._step()
 
     def _beat(self) -> None:
-        """Let the processes of devices know that this loop runs: they stop their devices when it does not."""
+        """Let the processes of devices know that this loop runs: they stop their devices when it
+        does not."""
         for place in self._workers.values():
             for child in place.children():
                 if not child.pipe.unsent:  # it does not read: more of the same would only pile up
@@ -146,7 +158,7 @@ class NodeShell:
                 handle.cancel()
         self._timer = self._soon = None
 
-    # --- steps -------------------------------------------------------------------------------------------------------
+    # --- steps --------------------------------------------------------------------------------
 
     def _obey(self, now: float, orders: list[Order]) -> None:
         self.node.obey(now, orders)
@@ -182,12 +194,14 @@ class NodeShell:
         if due is not None:
             self._timer = self._loop.call_at(max(due, self._loop.time()), self._step)
 
-    # --- other nodes -------------------------------------------------------------------------------------------------
+    # --- other nodes --------------------------------------------------------------------------
 
     def _connect(self, peer: str) -> None:
         host, port = self._directory.address(peer)
         caller, key = self.node.callers[peer], self._credentials.key
-        client = Client(host, port, caller, on_notices=self._take_notices, key=key, tls=self._client_tls)
+        client = Client(
+            host, port, caller, on_notices=self._take_notices, key=key, tls=self._client_tls
+        )
         self._clients[peer] = client
         client.start()
 
@@ -214,14 +228,16 @@ class NodeShell:
 
 
 def _tickets(directory: Directory, node: str) -> dict[str, str]:
-    """What opens each stream that a node receives: a secret of the receiving device, a dot, and one of the stream."""
+    """What opens each stream that a node receives: a secret of the receiving device, a dot, and one
+    of the stream."""
     streams = [s for s in directory.streams.values() if directory.where(s.name) == node]
     devices = {stream.to: secrets.token_hex(16) for stream in streams}
     return {stream.name: f"{devices[stream.to]}.{secrets.token_hex(16)}" for stream in streams}
 
 
 def _end_with_launcher(launcher: int, over: asyncio.Event) -> None:
-    """End in good order when the launcher is gone; by force if that takes too long, be it that a service hangs in the loop."""
+    """End in good order when the launcher is gone; by force if that takes too long, be it that a
+    service hangs in the loop."""
     outlive(launcher, GOOD_ORDER)
     try:
         asyncio.get_running_loop().add_reader(os.pidfd_open(launcher), over.set)
@@ -229,7 +245,9 @@ def _end_with_launcher(launcher: int, over: asyncio.Event) -> None:
         over.set()
 
 
-async def serve(directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0) -> None:
+async def serve(
+    directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0
+) -> None:
     """Run a node until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
     over = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -243,7 +261,9 @@ async def serve(directory: Directory, name: str, text: str, *, mock: str = "", m
     if not shell.latch.kept:
         places = " and ".join(str(path.parent) for path in shell.latch.paths)
         print(
-            f"node {name}: an emergency stop could not be kept in {places}; name a folder in ${STATE}", file=sys.stderr
+            f"node {name}: an emergency stop could not be kept in {places}; name a folder in "
+            f"${STATE}",
+            file=sys.stderr,
         )
     if stopped := shell.node.stopped_in_emergency():
         print(f"node {name}: {', '.join(stopped)}: {IN_EMERGENCY}", file=sys.stderr, flush=True)

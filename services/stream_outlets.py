@@ -1,20 +1,22 @@
-"""All streams that a worker sends: finds the receivers through its node, keeps the connections, drops what cannot go now."""
+"""All streams that a worker sends: finds the receivers through its node, keeps the connections,
+drops what cannot go now."""
 
 from __future__ import annotations
 
 import math
 
-from services.comm.credentials import credentials
-from services.comm.directory import Directory
-from services.comm.stream import StreamSender
-from services.runs import Sent
+from petrobot.services.comm.credentials import credentials
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.stream import StreamSender
+from petrobot.services.runs import Sent
 
 ASK_AGAIN = 0.25
 """Seconds between questions for the address of a receiver that is not there."""
 
 
 class StreamOutlets:
-    """Sending ends by stream, made when first needed. A receiver that does not take a stream is asked for anew."""
+    """Sending ends by stream, made when first needed. A receiver that does not take a stream is
+    asked for anew."""
 
     def __init__(self, directory: Directory, sender: str) -> None:
         self._sender = sender
@@ -41,7 +43,16 @@ class StreamOutlets:
         if older is not None:
             older.close()
         key, entry = self._credentials.stream_key(ticket), self._streams[stream]
-        outlet = StreamSender(self._sender, stream, entry.period, host, port, receiver=entry.to, ticket=ticket, key=key)
+        outlet = StreamSender(
+            self._sender,
+            stream,
+            entry.period,
+            host,
+            port,
+            receiver=entry.to,
+            ticket=ticket,
+            key=key,
+        )
         outlet.advance()
         self._outlets[stream] = outlet
 

@@ -9,10 +9,12 @@ SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
 
 
 class Timers:
-    """A machine: `advance(now)` gives the names whose time has come. Who listens is the event board's business.
+    """A machine: `advance(now)` gives the names whose time has come. Who listens is the event
+    board's business.
 
-    Pulses lie on the grid start + k * period, where start is the moment of the first advance: so they do not drift, and
-    neither listening nor load moves them. Pulses missed while the process stood still are left out, not made up for.
+    Pulses lie on the grid start + k * period, where start is the moment of the first advance: so
+    they do not drift, and neither listening nor load moves them. Pulses missed while the process
+    stood still are left out, not made up for.
     """
 
     def __init__(self, periods: Mapping[str, float]) -> None:

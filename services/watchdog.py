@@ -1,7 +1,9 @@
-"""Ends what hangs in lock step, where no other process could: code that does not come back would stop simulated time for ever.
+"""Ends what hangs in lock step, where no other process could: code that does not come back would
+stop simulated time for ever.
 
-A thread looks now and then at the step that a node is in. What counts is the processor time that the step has used, and the
-time that it slept: on a busy machine a step takes long without hanging, and then it does neither.
+A thread looks now and then at the step that a node is in. What counts is the processor time that
+the step has used, and the time that it slept: on a busy machine a step takes long without hanging,
+and then it does neither.
 """
 
 from __future__ import annotations
@@ -17,25 +19,29 @@ import weakref
 from pathlib import Path
 from types import FrameType
 
-from services.execution import Execution, Hung
+from petrobot.services.execution import Execution, Hung
 
 _log = logging.getLogger(__name__)
 LIMIT = 10.0
-"""Seconds of processor time or sleep that one step of a node may take: a thousand times what the slowest honest one takes."""
+"""Seconds of processor time or sleep that one step of a node may take: a thousand times what the
+slowest honest one takes."""
 COMPILER = "numba"
-"""Package that may take longer: it compiles a kernel when that is first called, once on each machine."""
+"""Package that may take longer: it compiles a kernel when that is first called, once on each
+machine."""
 LOOK = 0.5
 """Seconds between looks."""
 IDLE = 1e-3
 """Seconds of processor time between two looks below which a thread did nothing."""
 ATTEMPTS, AGAIN = 4, 2.0
-"""How often the code is interrupted, and the seconds of the same kind in between: it may catch that. Then the process ends."""
+"""How often the code is interrupted, and the seconds of the same kind in between: it may catch
+that. Then the process ends."""
 _SERVICES = str(Path(__file__).parent)
 _raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
 
 class Watchdog:
-    """Watches the steps of one node. `begin` and `end` cost next to nothing: they are called each tick."""
+    """Watches the steps of one node. `begin` and `end` cost next to nothing: they are called each
+    tick."""
 
     def __init__(self, node: str) -> None:
         self._node = node
@@ -49,8 +55,11 @@ class Watchdog:
     def begin(self) -> None:
         """The node's code is called now, in this thread."""
         if self._thread is None:
-            # It must not keep alive what it watches: a cell that nobody closes is gone with its last user.
-            self._thread = threading.Thread(target=_look_on, args=(weakref.ref(self), self._over), daemon=True)
+            # It must not keep alive what it watches: a cell that nobody closes is gone with its
+            # last user.
+            self._thread = threading.Thread(
+                target=_look_on, args=(weakref.ref(self), self._over), daemon=True
+            )
             self._thread.start()
         self._watched = threading.get_ident()
         self._step += 1
@@ -70,8 +79,8 @@ class Watchdog:
             self._seen, self._used, self._attempts = self._step, 0.0, 0
         else:
             spent = now - self._before
-            # Who looks holds the interpreter, so the other thread waits for it now, whatever it did before: it slept only if it
-            # has used no time either.
+            # Who looks holds the interpreter, so the other thread waits for it now, whatever it did
+            # before: it slept only if it has used no time either.
             self._used += LOOK if spent < IDLE and _sleeps(self._watched) else spent
             if self._used >= LIMIT:
                 self._used, self._attempts = LIMIT - AGAIN, self._attempts + 1
@@ -84,9 +93,14 @@ class Watchdog:
             self._used, self._attempts = 0.0, 0
             return
         where = _described(frame)
-        text = f"node {self._node}: {where} has not come back for {LIMIT:g} s of processor time or sleep"
+        text = (
+            f"node {self._node}: {where} has not come back for {LIMIT:g} s of processor "
+            "time or sleep"
+        )
         if attempts > ATTEMPTS:
-            print(f"{text}, and cannot be interrupted; the process ends", file=sys.stderr, flush=True)
+            print(
+                f"{text}, and cannot be interrupted; the process ends", file=sys.stderr, flush=True
+            )
             os._exit(3)
         stack = "".join(traceback.format_stack(frame)) if frame is not None else ""
         _log.error("%s; it is interrupted\n%s", text, stack)
@@ -104,7 +118,9 @@ def _described(frame: FrameType | None) -> str:
     line, whose = "", "its code"
     while frame is not None:
         code = frame.f_code
-        if not line and not (code.co_filename.startswith(_SERVICES) and frame.f_globals.get("__name__") in _OWN):
+        if not line and not (
+            code.co_filename.startswith(_SERVICES) and frame.f_globals.get("__name__") in _OWN
+        ):
             line = f"{code.co_name} ({code.co_filename}:{frame.f_lineno})"
         owner = frame.f_locals.get("self")
         if isinstance(owner, Execution):
@@ -122,7 +138,10 @@ def _compiles(frame: FrameType | None) -> bool:
     return False
 
 
-_OWN = frozenset(f"services.{name}" for name in ("execution", "runner", "place", "node", "lockstep_node", "watchdog"))
+_OWN = frozenset(
+    f"services.{name}"
+    for name in ("execution", "runner", "place", "node", "lockstep_node", "watchdog")
+)
 
 
 def _processor_time(thread: int) -> float:
@@ -137,6 +156,8 @@ def _sleeps(thread: int) -> bool:
     """Whether a thread waits for something, as against being ready to run on a busy machine."""
     native = next((t.native_id for t in threading.enumerate() if t.ident == thread), None)
     try:
-        return Path(f"/proc/self/task/{native}/stat").read_text().rpartition(")")[2].split()[0] == "S"
+        return (
+            Path(f"/proc/self/task/{native}/stat").read_text().rpartition(")")[2].split()[0] == "S"
+        )
     except (OSError, IndexError):
         return False

@@ -1,8 +1,10 @@
-"""A process of a node: the warm worker that runs the actions of a device (or of none), or the process of a cyclic driver.
+"""A process of a node: the warm worker that runs the actions of a device (or of none), or the
+process of a cyclic driver.
 
-Forked by its keeper (`services/keeper.py`) with the numbers of the inherited sockets PIPE DESCRIPTORS LINK (-1: none) and of the
-memory BEGUN, where it counts the runs that it begins. The node says over the pipe which it is to be. A process that makes its
-device's driver and finds it cyclic serves the driver alone.
+Forked by its keeper (`services/keeper.py`) with the numbers of the inherited sockets PIPE
+DESCRIPTORS LINK (-1: none) and of the memory BEGUN, where it counts the runs that it begins. The
+node says over the pipe which it is to be. A process that makes its device's driver and finds it
+cyclic serves the driver alone.
 """
 
 from __future__ import annotations
@@ -21,27 +23,28 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from services.comm.directory import Directory, DirectoryError, parse
-from services.comm.latch import latch_of
-from services.comm.parentage import STOP_ROUTINE, outlive
-from services.device import Driver
-from services.device_process import DeviceError, DeviceLoop, take_priority
-from services.drivers import make_driver
-from services.emergency_stops import BEAT, Guard
-from services.pipe import Counter, NewestLink, Pipe, keep_from_copies
-from services.place import InlinePlace
-from services.ports import ProcessPorts
-from services.remote import DeviceCommand, DeviceState, RemoteDriver
-from services.runs import Begin, Order, Raised, Sent, flat, record
-from services.scripted import load as load_script
-from services.stream_outlets import StreamOutlets
+from petrobot.services.comm.directory import Directory, DirectoryError, parse
+from petrobot.services.comm.latch import latch_of
+from petrobot.services.comm.parentage import STOP_ROUTINE, outlive
+from petrobot.services.device import Driver
+from petrobot.services.device_process import DeviceError, DeviceLoop, take_priority
+from petrobot.services.drivers import make_driver
+from petrobot.services.emergency_stops import BEAT, Guard
+from petrobot.services.pipe import Counter, NewestLink, Pipe, keep_from_copies
+from petrobot.services.place import InlinePlace
+from petrobot.services.ports import ProcessPorts
+from petrobot.services.remote import DeviceCommand, DeviceState, RemoteDriver
+from petrobot.services.runs import Begin, Order, Raised, Sent, flat, record
+from petrobot.services.scripted import load as load_script
+from petrobot.services.stream_outlets import StreamOutlets
 
 POLL = 0.002
 """Seconds between looks at what a run waits for, when it is more than time."""
 BORN, READY, FAILED, COMMAND, PING, PONG = "born", "ready", "failed", "command", "ping", "pong"
 WANTED, STREAM_AT = "wanted", "stream_at"
 LINK_LOST, NO_MEMORY = 90, 91
-"""Exit codes: the driver's process is gone; not even the report of a run fits into the memory that is left."""
+"""Exit codes: the driver's process is gone; not even the report of a run fits into the memory that
+is left."""
 
 
 _IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -69,7 +72,8 @@ class Setup:
 
 
 class Worker:
-    """Runs actions: orders come and reports go over the node's pipe, device commands and states over the link."""
+    """Runs actions: orders come and reports go over the node's pipe, device commands and states
+    over the link."""
 
     def __init__(
         self,
@@ -90,7 +94,11 @@ class Worker:
         self._link = link
         self._ports = ports
         self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
-        actions = {a.name: a for a in directory.actions.values() if (a.node, a.device) == (setup.node, setup.device)}
+        actions = {
+            a.name: a
+            for a in directory.actions.values()
+            if (a.node, a.device) == (setup.node, setup.device)
+        }
         scripted = load_script(setup.mock) if setup.mock else {}
         self._place = InlinePlace(
             actions,
@@ -143,7 +151,8 @@ class Worker:
         """Stop device and runs without an order where nobody may be able to give one."""
         cause, before = guard.look(now), self._barred
         self._barred = cause
-        # With a run again and again: it may have begun between a clearing and the next stop, both since the last look.
+        # With a run again and again: it may have begun between a clearing and the next stop, both
+        # since the last look.
         if cause and (cause != before or self._place.runs):
             self._place.bar(now, cause)
 
@@ -214,7 +223,9 @@ def _first(node: Pipe) -> Setup:
             sys.exit(0)
 
 
-def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, begun: Counter) -> None:
+def serve(
+    node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, begun: Counter
+) -> None:
     """Be what the node says. Faults of the driver go back to it as text."""
     node.post([BORN, os.getpid()])
     setup = _first(node)
@@ -225,11 +236,22 @@ def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None
     try:
         directory = parse(setup.text, Path(setup.source))
         if link is None and setup.device:
-            ports = ProcessPorts(directory, directory.devices[setup.device], time.monotonic, setup.tickets)
+            ports = ProcessPorts(
+                directory, directory.devices[setup.device], time.monotonic, setup.tickets
+            )
             driver = make_driver(directory, directory.devices[setup.device], ports)
             guard = Guard(setup.device, latch_of(directory.source, setup.node))
             if driver.period and descriptors is not None:
-                node.post([READY, {"period": driver.period, "streams": ports.stream_ports(), "fifo": take_priority()}])
+                node.post(
+                    [
+                        READY,
+                        {
+                            "period": driver.period,
+                            "streams": ports.stream_ports(),
+                            "fifo": take_priority(),
+                        },
+                    ]
+                )
                 DeviceLoop(driver, ports, node, descriptors, guard).run()
                 return
             worker = Worker(setup, directory, node, begun, driver=driver, ports=ports, guard=guard)
@@ -245,20 +267,25 @@ def serve(node: Pipe, descriptors: socket.socket | None, link: NewestLink | None
 
 
 def log_to_stderr() -> None:
-    """Write what the modules of services log to the process's standard error, which is its node's log."""
+    """Write what the modules of services log to the process's standard error, which is its node's
+    log."""
     logging.basicConfig(
-        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=logging.INFO
+        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s",
+        level=logging.INFO,
     )
 
 
 def main(arguments: list[str]) -> None:
     """What the process does, once it is forked."""
     for number in _IGNORED:
-        # The node decides when its children end. A handler, unlike SIG_IGN, is not passed on to programs that user code starts.
+        # The node decides when its children end. A handler, unlike SIG_IGN, is not passed on to
+        # programs that user code starts.
         signal.signal(number, lambda *_: None)
     os.register_at_fork(after_in_child=_take_signals)
     log_to_stderr()
-    pipe, descriptors, link = (socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments[:3])
+    pipe, descriptors, link = (
+        socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments[:3]
+    )
     begun = Counter(int(arguments[3]))
     assert pipe is not None
     node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None

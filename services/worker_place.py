@@ -1,8 +1,10 @@
-"""Where the runs of one device (or runs of none) take place in real time: in processes of their own, watched by the node.
+"""Where the runs of one device (or runs of none) take place in real time: in processes of their
+own, watched by the node.
 
-A device without cyclic duty has one process, which owns its driver and runs its actions. A cyclic device has two: its driver's,
-and its actions'. A run that hangs is ended at its deadline (stop routine first, then its process is killed), one whose process
-died ends ERROR with executed = unknown; a dead process is started again, at once and then with a growing pause.
+A device without cyclic duty has one process, which owns its driver and runs its actions. A cyclic
+device has two: its driver's, and its actions'. A run that hangs is ended at its deadline (stop
+routine first, then its process is killed), one whose process died ends ERROR with executed =
+unknown; a dead process is started again, at once and then with a growing pause.
 """
 
 from __future__ import annotations
@@ -13,16 +15,16 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from services.action import Status
-from services.child import Child
-from services.comm.messages import Executed
-from services.device import PICTURE
-from services.device_process import HALT, LINKED
-from services.pipe import link_pair
-from services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP
-from services.runner import GRACE, STOP_LIMIT
-from services.runs import Begin, Ended, Hold, Order, Report, Stop, Told, flat, record
-from services.worker import (
+from petrobot.services.action import Status
+from petrobot.services.child import Child
+from petrobot.services.comm.messages import Executed
+from petrobot.services.device import PICTURE
+from petrobot.services.device_process import HALT, LINKED
+from petrobot.services.pipe import link_pair
+from petrobot.services.remote import CLEAR_EMERGENCY, EMERGENCY_STOP
+from petrobot.services.runner import GRACE, STOP_LIMIT
+from petrobot.services.runs import Begin, Ended, Hold, Order, Report, Stop, Told, flat, record
+from petrobot.services.worker import (
     COMMAND,
     FAILED,
     LINK_LOST,
@@ -36,22 +38,28 @@ from services.worker import (
 )
 
 SILENT = 0.1
-"""Seconds without an answer after which a worker counts as hanging, so that its device is stopped without it."""
+"""Seconds without an answer after which a worker counts as hanging, so that its device is stopped
+without it."""
 MARGIN = 0.5
-"""Seconds beyond grace and stop limit after which a worker that answers but does not end a run is killed all the same."""
+"""Seconds beyond grace and stop limit after which a worker that answers but does not end a run is
+killed all the same."""
 PAUSES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
-"""Seconds before a dead process is started again, by how often it died soon after its start without ending a run."""
+"""Seconds before a dead process is started again, by how often it died soon after its start without
+ending a run."""
 STABLE = 10.0
 """Seconds after which a process counts as well started."""
 START_LIMIT = 30.0
 """Seconds that a process has to become ready; then it is killed and started again."""
 NOT_READY = 10.0
-"""Seconds that a call waits for a process that could not be started; for one that is being started it waits `START_LIMIT`."""
+"""Seconds that a call waits for a process that could not be started; for one that is being started
+it waits `START_LIMIT`."""
 DRIVER_GONE = 0.25
-"""Seconds before actions that have lost the link to their driver are started again: it has most likely died itself."""
+"""Seconds before actions that have lost the link to their driver are started again: it has most
+likely died itself."""
 OUT_OF_MEMORY = "out_of_memory"
 DONE = {"hold": "held", "release": "released", CLEAR_EMERGENCY: "cleared", PICTURE: PICTURE}
-"""What actions without a device answer to a command when no process of theirs has anything to do; `stopped` to all others."""
+"""What actions without a device answer to a command when no process of theirs has anything to do;
+`stopped` to all others."""
 DRIVER_DIED = "the process of its device's driver died"
 
 
@@ -60,7 +68,9 @@ class Stage(Enum):
 
     DOWN = "none runs; the first is started when its pause is over"
     DRIVER_STARTS = "the process with the device's driver was started and is not ready"
-    ACTIONS_DOWN = "a cyclic driver is ready, its actions' process is started when its pause is over"
+    ACTIONS_DOWN = (
+        "a cyclic driver is ready, its actions' process is started when its pause is over"
+    )
     ACTIONS_START = "the process of the actions was started and is not ready; a cyclic driver is"
     READY = "runs are taken"
     CLOSED = "the node ends; nothing is started any more"
@@ -93,7 +103,8 @@ NEXT: Mapping[tuple[Stage, Happening], Stage] = {
     (Stage.READY, Happening.ALL_ENDED): Stage.DOWN,
     **{(stage, Happening.CLOSE): Stage.CLOSED for stage in Stage},
 }
-"""Every move. What is not in the table happens only out of turn (a second READY) and moves nothing."""
+"""Every move. What is not in the table happens only out of turn (a second READY) and moves
+nothing."""
 
 STARTING = (Stage.DRIVER_STARTS, Stage.ACTIONS_START)
 
@@ -121,7 +132,8 @@ Spawn = Callable[[Setup, Callable[[Child, list[Any]], None], Callable[[Child], N
 
 
 class WorkerPlace:
-    """Implements `services.place.Place` with processes. `changed` is called when something came from one of them."""
+    """Implements `services.place.Place` with processes. `changed` is called when something came
+    from one of them."""
 
     def __init__(
         self,
@@ -166,9 +178,10 @@ class WorkerPlace:
         self._retiring: Child | None = None
         """A process that was told to leave for lack of memory."""
         self._emergency = False
-        """Whether the device obeys nobody until that is cleared: its next process, too, is told at once."""
+        """Whether the device obeys nobody until that is cleared: its next process, too, is told at
+        once."""
 
-    # --- processes ---------------------------------------------------------------------------------------------------
+    # --- processes ----------------------------------------------------------------------------
 
     @property
     def stage(self) -> Stage:
@@ -177,15 +190,21 @@ class WorkerPlace:
 
     @property
     def ready(self) -> bool:
-        """Whether a run would be taken at once: its processes are up, and none of them is known to end."""
+        """Whether a run would be taken at once: its processes are up, and none of them is known to
+        end."""
         return self._stage is Stage.READY and not self.failed and self._takes_orders()
 
     def _takes_orders(self) -> bool:
-        return self._worker is not None and not self._worker.closed and not (self._owner and self._owner.closed)
+        return (
+            self._worker is not None
+            and not self._worker.closed
+            and not (self._owner and self._owner.closed)
+        )
 
     @property
     def condition(self) -> tuple[str, str]:
-        """`up` if a run would be taken, else `starting`, `restarting` or `failed`; and why, empty for the first two."""
+        """`up` if a run would be taken, else `starting`, `restarting` or `failed`; and why, empty
+        for the first two."""
         if self.ready:
             return "up", ""
         if self.failed:
@@ -243,19 +262,24 @@ class WorkerPlace:
         return True
 
     def _heard(self, child: Child, items: list[Any]) -> None:
-        """A process of this place says something; what a former one has said last counts no more."""
+        """A process of this place says something; what a former one has said last counts no
+        more."""
         if child is self._owner or child is self._worker:
             try:
                 self._take_words(child, items)
             except (ValueError, TypeError, IndexError, KeyError, AttributeError):
-                child.kill("it wrote into its pipe what is no record, and was killed")  # user code did, or a copy of it
+                child.kill(
+                    "it wrote into its pipe what is no record, and was killed"
+                )  # user code did, or a copy of it
             self._changed()
 
     def _take_words(self, child: Child, items: list[Any]) -> None:
         if items[0] == READY:
             self._take_ready(child, items[1])
         elif items[0] == FAILED:
-            self.failed = str(items[1])  # it is about to end: what is ordered now waits for its successor
+            self.failed = str(
+                items[1]
+            )  # it is about to end: what is ordered now waits for its successor
         elif items[0] == PONG:
             for run in self._runs.values():
                 run.pong = run.pong or run.stop is not None
@@ -286,7 +310,11 @@ class WorkerPlace:
             self._post_waiting(self._clock())
 
     def _post_waiting(self, now: float) -> None:
-        if self._frozen_since is not None and self._worker is not None and self._worker is not self._owner:
+        if (
+            self._frozen_since is not None
+            and self._worker is not None
+            and self._worker is not self._owner
+        ):
             self._worker.post(flat(Hold(True)))  # it was held while it was being started
         for run in self._runs.values():
             if run.posted is None:
@@ -304,7 +332,8 @@ class WorkerPlace:
         self._changed()
 
     def _actions_ended(self, child: Child) -> None:
-        """The actions of a cyclic device: its driver is stopped, and what was lost is told when it stands."""
+        """The actions of a cyclic device: its driver is stopped, and what was lost is told when it
+        stands."""
         assert self._owner is not None
         self._worker = None
         self._died = f"the process of its actions died: {child.describe()}"
@@ -319,7 +348,11 @@ class WorkerPlace:
 
     def _all_ended(self, child: Child) -> None:
         """The process with the driver, or the only one: nothing of this place runs any more."""
-        why, worker, was_ready = self.failed or child.describe(), self._worker, self._stage is not Stage.DRIVER_STARTS
+        why, worker, was_ready = (
+            self.failed or child.describe(),
+            self._worker,
+            self._stage is not Stage.DRIVER_STARTS,
+        )
         driver = child is self._owner and worker is not child and was_ready
         self._owner = self._worker = None
         self.streams = {}
@@ -339,11 +372,14 @@ class WorkerPlace:
             self._plan_restart(child)
 
     def _plan_restart(self, child: Child | None = None) -> None:
-        """Start again what has ended, or could not be started: the later, the more often that has happened of late."""
+        """Start again what has ended, or could not be started: the later, the more often that has
+        happened of late."""
         now = self._clock()
         if child is not None and child is self._retiring:
             self._retiring = None
-        elif child is None or child.code != LINK_LOST:  # one that has lost its driver dies of that one's death
+        elif (
+            child is None or child.code != LINK_LOST
+        ):  # one that has lost its driver dies of that one's death
             self._deaths = 0 if now - self._started > STABLE else self._deaths + 1
         pause = PAUSES[min(self._deaths, len(PAUSES)) - 1] if self._deaths else 0.0
         if child is not None and child.code == LINK_LOST:
@@ -351,7 +387,7 @@ class WorkerPlace:
         self._restart_at = now + pause
         self._changed()
 
-    # --- runs --------------------------------------------------------------------------------------------------------
+    # --- runs ---------------------------------------------------------------------------------
 
     def _take_end(self, end: Ended) -> None:
         if self._runs.pop(end.id, None) is None:
@@ -372,22 +408,33 @@ class WorkerPlace:
         self._release_if_over()
 
     def _lose_runs(self, cause: str, text: str, begun: int) -> None:
-        """The process of the runs is gone: each that it had begun ends, with what is known of it. What it had not begun by then
-        nobody has executed: it waits for the next process, or ends as it was stopped."""
+        """The process of the runs is gone: each that it had begun ends, with what is known of it.
+        What it had not begun by then nobody has executed: it waits for the next process, or ends as
+        it was stopped."""
         for id_, run in list(self._runs.items()):
             if run.posted is None:
                 continue
             if run.number > begun:
                 run.posted = None
                 if run.stop is not None:
-                    self._end(id_, run.stop.cause, f"{run.stop.text}; its process had not begun it".lstrip("; "))
+                    self._end(
+                        id_,
+                        run.stop.cause,
+                        f"{run.stop.text}; its process had not begun it".lstrip("; "),
+                    )
                 continue
             del self._runs[id_]
             took = self._clock() - run.posted
             if run.killed and run.stop is not None:
-                how = "it did not let go" if run.pong else "it blocked its process, which answered nothing"
+                how = (
+                    "it did not let go"
+                    if run.pong
+                    else "it blocked its process, which answered nothing"
+                )
                 its_text = f"{run.stop.text}; {how}; its process was killed".lstrip("; ")
-                self._lost.append(Ended(id_, Status.ERROR, {}, run.stop.cause, its_text, Executed.YES, took))
+                self._lost.append(
+                    Ended(id_, Status.ERROR, {}, run.stop.cause, its_text, Executed.YES, took)
+                )
             else:
                 executed = Executed.YES if cause == OUT_OF_MEMORY else Executed.UNKNOWN
                 self._lost.append(Ended(id_, Status.ERROR, {}, cause, text, executed, took))
@@ -395,7 +442,9 @@ class WorkerPlace:
     def _tell_lost(self, note: str) -> None:
         for end in self._lost:
             text = f"{end.text}; {note}" if note else end.text
-            self._reports.append(Ended(end.id, end.status, {}, end.cause, text, end.executed, end.seconds))
+            self._reports.append(
+                Ended(end.id, end.status, {}, end.cause, text, end.executed, end.seconds)
+            )
         self._lost, self._halt_due = [], None
         self._release_if_over()
         self._changed()
@@ -446,7 +495,9 @@ class WorkerPlace:
                 why = self.failed or self._died or "it is being started"
                 self._end(id_, "not_ready", f"its process is not ready: {why}")
             elif run.stop is None and now >= run.limit and self._frozen_since is None:
-                self._stop(now, run, Stop(id_, "deadline", f"not over after {run.begin.deadline:g} s"))
+                self._stop(
+                    now, run, Stop(id_, "deadline", f"not over after {run.begin.deadline:g} s")
+                )
             elif run.stop is not None:
                 self._chase(now, run)
 
@@ -474,18 +525,28 @@ class WorkerPlace:
 
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s)."""
-        times = [self._restart_at, self._halt_due, self._started + START_LIMIT if self._stage in STARTING else None]
+        times = [
+            self._restart_at,
+            self._halt_due,
+            self._started + START_LIMIT if self._stage in STARTING else None,
+        ]
         for run in self._runs.values():
             if run.posted is None:
                 times.append(self._wait_limit(run))
             elif run.stop is None:
-                times.append(run.limit if run.limit < math.inf and self._frozen_since is None else None)
+                times.append(
+                    run.limit if run.limit < math.inf and self._frozen_since is None else None
+                )
             elif not run.killed:
-                waits = [GRACE + STOP_LIMIT + MARGIN] if run.pong else [SILENT] * (not run.halted) + [GRACE]
+                waits = (
+                    [GRACE + STOP_LIMIT + MARGIN]
+                    if run.pong
+                    else [SILENT] * (not run.halted) + [GRACE]
+                )
                 times.append(run.stopped_at + min(waits))
         return min((t for t in times if t is not None), default=None)
 
-    # --- operator ----------------------------------------------------------------------------------------------------
+    # --- operator -----------------------------------------------------------------------------
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
         """Carry out an operator's command in the process that has the driver."""
@@ -518,7 +579,9 @@ class WorkerPlace:
         word, why = self.condition
         done = "not ready" if self._setup.device else DONE.get(verb, "stopped")
         answer = word if verb == "status" else done
-        self._reports.append(Told(id_, answer, {"text": why, "runs": list(self._runs), "pids": self.pids()}))
+        self._reports.append(
+            Told(id_, answer, {"text": why, "runs": list(self._runs), "pids": self.pids()})
+        )
 
     def _answer_commands(self) -> None:
         """The process that was to answer them has ended."""
@@ -539,7 +602,8 @@ class WorkerPlace:
             self._worker.post(flat(Hold(frozen)))
 
     def _release_if_over(self) -> None:
-        """The last of the held runs has ended, its device was stopped: the next one must not find it held."""
+        """The last of the held runs has ended, its device was stopped: the next one must not find
+        it held."""
         if self._runs or self._frozen_since is None:
             return
         self._freeze(False)
@@ -548,8 +612,12 @@ class WorkerPlace:
 
     def _told(self, told: Told) -> None:
         if told.id.startswith(HALT):
-            if self._halt_due is not None and told.id == f"{HALT}{self._halts}":  # not that of an earlier order
-                self._tell_lost("" if told.answer == "stopped" else "the device is not known to stand still")
+            if (
+                self._halt_due is not None and told.id == f"{HALT}{self._halts}"
+            ):  # not that of an earlier order
+                self._tell_lost(
+                    "" if told.answer == "stopped" else "the device is not known to stand still"
+                )
             return
         verb = self._commands.pop(told.id, "")
         if verb == "hold" and told.answer != "cannot hold":
@@ -558,7 +626,10 @@ class WorkerPlace:
         if verb == "status":
             answer, data["text"] = self.condition
             if answer == "up" and told.data.get("fenced"):
-                answer, data["text"] = "fenced", "the device is not known to stand still after an earlier run"
+                answer, data["text"] = (
+                    "fenced",
+                    "the device is not known to stand still after an earlier run",
+                )
         self._reports.append(Told(told.id, answer, data))
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
@@ -589,5 +660,8 @@ def _cause_of(child: Child) -> tuple[str, str]:
     if child.code == LINK_LOST:
         return "device_died", DRIVER_DIED
     if child.code == NO_MEMORY:
-        return OUT_OF_MEMORY, "the memory of its process was used up; see worker_memory_mb in services.toml"
+        return (
+            OUT_OF_MEMORY,
+            "the memory of its process was used up; see worker_memory_mb in services.toml",
+        )
     return "worker_died", f"the process of its action died: {child.describe()}"

@@ -1,7 +1,9 @@
-"""The runs of a node's actions that use no device: each has a worker process of its own while it runs.
+"""The runs of a node's actions that use no device: each has a worker process of its own while it
+runs.
 
-So an action that blocks, crashes or takes all its memory ends no other run. Workers are started as they are needed, with one more
-that waits for the next run, since a process takes its time to start. Those that nobody has needed for a while retire.
+So an action that blocks, crashes or takes all its memory ends no other run. Workers are started as
+they are needed, with one more that waits for the next run, since a process takes its time to start.
+Those that nobody has needed for a while retire.
 """
 
 from __future__ import annotations
@@ -10,13 +12,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from services.action import Status
-from services.child import Child
-from services.comm.messages import Executed
-from services.device import PICTURE
-from services.runs import Answered, Asked, Begin, Dropped, Ended, Order, Report, Stop, Told
-from services.worker import Setup
-from services.worker_place import DONE, Spawn, Stage, WorkerPlace
+from petrobot.services.action import Status
+from petrobot.services.child import Child
+from petrobot.services.comm.messages import Executed
+from petrobot.services.device import PICTURE
+from petrobot.services.runs import Answered, Asked, Begin, Dropped, Ended, Order, Report, Stop, Told
+from petrobot.services.worker import Setup
+from petrobot.services.worker_place import DONE, Spawn, Stage, WorkerPlace
 
 KEPT = 2
 """Idle workers that stay however long nothing is to be done."""
@@ -34,7 +36,8 @@ class _Gathered:
 
 
 class WorkerPool:
-    """Implements `services.place.Place` for actions without a device, with one `WorkerPlace` for each worker.
+    """Implements `services.place.Place` for actions without a device, with one `WorkerPlace` for
+    each worker.
 
     `most` is how many workers there may be; a run beyond that is refused: `busy`, executed = no.
     """
@@ -56,12 +59,13 @@ class WorkerPool:
         self._most = most
         self._spawn = spawn
         self._workers: dict[int, WorkerPlace] = {}
-        """By number from 1, the lowest first: a node that has little to do uses the same ones again and again."""
+        """By number from 1, the lowest first: a node that has little to do uses the same ones again
+        and again."""
         self._leaving: list[WorkerPlace] = []
         self._idle_since: dict[int, float] = {}
         self._touched: set[int] = set()
-        """Those to which something has happened since the last step. The others need no look before they are due: a step must
-        not take longer the more workers there are."""
+        """Those to which something has happened since the last step. The others need no look before
+        they are due: a step must not take longer the more workers there are."""
         self._due: dict[int, float] = {}
         self._soonest = math.inf
         self._at: dict[str, int] = {}
@@ -76,7 +80,7 @@ class WorkerPool:
         self.streams: Mapping[str, int] = {}
         """Actions without a device receive no stream."""
 
-    # --- workers -----------------------------------------------------------------------------------------------------
+    # --- workers ------------------------------------------------------------------------------
 
     @property
     def ready(self) -> bool:
@@ -86,13 +90,20 @@ class WorkerPool:
     @property
     def failed(self) -> str:
         """Why a worker could not be started, empty if one is up or none has failed."""
-        return "" if self.ready else next((w.failed for w in self._workers.values() if w.failed), "")
+        return (
+            "" if self.ready else next((w.failed for w in self._workers.values() if w.failed), "")
+        )
 
     @property
     def condition(self) -> tuple[str, str]:
-        """`up` if a run would be taken, else `busy`, `starting`, `restarting` or `failed`; and why."""
+        """`up` if a run would be taken, else `busy`, `starting`, `restarting` or `failed`; and
+        why."""
         if self._idle() or len(self._workers) < self._most:
-            return ("up", "") if self.ready else next((w.condition for w in self._workers.values()), ("starting", ""))
+            return (
+                ("up", "")
+                if self.ready
+                else next((w.condition for w in self._workers.values()), ("starting", ""))
+            )
         return "busy", self._full()
 
     def _full(self) -> str:
@@ -130,7 +141,8 @@ class WorkerPool:
         self._changed()
 
     def _idle(self) -> list[int]:
-        """Workers without a run, the best first: ready ones, then those that start, then those that wait to be started again."""
+        """Workers without a run, the best first: ready ones, then those that start, then those that
+        wait to be started again."""
         idle = [number for number, worker in self._workers.items() if not worker.busy]
         return sorted(idle, key=lambda number: (self._rank(number), number))
 
@@ -140,16 +152,24 @@ class WorkerPool:
 
     def children(self) -> list[Child]:
         """Its processes, those included that were told to leave."""
-        return [child for worker in (*self._workers.values(), *self._leaving) for child in worker.children()]
+        return [
+            child
+            for worker in (*self._workers.values(), *self._leaving)
+            for child in worker.children()
+        ]
 
-    # --- runs --------------------------------------------------------------------------------------------------------
+    # --- runs ---------------------------------------------------------------------------------
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
         if isinstance(order, Begin):
             self._begin(now, order)
         elif isinstance(order, Stop | Answered):
-            known = self._at.get(order.id) if isinstance(order, Stop) else self._asked.pop(order.id, None)
+            known = (
+                self._at.get(order.id)
+                if isinstance(order, Stop)
+                else self._asked.pop(order.id, None)
+            )
             if known in self._workers:
                 self._touched.add(known)
                 self._workers[known].take(now, order)
@@ -157,14 +177,18 @@ class WorkerPool:
     def _begin(self, now: float, begin: Begin) -> None:
         number = self._choose()
         if number is None:
-            self._reports.append(Ended(begin.id, Status.ERROR, {}, "busy", self._full(), Executed.NO))
+            self._reports.append(
+                Ended(begin.id, Status.ERROR, {}, "busy", self._full(), Executed.NO)
+            )
             return
         self._at[begin.id] = number
         self._touched.add(number)
         if self._held:
             self._workers[number].command(now, "", "hold")
         self._workers[number].take(now, begin)
-        if len(self._workers) < self._most and all(worker.busy for worker in self._workers.values()):
+        if len(self._workers) < self._most and all(
+            worker.busy for worker in self._workers.values()
+        ):
             self._add()
 
     def _choose(self) -> int | None:
@@ -194,7 +218,8 @@ class WorkerPool:
             self._retire(now)
 
     def _retire(self, now: float) -> None:
-        """Of idle workers only the lowest numbers stay; the others leave when they have been idle for long."""
+        """Of idle workers only the lowest numbers stay; the others leave when they have been idle
+        for long."""
         before = self._idle_since
         spare = sorted(number for number, worker in self._workers.items() if not worker.busy)[KEPT:]
         self._idle_since = {number: before.get(number, now) for number in spare}
@@ -251,23 +276,25 @@ class WorkerPool:
             self._asked.pop(report.id, None)
         self._reports.append(report)
 
-    # --- streams -----------------------------------------------------------------------------------------------------
+    # --- streams ------------------------------------------------------------------------------
 
     def _want(self, number: int, stream: str) -> None:
         self._streams.setdefault(stream, set()).add(number)
         self._wanted(stream)
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
-        """Tell the workers that have asked where a stream is received: another one would take the stream over."""
+        """Tell the workers that have asked where a stream is received: another one would take the
+        stream over."""
         for number in self._streams.pop(stream, ()):
             if number in self._workers:
                 self._workers[number].stream_at(stream, host, port, ticket)
 
-    # --- operator ----------------------------------------------------------------------------------------------------
+    # --- operator -----------------------------------------------------------------------------
 
     def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
-        """Carry out an operator's command in every worker that has a run. What only the node knows needs none of them:
-        `status` is answered although all of them may be blocked by their actions."""
+        """Carry out an operator's command in every worker that has a run. What only the node knows
+        needs none of them: `status` is answered although all of them may be blocked by their
+        actions."""
         if verb in ("hold", "release"):
             self._held = verb == "hold"
         asked = set() if verb in ("status", PICTURE) else set(self._at.values())
@@ -289,10 +316,18 @@ class WorkerPool:
         if not command.missing:
             del self._commands[told.id]
             good = DONE.get(command.verb, "stopped")
-            self._tell(told.id, next((answer for answer in command.answers if answer != good), good))
+            self._tell(
+                told.id, next((answer for answer in command.answers if answer != good), good)
+            )
 
     def _tell(self, id_: str, word: str, why: str = "") -> None:
-        data = {"text": why, "runs": list(self._at), "pids": self.pids(), "state": {}, "workers": len(self._workers)}
+        data = {
+            "text": why,
+            "runs": list(self._at),
+            "pids": self.pids(),
+            "state": {},
+            "workers": len(self._workers),
+        }
         self._reports.append(Told(id_, word, data))
 
     def close(self, now: float) -> None:

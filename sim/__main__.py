@@ -1,4 +1,4 @@
-"""Launches the simulated laboratory: `python -m sim [--services FILE] [--lockstep]`."""
+"""Launches the simulated laboratory: `python -m petrobot.sim [--services FILE] [--lockstep]`."""
 
 from __future__ import annotations
 
@@ -8,26 +8,29 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from services.comm.directory import Directory, DirectoryError, load, resolve
-from services.comm.lockstep import CellError
-from services.comm.lockstep_process import run_member
-from services.comm.quantities import number
-from services.comm.security import KeyFileError, KeyNeededError
-from sim.realtime import serve
-from sim.truth import LaboratoryError
+from petrobot.services.comm.directory import Directory, DirectoryError, load, resolve
+from petrobot.services.comm.lockstep import CellError
+from petrobot.services.comm.lockstep_process import run_member
+from petrobot.services.comm.quantities import number
+from petrobot.services.comm.security import KeyFileError, KeyNeededError
+from petrobot.sim.realtime import serve
+from petrobot.sim.truth import LaboratoryError
 
-EXAMPLE = "example:\n  python -m sim --services services.toml"
+EXAMPLE = "example:\n  python -m petrobot.sim --services services.toml"
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = argparse.ArgumentParser(
-        prog="python -m sim",
+        prog="python -m petrobot.sim",
         description="Launches the simulated laboratory: the node of services.toml with a key sim.",
-        epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or cell file, 3 the cell lost a party",
+        epilog=f"{EXAMPLE}\n\nexit codes: 0 ended by SIGTERM, 2 bad services.toml or cell "
+        "file, 3 the cell lost a party",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands.add_argument("--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file")
+    commands.add_argument(
+        "--services", metavar="FILE", type=Path, default=Path("services.toml"), help="location file"
+    )
     commands.add_argument("--lockstep", action="store_true", help="be a member of a lock-step cell")
     commands.add_argument(
         "--await-coordinator",
@@ -44,10 +47,15 @@ def read(path: Path) -> tuple[Directory, str]:
     try:
         directory = load(path)
     except OSError as fault:
-        raise DirectoryError((f"{path}: {fault.strerror}; name the file with --services",)) from fault
+        raise DirectoryError(
+            (f"{path}: {fault.strerror}; name the file with --services",)
+        ) from fault
     name = directory.laboratory()
     if not name:
-        text = 'no node is simulated; write sim = "sim.laboratory:make_laboratory" in one [nodes.NAME]'
+        text = (
+            'no node is simulated; write sim = "petrobot.sim.laboratory:make_laboratory" '
+            "in one [nodes.NAME]"
+        )
         raise DirectoryError((f"{path}: {text}",))
     return directory, name
 
@@ -62,11 +70,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run_member(directory, name, laboratory, options.await_coordinator)
         else:
             asyncio.run(serve(directory, name))
-    except (DirectoryError, LaboratoryError, KeyNeededError, KeyFileError, ImportError, ValueError, OSError) as fault:
-        print(f"python -m sim: {fault}", file=sys.stderr)
+    except (
+        DirectoryError,
+        LaboratoryError,
+        KeyNeededError,
+        KeyFileError,
+        ImportError,
+        ValueError,
+        OSError,
+    ) as fault:
+        print(f"python -m petrobot.sim: {fault}", file=sys.stderr)
         return 2
     except CellError as fault:
-        print(f"python -m sim: {fault}", file=sys.stderr)
+        print(f"python -m petrobot.sim: {fault}", file=sys.stderr)
         return 3
     return 0
 

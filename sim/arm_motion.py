@@ -1,10 +1,11 @@
-"""A step of the arm's joints as pure numbers: motors, semi-implicit Euler, dry friction, hard stops. A kernel of sim/puma.py."""
+"""A step of the arm's joints as pure numbers: motors, semi-implicit Euler, dry friction, hard
+stops. A kernel of sim/puma.py."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from services.comm.compiled import kernel
+from petrobot.services.comm.compiled import kernel
 
 Six = tuple[float, float, float, float, float, float]
 """One number a joint, base to flange."""
@@ -13,13 +14,14 @@ Matrix = tuple[Six, Six, Six, Six, Six, Six]
 STILL = 1e-4
 """rad/s; slower than this and held by friction, a joint stops."""
 FADE = 0.15
-"""Above its greatest speed the motor's torque fades to nothing within this share of it (back EMF)."""
+"""Above its greatest speed the motor's torque fades to nothing within this share of it (back
+EMF)."""
 
 
 @kernel
 def motor(tau: float, limit: float, speed: float, greatest: float) -> float:
-    """Torque (N m) of a motor that is asked for `tau`: within its limit, and beyond its greatest speed less, at last none, for
-    what would speed it up."""
+    """Torque (N m) of a motor that is asked for `tau`: within its limit, and beyond its greatest
+    speed less, at last none, for what would speed it up."""
     high = low = limit
     if speed > greatest:
         high = max(0.0, 1.0 - (speed / greatest - 1.0) / FADE) * limit
@@ -56,7 +58,14 @@ def held(drive: Six, bias: Six, hold: Six) -> bool:
 
 @kernel
 def _row(row: Six, t: Six) -> float:
-    return row[0] * t[0] + row[1] * t[1] + row[2] * t[2] + row[3] * t[3] + row[4] * t[4] + row[5] * t[5]
+    return (
+        row[0] * t[0]
+        + row[1] * t[1]
+        + row[2] * t[2]
+        + row[3] * t[3]
+        + row[4] * t[4]
+        + row[5] * t[5]
+    )
 
 
 @kernel
@@ -81,10 +90,12 @@ def _stopping(friction: float, speed: float, gain: float, hold: float) -> float:
 
 @kernel
 def rubbed(dt: float, speed: Six, inverse: Matrix, before: Six, hold: Six) -> tuple[Six, Six]:
-    """Dry friction (N m) and the speeds that it leaves: the torque that would stop a joint within the step, at most `hold`.
+    """Dry friction (N m) and the speeds that it leaves: the torque that would stop a joint within
+    the step, at most `hold`.
 
-    Last step's friction `before` is the first guess (already in `speed`), so the coupling of the joints settles over a few
-    steps. Where the guess was right, as it is while all joints slide, there is nothing to take off.
+    Last step's friction `before` is the first guess (already in `speed`), so the coupling of the
+    joints settles over a few steps. Where the guess was right, as it is while all joints slide,
+    there is nothing to take off.
     """
     friction = (
         _stopping(before[0], speed[0], dt * inverse[0][0], hold[0]),
@@ -107,12 +118,20 @@ def rubbed(dt: float, speed: Six, inverse: Matrix, before: Six, hold: Six) -> tu
 
 @kernel
 def accelerated(
-    dt: float, qd: Six, drive: Six, bias: Six, inverse: Matrix, viscous: Six, friction: Six, hold: Six
+    dt: float,
+    qd: Six,
+    drive: Six,
+    bias: Six,
+    inverse: Matrix,
+    viscous: Six,
+    friction: Six,
+    hold: Six,
 ) -> tuple[Six, Six]:
     """Dry friction (N m) and speeds (rad/s) after `dt` (s).
 
-    `drive`: the motors' torques; `bias`: those of gravity, Coriolis and centrifugal forces; `viscous` (N m s/rad);
-    `friction`: the last step's; `hold`: what friction and brakes can hold at most.
+    `drive`: the motors' torques; `bias`: those of gravity, Coriolis and centrifugal forces;
+    `viscous` (N m s/rad); `friction`: the last step's; `hold`: what friction and brakes can hold at
+    most.
     """
     torque = (
         drive[0] - bias[0] - viscous[0] * qd[0] + friction[0],
@@ -132,7 +151,8 @@ def _stopped(q: float, v: float, low: float, high: float) -> tuple[float, float]
 
 @kernel
 def moved(dt: float, q: Six, speed: Six, lower: Six, upper: Six) -> tuple[Six, Six]:
-    """Angles (rad) and speeds after `dt` (s); a joint that comes to an end of its range stops there."""
+    """Angles (rad) and speeds after `dt` (s); a joint that comes to an end of its range stops
+    there."""
     q0, v0 = _stopped(q[0] + dt * speed[0], speed[0], lower[0], upper[0])
     q1, v1 = _stopped(q[1] + dt * speed[1], speed[1], lower[1], upper[1])
     q2, v2 = _stopped(q[2] + dt * speed[2], speed[2], lower[2], upper[2])
@@ -161,7 +181,8 @@ def stepped(
 ) -> tuple[Six, Six, Six, bool]:
     """Angles, speeds and dry friction after `dt` (s), and whether the arm stands still from now on.
 
-    `tau`: what the motors are asked for; `limit` (N m), `greatest` (rad/s): theirs; `stick` (N m): what holds a joint at rest.
+    `tau`: what the motors are asked for; `limit` (N m), `greatest` (rad/s): theirs; `stick` (N m):
+    what holds a joint at rest.
     """
     drive = motors(tau, limit, qd, greatest)
     friction, speed = accelerated(dt, qd, drive, bias, inverse, viscous, friction, hold)
@@ -185,22 +206,45 @@ def _six(numbers: Sequence[float], first: int) -> Six:
 
 @kernel
 def _matrix(rows: Sequence[float]) -> Matrix:
-    return _six(rows, 0), _six(rows, 6), _six(rows, 12), _six(rows, 18), _six(rows, 24), _six(rows, 30)
+    return (
+        _six(rows, 0),
+        _six(rows, 6),
+        _six(rows, 12),
+        _six(rows, 18),
+        _six(rows, 24),
+        _six(rows, 30),
+    )
 
 
 @kernel
 def stepped_packed(
-    dt: float, q: Six, qd: Six, tau: Six, bias: Six, friction: Six, inverse: Sequence[float], numbers: Sequence[float]
+    dt: float,
+    q: Six,
+    qd: Six,
+    tau: Six,
+    bias: Six,
+    friction: Six,
+    inverse: Sequence[float],
+    numbers: Sequence[float],
 ) -> tuple[Six, Six, Six, bool]:
-    """`stepped`, where what seldom changes comes packed: the matrix row by row, then limit, greatest, viscous, hold, stick, lower
-    and upper in one. Compiled, handing those over as tuples takes as long as the step itself."""
+    """`stepped`, where what seldom changes comes packed: the matrix row by row, then limit,
+    greatest, viscous, hold, stick, lower and upper in one. Compiled, handing those over as tuples
+    takes as long as the step itself."""
     limit, greatest, viscous = _six(numbers, 0), _six(numbers, 6), _six(numbers, 12)
-    hold, stick, lower, upper = _six(numbers, 18), _six(numbers, 24), _six(numbers, 30), _six(numbers, 36)
+    hold, stick, lower, upper = (
+        _six(numbers, 18),
+        _six(numbers, 24),
+        _six(numbers, 30),
+        _six(numbers, 36),
+    )
     matrix = _matrix(inverse)
-    return stepped(dt, q, qd, tau, bias, matrix, friction, limit, greatest, viscous, hold, stick, lower, upper)
+    return stepped(
+        dt, q, qd, tau, bias, matrix, friction, limit, greatest, viscous, hold, stick, lower, upper
+    )
 
 
 @kernel
 def held_packed(tau: Six, speed: Six, bias: Six, numbers: Sequence[float]) -> bool:
-    """Whether friction and brakes hold an arm that stands, its motors asked for `tau`; `numbers` as in `stepped_packed`."""
+    """Whether friction and brakes hold an arm that stands, its motors asked for `tau`; `numbers` as
+    in `stepped_packed`."""
     return held(motors(tau, _six(numbers, 0), speed, _six(numbers, 6)), bias, _six(numbers, 24))

@@ -1,9 +1,11 @@
-"""The ball's motion where it is known exactly: sliding and rolling on the flat table, and free flight.
+"""The ball's motion where it is known exactly: sliding and rolling on the flat table, and free
+flight.
 
-A ball on a table slides while its lowest point moves, then rolls. With sliding friction mu the slip velocity keeps its
-direction and shrinks at mu g (1 + 1/k), where k = I / (m r^2); a rolling ball then loses c g of speed each second
-(c: coefficient of rolling resistance). Both phases have closed forms, so no step size enters. Source: rigid-body
-mechanics of a sphere on a plane (e.g. Marlow, "The Physics of Pocket Billiards", 1995).
+A ball on a table slides while its lowest point moves, then rolls. With sliding friction mu the slip
+velocity keeps its direction and shrinks at mu g (1 + 1/k), where k = I / (m r^2); a rolling ball
+then loses c g of speed each second (c: coefficient of rolling resistance). Both phases have closed
+forms, so no step size enters. Source: rigid-body mechanics of a sphere on a plane (e.g. Marlow,
+"The Physics of Pocket Billiards", 1995).
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ class BallState(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BallModel:
-    """What does not change from throw to throw; `inertia_factor` is k = I / (m r^2), `friction` the sliding coefficient."""
+    """What does not change from throw to throw; `inertia_factor` is k = I / (m r^2), `friction` the
+    sliding coefficient."""
 
     radius: float
     mass: float
@@ -37,13 +40,16 @@ class BallModel:
         """From the `[ball]` table of cell.toml and the true friction."""
         return cls(ball["radius"], ball["mass"], ball["inertia_factor"], ball["gravity"], friction)
 
-    def spin_of_rolling(self, vx: float, vy: float, share: float = 1.0) -> tuple[float, float, float]:
+    def spin_of_rolling(
+        self, vx: float, vy: float, share: float = 1.0
+    ) -> tuple[float, float, float]:
         """Spin (rad/s) of a ball that rolls with horizontal velocity (vx, vy), times `share`."""
         return (-share * vy / self.radius, share * vx / self.radius, 0.0)
 
 
 class TableMotion:
-    """Motion on a flat table from a start state, as a function of the time since then; height is not part of it."""
+    """Motion on a flat table from a start state, as a function of the time since then; height is
+    not part of it."""
 
     def __init__(self, model: BallModel, start: BallState, rolling_resistance: float) -> None:
         self._model = model
@@ -64,7 +70,9 @@ class TableMotion:
         speed = math.hypot(*self._u)
         self._heading = (self._u[0] / speed, self._u[1] / speed) if speed > 0.0 else (0.0, 0.0)
         self._speed = speed
-        self.rests_after = t + (speed / self._deceleration if self._deceleration > 0.0 else math.inf)
+        self.rests_after = t + (
+            speed / self._deceleration if self._deceleration > 0.0 else math.inf
+        )
         """s until the ball lies still."""
 
     def _slide_position(self, t: float) -> tuple[float, float]:
@@ -85,7 +93,11 @@ class TableMotion:
             x, y = self._slide_position(t)
             vx, vy = self._slide_velocity(t)
             gained = self._sliding * t / (self._model.inertia_factor * self._model.radius)
-            spin = self._w[0] - gained * self._slip[1], self._w[1] + gained * self._slip[0], self._w[2]
+            spin = (
+                self._w[0] - gained * self._slip[1],
+                self._w[1] + gained * self._slip[0],
+                self._w[2],
+            )
             return BallState((x, y, z), (vx, vy, 0.0), spin)
         rolled = min(t, self.rests_after) - self.rolls_after
         way = self._speed * rolled - 0.5 * self._deceleration * rolled * rolled
@@ -96,9 +108,13 @@ class TableMotion:
         return BallState((x, y, z), (vx, vy, 0.0), (wx, wy, self._w[2]))
 
     def first_crossing(self, axis: int, value: float) -> float:
-        """Seconds until the centre's x (axis 0) or y (axis 1) first equals `value`; inf if never."""
+        """Seconds until the centre's x (axis 0) or y (axis 1) first equals `value`; inf if
+        never."""
         sliding = _first_root(
-            self._p[axis] - value, self._v[axis], -0.5 * self._sliding * self._slip[axis], self.rolls_after
+            self._p[axis] - value,
+            self._v[axis],
+            -0.5 * self._sliding * self._slip[axis],
+            self.rolls_after,
         )
         if sliding < math.inf:
             return sliding
@@ -128,4 +144,8 @@ def _first_root(c: float, b: float, a: float, until: float) -> float:
 def fly(start: BallState, t: float, gravity: float) -> BallState:
     """Free flight without air drag, `t` seconds after `start`; spin is kept."""
     (x, y, z), (vx, vy, vz), spin = start
-    return BallState((x + vx * t, y + vy * t, z + vz * t - 0.5 * gravity * t * t), (vx, vy, vz - gravity * t), spin)
+    return BallState(
+        (x + vx * t, y + vy * t, z + vz * t - 0.5 * gravity * t * t),
+        (vx, vy, vz - gravity * t),
+        spin,
+    )

@@ -1,6 +1,7 @@
-"""Board images as somebody would take them in the simulated laboratory: laid on the table at measured places, and held by hand.
+"""Board images as somebody would take them in the simulated laboratory: laid on the table at
+measured places, and held by hand.
 
-`python -m sim.board DIR` saves them as `petrobot calibrate --views DIR` reads them.
+`python -m petrobot.sim.board DIR` saves them as `petrobot calibrate --views DIR` reads them.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.camera import Array, PinholeCamera
-from sim.scenery import Chessboard
-from sim.truth import read_toml, read_truth
+from petrobot.sim.camera import Array, PinholeCamera
+from petrobot.sim.scenery import Chessboard
+from petrobot.sim.truth import read_toml, read_truth
 
 CELL = Path(__file__).parents[1] / "services" / "cell.toml"
 
@@ -47,20 +48,27 @@ HELD = (
     (1.25, -0.20, 0.30, -0.4, 0.4, 0.3),
     (0.80, 0.00, 0.70, 0.1, 0.2, 0.1),
 )
-"""Middle of the board (m from the near edge, y, m above the table) and its turns about x, y and z (rad)."""
+"""Middle of the board (m from the near edge, y, m above the table) and its turns about x, y and z
+(rad)."""
 
 
 def board_views(
-    cell: Mapping[str, Any], camera: PinholeCamera, rng: np.random.Generator, board: Chessboard | None = None
+    cell: Mapping[str, Any],
+    camera: PinholeCamera,
+    rng: np.random.Generator,
+    board: Chessboard | None = None,
 ) -> Iterator[tuple[NDArray[np.uint8], Array | None]]:
-    """Images of the board with its pose (4, 4) in the base frame as measured, None for a held board."""
+    """Images of the board with its pose (4, 4) in the base frame as measured, None for a held
+    board."""
     board = board or Chessboard()
     table = cell["table"]
     for along, y, turn in LAID:
         place = np.array([table["near_edge"] + along, y, table["top"]])
         measured = _centred(place, _turned(0.0, 0.0, turn), board)
         shift = np.array([*rng.normal(0.0, PLACEMENT, 2), 0.0])
-        true = _centred(place + shift, _turned(0.0, 0.0, turn + float(rng.normal(0.0, DIRECTION))), board)
+        true = _centred(
+            place + shift, _turned(0.0, 0.0, turn + float(rng.normal(0.0, DIRECTION))), board
+        )
         true[2, 3] = camera.table.top
         yield camera.render_board(true, board), measured
     for along, y, above, *turns in HELD:
@@ -68,17 +76,24 @@ def board_views(
         yield camera.render_board(_centred(place, _turned(*turns), board), board), None
 
 
-def save_board_views(folder: Path, cell: Mapping[str, Any], camera: PinholeCamera, rng: np.random.Generator) -> None:
-    """Take the images and save them with the measured poses: view01.png, ... and views.toml, as `petrobot calibrate` reads them."""
+def save_board_views(
+    folder: Path, cell: Mapping[str, Any], camera: PinholeCamera, rng: np.random.Generator
+) -> None:
+    """Take the images and save them with the measured poses: view01.png, ... and views.toml, as
+    `petrobot calibrate` reads them."""
     board = Chessboard()
     folder.mkdir(parents=True, exist_ok=True)
-    lines = [f"[board]\ncolumns = {board.columns}\nrows = {board.rows}\nsquare = {board.square}  # m\n"]
+    lines = [
+        f"[board]\ncolumns = {board.columns}\nrows = {board.rows}\nsquare = {board.square}  # m\n"
+    ]
     for number, (pixels, pose) in enumerate(board_views(cell, camera, rng, board), 1):
         name = f"view{number:02}.png"
         cv2.imwrite(str(folder / name), pixels)
         lines.append(f'[[views]]\nfile = "{name}"')
         if pose is not None:
-            rows = ",\n".join("  [" + ", ".join(f"{value:.9f}" for value in row) + "]" for row in pose)
+            rows = ",\n".join(
+                "  [" + ", ".join(f"{value:.9f}" for value in row) + "]" for row in pose
+            )
             lines.append(f"pose = [\n{rows},\n]")
         lines.append("")
     (folder / "views.toml").write_text("\n".join(lines), encoding="utf-8")
@@ -104,18 +119,22 @@ def _turned(x: float, y: float, z: float) -> Array:
 def main(argv: Sequence[str] | None = None) -> int:
     """Save board images of the simulated camera as it truly hangs; gives the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m sim.board",
+        prog="python -m petrobot.sim.board",
         description="Save images of a calibration board taken by the simulated camera.",
-        epilog="example:\n  python -m sim.board board_images && petrobot calibrate --views board_images",
+        epilog="example:\n  python -m petrobot.sim.board board_images && petrobot calibrate "
+        "--views board_images",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("folder", type=Path, help="folder for view01.png, ... and views.toml")
-    parser.add_argument("--seed", type=int, default=1, help="of noise and of how the boards really lie (default 1)")
+    parser.add_argument(
+        "--seed", type=int, default=1, help="of noise and of how the boards really lie (default 1)"
+    )
     options = parser.parse_args(argv)
     cell = read_toml(CELL)
     truth = read_truth(cell)
     view = {
-        key: getattr(truth.camera, key) for key in ("position", "rotation", "focal_px", "principal_px", "distortion")
+        key: getattr(truth.camera, key)
+        for key in ("position", "rotation", "focal_px", "principal_px", "distortion")
     }
     view |= {"table_top": truth.table.top, "near_edge": truth.table.near_edge}
     rng = np.random.default_rng(options.seed)

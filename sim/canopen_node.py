@@ -1,4 +1,5 @@
-"""A CANopen device (CiA 301) as a machine: object dictionary from an EDS file, SDO server, NMT, heartbeats, one PDO each way."""
+"""A CANopen device (CiA 301) as a machine: object dictionary from an EDS file, SDO server, NMT,
+heartbeats, one PDO each way."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ from importlib.resources import files
 from operator import itemgetter
 from typing import Final
 
-from services.comm.canbus import Frame
-from services.comm.canopen import (
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import (
     HEARTBEAT_BASE,
     NMT_ID,
     PDO_OFF,
@@ -62,7 +63,8 @@ class Entry:
 
 @cache
 def _objects(eds: str) -> tuple[Mapping[Key, Entry], Mapping[Key, str]]:
-    """Objects and their default values, as an EDS text writes them: read once, however many devices are of this kind."""
+    """Objects and their default values, as an EDS text writes them: read once, however many devices
+    are of this kind."""
     parser = configparser.ConfigParser(interpolation=None)
     parser.read_string(eds)
     entries: dict[Key, Entry] = {}
@@ -90,12 +92,14 @@ def _entry(section: configparser.SectionProxy) -> Entry:
 
 
 class Dictionary:
-    """Object dictionary of an EDS text: values by (index, sub-index), read and written as an SDO server does."""
+    """Object dictionary of an EDS text: values by (index, sub-index), read and written as an SDO
+    server does."""
 
     def __init__(self, eds: str, node: int) -> None:
         self.entries, defaults = _objects(eds)
         self.values: dict[Key, int] = {
-            key: int(text.removeprefix("$NODEID+"), 0) + (node if text.startswith("$NODEID+") else 0)
+            key: int(text.removeprefix("$NODEID+"), 0)
+            + (node if text.startswith("$NODEID+") else 0)
             for key, text in defaults.items()
         }
         self._defaults = dict(self.values)
@@ -121,12 +125,15 @@ class Dictionary:
         return entry.type.pack(self.values[index, sub])
 
     def checked(self, index: int, sub: int, data: bytes) -> int:
-        """The value that a write of these bytes gives; raises SdoAbortError if it may not be written."""
+        """The value that a write of these bytes gives; raises SdoAbortError if it may not be
+        written."""
         entry = self.entry(index, sub)
         if not entry.writable:
             raise SdoAbortError(Abort.READ_ONLY, index, sub)
         if len(data) != entry.type.size:
-            raise SdoAbortError(Abort.TOO_LONG if len(data) > entry.type.size else Abort.TOO_SHORT, index, sub)
+            raise SdoAbortError(
+                Abort.TOO_LONG if len(data) > entry.type.size else Abort.TOO_SHORT, index, sub
+            )
         value = entry.type.unpack(data)
         if not entry.low <= value <= entry.high:
             raise SdoAbortError(Abort.TOO_HIGH if value > entry.high else Abort.TOO_LOW, index, sub)
@@ -134,7 +141,8 @@ class Dictionary:
 
 
 class Pdo:
-    """A PDO's COB-ID, transmission type and layout, kept in step with its two records of the dictionary."""
+    """A PDO's COB-ID, transmission type and layout, kept in step with its two records of the
+    dictionary."""
 
     def __init__(self, dictionary: Dictionary, parameters: int, mapping: int) -> None:
         self._values = dictionary.values
@@ -152,7 +160,10 @@ class Pdo:
         cob_id = self._values[self.parameters, 1]
         self.on, self.cob_id = not cob_id & PDO_OFF, cob_id & 0x7FF
         self.synchronous = self._values[self.parameters, 2] in _SYNCHRONOUS
-        objects = [self.mapped(self._values[self.mapping, n]) for n in range(1, self._values[self.mapping, 0] + 1)]
+        objects = [
+            self.mapped(self._values[self.mapping, n])
+            for n in range(1, self._values[self.mapping, 0] + 1)
+        ]
         self.layout = pdo_struct(objects)
         self.keys = tuple((mapped.index, mapped.sub) for mapped in objects)
         self._mapped = itemgetter(*self.keys) if len(self.keys) > 1 else None
@@ -161,7 +172,9 @@ class Pdo:
         """The values of the mapped objects as they travel."""
         values = self._values
         many = self._mapped
-        return self.layout.pack(*([values[key] for key in self.keys] if many is None else many(values)))
+        return self.layout.pack(
+            *([values[key] for key in self.keys] if many is None else many(values))
+        )
 
     def mapped(self, entry: int) -> Mapped:
         """A mapping entry taken apart; raises SdoAbortError if it cannot be mapped."""
@@ -174,7 +187,8 @@ class Pdo:
         return Mapped(index, sub, found.type)
 
     def check(self, index: int, sub: int, value: int) -> None:
-        """Raise SdoAbortError if one of the PDO's records must not get this value now (CiA 301, 7.5.2.35 and 36)."""
+        """Raise SdoAbortError if one of the PDO's records must not get this value now (CiA 301,
+        7.5.2.35 and 36)."""
         if index == self.mapping and (self.on or (sub and self._values[index, 0])):
             raise SdoAbortError(Abort.STATE, index, sub)
         if index == self.mapping and sub == 0 and value:
@@ -183,19 +197,28 @@ class Pdo:
                 raise SdoAbortError(Abort.PDO_LENGTH, index, sub)
         if index == self.mapping and sub and value:
             self.mapped(value)
-        if index == self.parameters and sub == 1 and self.on and not value & PDO_OFF and value & 0x7FF != self.cob_id:
+        if (
+            index == self.parameters
+            and sub == 1
+            and self.on
+            and not value & PDO_OFF
+            and value & 0x7FF != self.cob_id
+        ):
             raise SdoAbortError(Abort.VALUE, index, sub)
 
 
 class CanopenNode:
-    """One device on the bus. Subclasses fill `before_sending`, act in `after_receiving` and the other hooks.
+    """One device on the bus. Subclasses fill `before_sending`, act in `after_receiving` and the
+    other hooks.
 
     Times are seconds on the caller's clock; `drain` gives the frames to send.
     """
 
     def __init__(self, node: int, eds: str) -> None:
         self.node = node
-        self.dictionary = Dictionary((files("services.comm.eds") / eds).read_text(encoding="utf-8"), node)
+        self.dictionary = Dictionary(
+            (files("petrobot.services.comm.eds") / eds).read_text(encoding="utf-8"), node
+        )
         self.values = self.dictionary.values
         self.rpdo = Pdo(self.dictionary, RPDO, RPDO_MAPPING)
         self.tpdo = Pdo(self.dictionary, TPDO, TPDO_MAPPING)
@@ -209,7 +232,8 @@ class CanopenNode:
 
     # What a device adds.
     def before_sending(self) -> None:
-        """Bring the objects that a TPDO may carry up to date; call `changed` if one of them is another than before."""
+        """Bring the objects that a TPDO may carry up to date; call `changed` if one of them is
+        another than before."""
 
     def before_reading(self) -> None:
         """Bring all objects that change by themselves up to date."""
@@ -258,7 +282,10 @@ class CanopenNode:
             self._serve(now, frame)
         elif cob_id == NMT_ID and len(frame.data) == 2 and frame.data[1] in (0, self.node):
             self._order(now, frame.data[0])
-        elif cob_id > HEARTBEAT_BASE and cob_id - HEARTBEAT_BASE == self.values[0x1016, 1] >> 16 & 0x7F:
+        elif (
+            cob_id > HEARTBEAT_BASE
+            and cob_id - HEARTBEAT_BASE == self.values[0x1016, 1] >> 16 & 0x7F
+        ):
             self._master_due = now + (self.values[0x1016, 1] & 0xFFFF) / 1e3
 
     def advance(self, now: float) -> None:
@@ -370,7 +397,12 @@ class CanopenNode:
 
     def _write(self, now: float, index: int, sub: int, data: bytes) -> None:
         value = self.dictionary.checked(index, sub, data)
-        pdo = {RPDO: self.rpdo, RPDO_MAPPING: self.rpdo, TPDO: self.tpdo, TPDO_MAPPING: self.tpdo}.get(index)
+        pdo = {
+            RPDO: self.rpdo,
+            RPDO_MAPPING: self.rpdo,
+            TPDO: self.tpdo,
+            TPDO_MAPPING: self.tpdo,
+        }.get(index)
         if pdo is not None:
             pdo.check(index, sub, value)
         if (index, sub) in ((RPDO, 1), (TPDO, 1)) and not self._may_use(value & 0x7FF):
@@ -388,5 +420,6 @@ class CanopenNode:
 
     @staticmethod
     def _may_use(cob_id: int) -> bool:
-        """Whether a PDO may have this identifier: none of NMT, SYNC, EMCY, SDO and heartbeat (CiA 301, table 54)."""
+        """Whether a PDO may have this identifier: none of NMT, SYNC, EMCY, SDO and heartbeat (CiA
+        301, table 54)."""
         return TPDO1_BASE < cob_id < SDO_REPLY_BASE and cob_id not in _PREDEFINED

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from sim.ball import BallState
-from sim.thrower import Throw
+from petrobot.sim.ball import BallState
+from petrobot.sim.thrower import Throw
 
 
 class Outcome(StrEnum):
@@ -23,7 +23,8 @@ class Outcome(StrEnum):
 
 @dataclass(slots=True)
 class Course:
-    """What was seen of one throw so far. Times are seconds after its release, lengths m, base frame."""
+    """What was seen of one throw so far. Times are seconds after its release, lengths m, base
+    frame."""
 
     throw: Throw
     released_at: float
@@ -32,8 +33,8 @@ class Course:
     """When the centre left the near edge; inf if it did not."""
     exit_state: BallState | None = None
     crossing: float = math.inf
-    """Least distance from the centre of the cup's mouth at which the ball's centre, once off the table, went through
-    the plane of the mouth from outside; inf if it never did."""
+    """Least distance from the centre of the cup's mouth at which the ball's centre, once off the
+    table, went through the plane of the mouth from outside; inf if it never did."""
     approach: float = math.inf
     """Least distance of the ball's centre from the centre of the mouth."""
     caught_at: float = math.inf
@@ -42,14 +43,15 @@ class Course:
 
     @property
     def miss(self) -> float:
-        """How far from the middle of the mouth the ball came to it (m): in the plane of the mouth where it crossed that,
-        else its closest approach."""
+        """How far from the middle of the mouth the ball came to it (m): in the plane of the mouth
+        where it crossed that, else its closest approach."""
         return self.crossing if self.crossing < math.inf else self.approach
 
 
 @dataclass(slots=True)
 class Barrier:
-    """A light barrier with a filter: its output follows what it sees after `delay` seconds without a change."""
+    """A light barrier with a filter: its output follows what it sees after `delay` seconds without
+    a change."""
 
     delay: float
     output: bool = False

@@ -1,11 +1,12 @@
-"""The digital-input node on the arm's bus (CiA 401): light barrier in the cup and arm-power chain."""
+"""The digital-input node on the arm's bus (CiA 401): light barrier in the cup and arm-power
+chain."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-from sim.canopen_node import CanopenNode
+from petrobot.sim.canopen_node import CanopenNode
 
 
 class DigitalInputs(CanopenNode):
@@ -44,7 +45,9 @@ class DigitalInputs(CanopenNode):
         """Send on change, and again when the event timer says so."""
         super().advance(now)
         timer = self.values[0x1800, 5] * 1e-3
-        if not self.tpdo.synchronous and (self.inputs != self._sent or (timer and now >= self._due)):
+        if not self.tpdo.synchronous and (
+            self.inputs != self._sent or (timer and now >= self._due)
+        ):
             before = len(self.outbox)
             self.send_tpdo()
             if len(self.outbox) > before:

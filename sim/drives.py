@@ -1,4 +1,5 @@
-"""Six CiA 402 servo drives and the digital inputs on the arm's bus: frames in, torques on the arm, frames out."""
+"""Six CiA 402 servo drives and the digital inputs on the arm's bus: frames in, torques on the arm,
+frames out."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
-from services.comm.canbus import Frame
-from services.comm.canopen import SYNC_ID, NmtState
-from services.comm.cia402 import (
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import SYNC_ID, NmtState
+from petrobot.services.comm.cia402 import (
     RECEIVED,
     SENT,
     UNITS,
@@ -20,17 +21,18 @@ from services.comm.cia402 import (
     fault_text,
     to_units,
 )
-from sim.canopen_node import CanopenNode
-from sim.digital_io import DigitalInputs
-from sim.power_drive import ENABLE, ENABLE_MASK, POWERED, RUNNING, PowerDrive
-from sim.servo import DriveRating, JointServo
+from petrobot.sim.canopen_node import CanopenNode
+from petrobot.sim.digital_io import DigitalInputs
+from petrobot.sim.power_drive import ENABLE, ENABLE_MASK, POWERED, RUNNING, PowerDrive
+from petrobot.sim.servo import DriveRating, JointServo
 
 INPUTS_NODE: Final = 7
 """Node id of the digital inputs; the drives have 1 to 6, base to flange."""
 
 SYNC_PATIENCE: Final = 10
-"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 40 ms at 250 Hz, shorter than three periods of
-the set-point stream, longer than what a master on an ordinary Linux is now and then late."""
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 40 ms at 250 Hz,
+shorter than three periods of the set-point stream, longer than what a master on an ordinary Linux
+is now and then late."""
 
 _STATUSWORD: Final = (int(Object.STATUSWORD), 0)
 _CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
@@ -42,12 +44,15 @@ _POSITION, _VELOCITY, _TORQUE, _TARGET = (
 )
 _ENABLED: Final = State.OPERATION_ENABLED
 _OPERATIONAL: Final = NmtState.OPERATIONAL
-_RPDO_KEYS, _TPDO_KEYS = (tuple((int(one.index), one.sub) for one in mapped) for mapped in (RECEIVED, SENT))
+_RPDO_KEYS, _TPDO_KEYS = (
+    tuple((int(one.index), one.sub) for one in mapped) for mapped in (RECEIVED, SENT)
+)
 _LIMIT, _ERROR = int(StatusBit.INTERNAL_LIMIT), int(StatusBit.FOLLOWING_ERROR)
 
 
 class Plant(Protocol):
-    """The arm as its drives feel it: angles (rad), speeds (rad/s) and torques (N m) by joint, and the joints' brakes."""
+    """The arm as its drives feel it: angles (rad), speeds (rad/s) and torques (N m) by joint, and
+    the joints' brakes."""
 
     @property
     def q(self) -> Sequence[float]:
@@ -71,7 +76,8 @@ class Plant(Protocol):
 
 
 def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
-    """The drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and inertia (kg m^2)."""
+    """The drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and
+    inertia (kg m^2)."""
     return tuple(
         DriveRating(float(joint["torque"]), math.radians(joint["speed"]), float(joint["inertia"]))
         for joint in table["joint"]
@@ -84,14 +90,18 @@ class Drive(PowerDrive):
     mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
     fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
 
-    def __init__(self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]) -> None:
-        """`stir` is called whenever something happens that may change the torque of a joint at rest."""
+    def __init__(
+        self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]
+    ) -> None:
+        """`stir` is called whenever something happens that may change the torque of a joint at
+        rest."""
         super().__init__(joint + 1, "joint_drive.eds", SYNC_PATIENCE, stir)
         self.joint = joint
         self.plant = plant
         self._shown: tuple[int, float, float, float] | None = None
         self._said: tuple[int, float, float] | None = None
-        """Status, angle and torque in the TPDO that `sync` made last, if no object has changed since."""
+        """Status, angle and torque in the TPDO that `sync` made last, if no object has changed
+        since."""
         self._usual = False
         """Whether both PDOs are laid out as masters of this profile do it, and go by SYNC."""
         self.servo = JointServo(rating, plant.q[joint])
@@ -104,7 +114,12 @@ class Drive(PowerDrive):
     def before_sending(self) -> None:
         """Bring status, position, speed and torque up to date."""
         plant, joint = self.plant, self.joint
-        usual = self.state is _ENABLED and self.powered and not self.servo.limited and self._error_since is None
+        usual = (
+            self.state is _ENABLED
+            and self.powered
+            and not self.servo.limited
+            and self._error_since is None
+        )
         word = RUNNING if usual else self.statusword()
         shown = _, q, qd, torque = word, plant.q[joint], plant.qd[joint], self._torque
         if shown == self._shown:
@@ -130,10 +145,13 @@ class Drive(PowerDrive):
         super().changed()
 
     def sync(self, now: float) -> None:
-        """SYNC has come. Of a drive that follows its set points, with PDOs laid out as usual, six are asked for this in every
-        cycle: it does in one go what the base class does in steps, to the same bytes. Objects that nobody reads meanwhile
-        are brought up to date when somebody does."""
-        if not (self._usual and self.state is _ENABLED and self.nmt is _OPERATIONAL and self._goes_on()):
+        """SYNC has come. Of a drive that follows its set points, with PDOs laid out as usual, six
+        are asked for this in every cycle: it does in one go what the base class does in steps, to
+        the same bytes. Objects that nobody reads meanwhile are brought up to date when somebody
+        does."""
+        if not (
+            self._usual and self.state is _ENABLED and self.nmt is _OPERATIONAL and self._goes_on()
+        ):
             super().sync(now)
             return
         self._synced = now
@@ -142,16 +160,23 @@ class Drive(PowerDrive):
         if not servo.standing:
             self.stir()
         usual = self.powered and not servo.limited and self._error_since is None
-        said = word, q, torque = RUNNING if usual else self.statusword(), self.plant.q[self.joint], self._torque
+        said = word, q, torque = (
+            RUNNING if usual else self.statusword(),
+            self.plant.q[self.joint],
+            self._torque,
+        )
         frame = self._tpdo_frame
         if frame is None or said != self._said:
             self._said, self._shown = said, None
-            data = self.tpdo.layout.pack(word, round(q * UNITS), round(1000.0 * torque / servo.rating.torque))
+            data = self.tpdo.layout.pack(
+                word, round(q * UNITS), round(1000.0 * torque / servo.rating.torque)
+            )
             self._tpdo_frame = frame = Frame(self.tpdo.cob_id, data)
         self.outbox.append(frame)
 
     def _goes_on(self) -> bool:
-        """Take over the RPDO's set point if its controlword orders nothing but to go on; else leave all as it is."""
+        """Take over the RPDO's set point if its controlword orders nothing but to go on; else leave
+        all as it is."""
         data = self._latched
         if data is not None and data != self._applied:
             word, target = self.rpdo.layout.unpack_from(data)
@@ -194,7 +219,10 @@ class Drive(PowerDrive):
         self._patience = values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
         self._range = values[Object.SOFTWARE_LIMITS, 1], values[Object.SOFTWARE_LIMITS, 2]
         if values[Object.INTERPOLATION_PERIOD, 1]:
-            self.servo.period = values[Object.INTERPOLATION_PERIOD, 1] * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
+            self.servo.period = (
+                values[Object.INTERPOLATION_PERIOD, 1]
+                * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
+            )
         self.stir()
 
     # Hooks of the state machine.
@@ -235,7 +263,8 @@ class Drive(PowerDrive):
         self.refresh()
 
     def torque(self, now: float, dt: float, q: float, qd: float) -> float:
-        """Torque of the next `dt` seconds (N m) from the joint's angle and speed; 0 without power."""
+        """Torque of the next `dt` seconds (N m) from the joint's angle and speed; 0 without
+        power."""
         state = self.state
         if state is not _ENABLED and state not in POWERED:
             return 0.0
@@ -243,7 +272,11 @@ class Drive(PowerDrive):
         self._torque = tau = servo.torque(q, qd, dt)
         if state is _ENABLED:
             late = now - self._synced > self._sync_patience + 1e-9
-            if late or self._error_since is not None or not -self._window <= servo.error <= self._window:
+            if (
+                late
+                or self._error_since is not None
+                or not -self._window <= servo.error <= self._window
+            ):
                 self._watch(now, late)
         elif state is State.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
             self.ramp_ended()
@@ -254,7 +287,11 @@ class Drive(PowerDrive):
         """Whether the torque of a joint at rest stays as it is unless something happens."""
         if self.state not in POWERED:
             return True
-        return self.servo.settled and self._error_since is None and self.state is not State.FAULT_REACTION_ACTIVE
+        return (
+            self.servo.settled
+            and self._error_since is None
+            and self.state is not State.FAULT_REACTION_ACTIVE
+        )
 
     def _watch(self, now: float, late: bool) -> None:
         """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
@@ -274,11 +311,13 @@ class Drive(PowerDrive):
 
 
 class DriveBus:
-    """Everything on the arm's bus but the master: six drives (nodes 1 to 6) and the digital inputs (node 7).
+    """Everything on the arm's bus but the master: six drives (nodes 1 to 6) and the digital inputs
+    (node 7).
 
-    In each step of the plant (1 kHz or faster): `receive` what came, then `step(now, dt)`, which also moves the plant,
-    then send what `drain` gives. Times are seconds on the caller's clock. An arm that stands still under torques that
-    do not change is at rest: until something stirs it, a step would change nothing and is left out.
+    In each step of the plant (1 kHz or faster): `receive` what came, then `step(now, dt)`, which
+    also moves the plant, then send what `drain` gives. Times are seconds on the caller's clock. An
+    arm that stands still under torques that do not change is at rest: until something stirs it, a
+    step would change nothing and is left out.
     """
 
     def __init__(self, plant: Plant, drives: Sequence[DriveRating], now: float = 0.0) -> None:
@@ -289,8 +328,11 @@ class DriveBus:
         self._odd = False
         self._heard: Sequence[Frame] = ()
         self._echoes: Sequence[Frame] = ()
-        """The set points of the newest cycle that found and left the arm at rest, and the answers, one a drive."""
-        self.drives = tuple(Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives))
+        """The set points of the newest cycle that found and left the arm at rest, and the answers,
+        one a drive."""
+        self.drives = tuple(
+            Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
+        )
         self.inputs = DigitalInputs(INPUTS_NODE)
         self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
         self._own = {node.node: node for node in self._nodes}
@@ -299,7 +341,8 @@ class DriveBus:
             node.boot(now)
 
     def receive_cycle(self, now: float, frames: Sequence[Frame]) -> None:
-        """The frames of one cycle of the master's. Drives at rest that hear what they have heard before answer as before."""
+        """The frames of one cycle of the master's. Drives at rest that hear what they have heard
+        before answer as before."""
         if self._echoes and frames == self._heard and self._resting:
             for drive, echo in zip(self.drives, self._echoes, strict=True):
                 drive.repeat(now, echo)
@@ -343,7 +386,8 @@ class DriveBus:
         plant, before, self._stirred = self.plant, self._tau, False
         moving = any(plant.qd)
         self._tau = tau = [
-            drive.torque(now, dt, q, qd) for drive, q, qd in zip(self.drives, plant.q, plant.qd, strict=True)
+            drive.torque(now, dt, q, qd)
+            for drive, q, qd in zip(self.drives, plant.q, plant.qd, strict=True)
         ]
         plant.step(dt, tau)
         if not (moving or self._stirred or tau != before or any(plant.qd)):
@@ -366,7 +410,8 @@ class DriveBus:
         self._put(DigitalInputs.BALL, present)
 
     def power(self, closed: bool) -> None:
-        """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the brakes fall in."""
+        """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the
+        brakes fall in."""
         self._put(DigitalInputs.POWER, closed)
         self._echoes = ()
         for drive in self.drives:

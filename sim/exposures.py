@@ -1,4 +1,5 @@
-"""When the simulated camera exposes, when an image leaves it, and the cameras themselves: each is built once a process."""
+"""When the simulated camera exposes, when an image leaves it, and the cameras themselves: each is
+built once a process."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim.camera import Picture, PinholeCamera
-from sim.truth import Truth
+from petrobot.sim.camera import Picture, PinholeCamera
+from petrobot.sim.truth import Truth
 
 _ON_TIME = 1e-9
 """s of rounding."""
@@ -18,7 +19,8 @@ _BUILT: dict[str, PinholeCamera] = {}
 
 
 class Exposed(NamedTuple):
-    """An image on its way out of the camera: leaves at `ready`, its exposure's middle was at `time` (s)."""
+    """An image on its way out of the camera: leaves at `ready`, its exposure's middle was at `time`
+    (s)."""
 
     ready: float
     time: float
@@ -38,21 +40,24 @@ class Exposures:
         self._waiting: list[Exposed] = []
 
     def want(self, now: float, rate: float, generation: int) -> None:
-        """From now on `rate` images a second (0: none); what was exposed for an earlier wish is not sent."""
+        """From now on `rate` images a second (0: none); what was exposed for an earlier wish is not
+        sent."""
         if rate > 0.0 and self.rate <= 0.0:
             self._next = now
         self.rate, self.generation = rate, generation
         self._waiting.clear()
 
     def due(self, now: float) -> bool:
-        """Whether an exposure has its middle at `now`; its clock goes on whether the image is used or not."""
+        """Whether an exposure has its middle at `now`; its clock goes on whether the image is used
+        or not."""
         if self.rate <= 0.0 or now < self._next - _ON_TIME:
             return False
         self._next = max(self._next, now - 1.0 / self.rate) + 1.0 / self.rate
         return True
 
     def put(self, now: float, ready: float, pixels: Picture) -> None:
-        """An image exposed at `now` leaves the camera at `ready` (s); nobody writes to it any more."""
+        """An image exposed at `now` leaves the camera at `ready` (s); nobody writes to it any
+        more."""
         pixels.flags.writeable = False
         self._waiting.append(Exposed(ready, now, self._sequence, self.generation, pixels))
         self._sequence += 1
@@ -69,7 +74,8 @@ class Exposures:
 def camera_of(cell: Mapping[str, Any], truth: Truth, rng: np.random.Generator) -> PinholeCamera:
     """The camera as it hangs in `truth`, its noise chosen by `rng` until the next call.
 
-    Drawing the still scene takes seconds, so cameras are kept; between two calls nothing of the last user stays in them.
+    Drawing the still scene takes seconds, so cameras are kept; between two calls nothing of the
+    last user stays in them.
     """
     true = truth.camera
     view: dict[str, Any] = {

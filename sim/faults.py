@@ -23,12 +23,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from services.comm.canbus import Frame
+from petrobot.services.comm.canbus import Frame
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor or joint (from 1)."""
+    """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor
+    or joint (from 1)."""
 
     kind: str
     start: float
@@ -46,7 +47,8 @@ class FaultKinds:
     drives: int
 
     def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
-        """A fault as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
+        """A fault as a caller asks for it. Raises ValueError that says what is wrong and what
+        fits."""
         if kind not in self.keys:
             raise ValueError(f"no fault is called {kind!r}; there are {', '.join(self.keys)}")
         keys = self.keys[kind]
@@ -83,11 +85,14 @@ ARM_FAULTS: Final = FaultKinds(
 
 
 def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
-    """A fault of the catching cell's as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
+    """A fault of the catching cell's as a caller asks for it. Raises ValueError that says what is
+    wrong and what fits."""
     return ARM_FAULTS.read(now, kind, arguments)
 
 
-def _number(arguments: Mapping[str, Any], key: str, default: float | None, low: float, high: float) -> float:
+def _number(
+    arguments: Mapping[str, Any], key: str, default: float | None, low: float, high: float
+) -> float:
     value = arguments.get(key, default)
     if value is None:
         raise ValueError(f"{key} is missing: give a number from {low:g} to {high:g}")
@@ -109,7 +114,8 @@ class FaultPlan:
         self._coming.append(fault)
 
     def begin(self, now: float) -> list[Fault]:
-        """The faults whose time has come since the last call, in the order of their time; those over are forgotten."""
+        """The faults whose time has come since the last call, in the order of their time; those
+        over are forgotten."""
         begun = sorted((f for f in self._coming if f.start <= now), key=lambda f: f.start)
         if begun:
             self._coming = [f for f in self._coming if f.start > now]

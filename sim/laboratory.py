@@ -1,7 +1,9 @@
-"""The laboratory: world, arm, drives, camera and thrower as one party, which answers on bus, camera and wire as hardware would.
+"""The laboratory: world, arm, drives, camera and thrower as one party, which answers on bus, camera
+and wire as hardware would.
 
-At a tick it takes what came, shows the camera the world as it is, and moves the world on by a tick; so a set point acts and
-is answered within the tick in which it arrives. Nothing here knows wall-clock time: lock step and real time drive it alike.
+At a tick it takes what came, shows the camera the world as it is, and moves the world on by a tick;
+so a set point acts and is answered within the tick in which it arrives. Nothing here knows
+wall-clock time: lock step and real time drive it alike.
 """
 
 from __future__ import annotations
@@ -11,29 +13,30 @@ from typing import Any
 
 import numpy as np
 
-from services.comm.canbus import Frame
-from services.comm.directory import Directory
-from services.comm.party import TICK
-from sim.camera import Picture, PinholeCamera
-from sim.drives import DriveBus
-from sim.exposures import camera_of
-from sim.faults import Fault, FaultPlan, read_fault
-from sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
-from sim.oracle import Oracle
-from sim.puma import ArmPlant
-from sim.puma_model import Frame3
-from sim.referee import Referee
-from sim.site import CupMount, Site, site_of
-from sim.thrower import Thrower
-from sim.truth import Truth
-from sim.world import World
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.party import TICK
+from petrobot.sim.camera import Picture, PinholeCamera
+from petrobot.sim.drives import DriveBus
+from petrobot.sim.exposures import camera_of
+from petrobot.sim.faults import Fault, FaultPlan, read_fault
+from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.oracle import Oracle
+from petrobot.sim.puma import ArmPlant
+from petrobot.sim.puma_model import Frame3
+from petrobot.sim.referee import Referee
+from petrobot.sim.site import CupMount, Site, site_of
+from petrobot.sim.thrower import Thrower
+from petrobot.sim.truth import Truth
+from petrobot.sim.world import World
 
 _NOISE, _FAULTS = 0x6361, 0x6661
 """Keep the draws of camera noise and of faults apart from other draws of the same seed."""
 
 
 class Laboratory(LaboratoryParty):
-    """The party of the simulated node `name`. `where` gives the party of an endpoint (`Directory.party`)."""
+    """The party of the simulated node `name`. `where` gives the party of an endpoint
+    (`Directory.party`)."""
 
     def __init__(
         self,
@@ -47,21 +50,25 @@ class Laboratory(LaboratoryParty):
         boot: str = "laboratory",
         directory: str = "",
     ) -> None:
-        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in services.comm.callee."""
+        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in
+        services.comm.callee."""
         super().__init__(name, where, boot, directory)
         self._site = site
         truth = site.truth(regime)
         self._mount = CupMount(site.arm, truth)
         cup = site.cell["cup"]
         load = self._mount.load(truth.settings["cup"]["mass"], cup["radius"], cup["depth"])
-        self.plant = ArmPlant(site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load)
+        self.plant = ArmPlant(
+            site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load
+        )
         self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = DriveBus(self.plant, site.drives)
         self._world: World | None = None
         self._prepare(self.now, seed, truth, throws)
 
     def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
-        """A new experiment: ball gone, score empty, everything drawn anew. The arm stays where it is."""
+        """A new experiment: ball gone, score empty, everything drawn anew. The arm stays where it
+        is."""
         if self._world is not None:
             self._world.close()
         self.truth = truth
@@ -69,7 +76,9 @@ class Laboratory(LaboratoryParty):
         self._arm_dt = float(truth.settings["step"]["arm"])
         self._world = self.world = World(self._site.cell, truth)
         self.thrower = Thrower(self._site.cell, truth, seed, throws)
-        self.referee = Referee(seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now)
+        self.referee = Referee(
+            seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now
+        )
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self._noise = np.random.default_rng((seed, _NOISE))
         self._camera: PinholeCamera | None = None
@@ -107,7 +116,8 @@ class Laboratory(LaboratoryParty):
         self.exposures.put(now, ready, self._picture(now))
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Draw the still scene of a regime's camera ahead of its first image, which takes seconds. Raises LaboratoryError."""
+        """Draw the still scene of a regime's camera ahead of its first image, which takes seconds.
+        Raises LaboratoryError."""
         regime = str(arguments.get("regime", "A"))
         camera_of(self._site.cell, self._site.truth(regime), self._noise).warm_up()
 
@@ -141,17 +151,21 @@ class Laboratory(LaboratoryParty):
             self.referee.enter(course, self.plant.q)
 
     def _ready(self) -> bool:
-        """Images are taken, the last ball is gone, the cup is empty, the arm stands still at home."""
+        """Images are taken, the last ball is gone, the cup is empty, the arm stands still at
+        home."""
         if self.exposures.rate <= 0.0 or self.world.ball is not None or self.world.barrier:
             return False
         rules = self.truth.settings["thrower"]
         still, near = rules["still_speed"], rules["home_tolerance"]
         if max(self.plant.qd) >= still or min(self.plant.qd) <= -still:
             return False
-        return all(-near < angle - at < near for angle, at in zip(self.plant.q, self._home, strict=True))
+        return all(
+            -near < angle - at < near for angle, at in zip(self.plant.q, self._home, strict=True)
+        )
 
     def _move(self, now: float) -> None:
-        """The world goes on by a tick: in fine steps while the ball may touch something, else in the arm's own."""
+        """The world goes on by a tick: in fine steps while the ball may touch something, else in
+        the arm's own."""
         world, bus = self.world, self.bus
         if world.ball is not None:
             world.begin(now, self._cup_now)
@@ -199,11 +213,12 @@ class Laboratory(LaboratoryParty):
             self.bus.slow_down(fault.value)
 
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments that cannot be.
+        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments
+        that cannot be.
 
-        laboratory_prepare(seed=0, regime="A", throws=None): a new experiment, gives nothing; other parameters of the task
-        are not the laboratory's business; laboratory_score(cycles=[]): see sim.referee;
-        laboratory_fault(kind, after=0, ...): see sim.faults.
+        laboratory_prepare(seed=0, regime="A", throws=None): a new experiment, gives nothing; other
+        parameters of the task are not the laboratory's business; laboratory_score(cycles=[]): see
+        sim.referee; laboratory_fault(kind, after=0, ...): see sim.faults.
         """
         if service == SCORE:
             return self.referee.score(self.now, arguments.get("cycles", ()))
@@ -211,7 +226,10 @@ class Laboratory(LaboratoryParty):
             rest = {key: value for key, value in arguments.items() if key != "kind"}
             self._faults.add(read_fault(self.now, str(arguments.get("kind", "")), rest))
             return {}
-        seed, throws = whole_number(arguments, "seed", 0) or 0, whole_number(arguments, "throws", None)
+        seed, throws = (
+            whole_number(arguments, "seed", 0) or 0,
+            whole_number(arguments, "throws", None),
+        )
         self._prepare(self.now, seed, self._site.truth(str(arguments.get("regime", "A"))), throws)
         return {}
 
@@ -224,4 +242,6 @@ class Laboratory(LaboratoryParty):
 def make_laboratory(directory: Directory, name: str) -> Laboratory:
     """The laboratory of the simulated node `name` of services.toml. Raises LaboratoryError."""
     boot = f"{name} in lock step"
-    return Laboratory(name, site_of(directory), directory.party, boot=boot, directory=directory.hash)
+    return Laboratory(
+        name, site_of(directory), directory.party, boot=boot, directory=directory.hash
+    )

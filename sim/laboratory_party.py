@@ -1,7 +1,8 @@
-"""What every simulated laboratory has in common: a party with a bus, a camera and services, that lock step and real time drive.
+"""What every simulated laboratory has in common: a party with a bus, a camera and services, that
+lock step and real time drive.
 
-A subclass is a world: it moves on by `tick`, takes and gives frames, exposes images, answers its services. Nothing here knows
-wall-clock time.
+A subclass is a world: it moves on by `tick`, takes and gives frames, exposes images, answers its
+services. Nothing here knows wall-clock time.
 """
 
 from __future__ import annotations
@@ -11,18 +12,19 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
-from services.comm.callee import Callee, Commanded, Offer, Order
-from services.comm.canbus import Frame
-from services.comm.channels import can_body, image_body, read_can, read_images_wanted
-from services.comm.messages import Call, Executed, Outcome
-from services.comm.party import TICK, Envelope
-from sim.exposures import Exposures
+from petrobot.services.comm.callee import Callee, Commanded, Offer, Order
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.channels import can_body, image_body, read_can, read_images_wanted
+from petrobot.services.comm.messages import Call, Executed, Outcome
+from petrobot.services.comm.party import TICK, Envelope
+from petrobot.sim.exposures import Exposures
 
 PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")
 
 
 def answer_command(now: float, callee: Callee, order: Order) -> None:
-    """Answer an operator's command: a laboratory is up, and has no device that could be held or stopped."""
+    """Answer an operator's command: a laboratory is up, and has no device that could be held or
+    stopped."""
     if isinstance(order, Commanded):
         callee.answer(now, order.command.id, True, {"answers": {}, "devices": {}, "emergency": []})
 
@@ -33,14 +35,17 @@ class LaboratoryParty(ABC):
     services: ClassVar[Sequence[str]] = SERVICES
     """What it answers."""
     between_ticks: ClassVar[str] = PREPARE
-    """The service that may take longer than a tick: in real time the world waits for it, not the callers."""
+    """The service that may take longer than a tick: in real time the world waits for it, not the
+    callers."""
 
     def __init__(self, name: str, where: Callable[[str], str], boot: str, directory: str) -> None:
         """`boot`, `directory`: as in services.comm.callee."""
         self.name = name
         self.now = 0.0
         """How far the world has gone (s)."""
-        offers = {service: Offer(inline=lambda _, call: self.answer(call)) for service in self.services}
+        offers = {
+            service: Offer(inline=lambda _, call: self.answer(call)) for service in self.services
+        }
         self.callee = Callee(name, boot, offers, directory=directory)
         self.exposures = Exposures()
         self._where = cache(where)
@@ -68,7 +73,8 @@ class LaboratoryParty(ABC):
 
     @abstractmethod
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Do beforehand, in any thread, what a preparation with these arguments would take long for. Raises ValueError."""
+        """Do beforehand, in any thread, what a preparation with these arguments would take long
+        for. Raises ValueError."""
 
     @abstractmethod
     def close(self) -> None:
@@ -124,10 +130,13 @@ class LaboratoryParty(ABC):
         frames = self.take_frames()
         if frames:
             for port in self._bus_ports:
-                self._out.append(Envelope(self._where(port), self.name, port, "can", can_body(frames)))
+                self._out.append(
+                    Envelope(self._where(port), self.name, port, "can", can_body(frames))
+                )
 
     def _send_images(self, now: float) -> None:
-        """An image arrives a tick after it is sent: it is sent a tick early, with the age that it has on arrival."""
+        """An image arrives a tick after it is sent: it is sent a tick early, with the age that it
+        has on arrival."""
         arrival = now + TICK
         for image in self.exposures.take(arrival):
             body = image_body(image.pixels, arrival - image.time, image.sequence, image.generation)
@@ -142,6 +151,7 @@ def whole_number(arguments: Mapping[str, Any], key: str, default: int | None) ->
         return None
     if type(value) is not int or value < 0:
         raise ValueError(
-            f"{key} is {value!r}: give a whole number, 0 or more" + (", or leave it out" if default is None else "")
+            f"{key} is {value!r}: give a whole number, 0 or more"
+            + (", or leave it out" if default is None else "")
         )
     return value

@@ -1,6 +1,8 @@
-"""Arm and cup as the simulated camera sees them: patches of one grey level, each the convex hull of two rims.
+"""Arm and cup as the simulated camera sees them: patches of one grey level, each the convex hull of
+two rims.
 
-They are worked out anew only when arm or cup has moved. Plain floats decide what is in view: most parts never are.
+They are worked out anew only when arm or cup has moved. Plain floats decide what is in view: most
+parts never are.
 """
 
 from __future__ import annotations
@@ -56,8 +58,8 @@ class Lens(Protocol):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cover:
-    """What arm or cup hide: a convex hull (n, 1, 2) in sixteenths of a pixel, the box of the image that holds it, its grey
-    level, its height (m)."""
+    """What arm or cup hide: a convex hull (n, 1, 2) in sixteenths of a pixel, the box of the image
+    that holds it, its grey level, its height (m)."""
 
     hull: NDArray[np.int32]
     box: Box
@@ -73,12 +75,15 @@ class Occluders:
         """Radius and depth of the cup (m)."""
         self._lens = lens
         outer = _RING * (cup_radius + CUP_WALL)
-        self._rings: Array = np.concatenate([outer, outer - (0.0, 0.0, cup_depth), _RING * cup_radius])
+        self._rings: Array = np.concatenate(
+            [outer, outer - (0.0, 0.0, cup_depth), _RING * cup_radius]
+        )
         self._size = math.hypot(cup_radius + CUP_WALL, cup_depth)
         self._seen: tuple[bytes, list[Cover]] = (b"", [])
 
     def covers(self, points: Array, radii: Array, pose: Array | None) -> list[Cover]:
-        """What hides something now: capsules of the arm (points (n, 2, 3), radii (n,)), cup at `pose` (4, 4) if not None."""
+        """What hides something now: capsules of the arm (points (n, 2, 3), radii (n,)), cup at
+        `pose` (4, 4) if not None."""
         key = points.tobytes() + radii.tobytes() + (b"" if pose is None else pose.tobytes())
         if key != self._seen[0]:
             if len(points) != len(radii):
@@ -86,7 +91,9 @@ class Occluders:
             self._seen = key, self._arm(points.tolist(), radii.tolist()) + self._cup(pose)
         return self._seen[1]
 
-    def _arm(self, capsules: Sequence[Sequence[Sequence[float]]], radii: Sequence[float]) -> list[Cover]:
+    def _arm(
+        self, capsules: Sequence[Sequence[Sequence[float]]], radii: Sequence[float]
+    ) -> list[Cover]:
         """The hull of both ends' discs for each capsule in view."""
         seen = [
             (disc, 0.5 * (a[2] + b[2]))
@@ -103,7 +110,9 @@ class Occluders:
             for hull, ((a, b), height) in zip(corners, seen, strict=True)
         ]
 
-    def _discs(self, a: Sequence[float], b: Sequence[float], radius: float) -> tuple[Disc, Disc] | None:
+    def _discs(
+        self, a: Sequence[float], b: Sequence[float], radius: float
+    ) -> tuple[Disc, Disc] | None:
         """Both ends of a capsule, None if it is not in view."""
         lens = self._lens
         (ua, va, near), (ub, vb, far) = lens.pixel(a), lens.pixel(b)
@@ -111,7 +120,10 @@ class Occluders:
             return None  # at or behind the lens: out of focus anyway
         ra, rb = radius * lens.focal / near, radius * lens.focal / far
         if not self._in_view(
-            min(ua - ra, ub - rb), min(va - ra, vb - rb), max(ua + ra, ub + rb), max(va + ra, vb + rb)
+            min(ua - ra, ub - rb),
+            min(va - ra, vb - rb),
+            max(ua + ra, ub + rb),
+            max(va + ra, vb + rb),
         ):
             return None
         return (ua, va, ra), (ub, vb, rb)
@@ -140,14 +152,25 @@ class Occluders:
 
     def _in_view(self, left: float, top: float, right: float, bottom: float) -> bool:
         """Whether some of a box (px) is in the image."""
-        return right >= 0.0 and bottom >= 0.0 and left < self._lens.width and top < self._lens.height
+        return (
+            right >= 0.0 and bottom >= 0.0 and left < self._lens.width and top < self._lens.height
+        )
 
     def _cover(
-        self, corners: NDArray[np.int32], u: float, v: float, grey: float, height: float, cup: bool = False
+        self,
+        corners: NDArray[np.int32],
+        u: float,
+        v: float,
+        grey: float,
+        height: float,
+        cup: bool = False,
     ) -> Cover:
-        """The convex hull of corners (n, 2), in sixteenths of a pixel, in the light of the pixel (u, v)."""
+        """The convex hull of corners (n, 2), in sixteenths of a pixel, in the light of the pixel
+        (u, v)."""
         lens = self._lens
-        light = lens.illumination[min(max(int(v), 0), lens.height - 1), min(max(int(u), 0), lens.width - 1)]
+        light = lens.illumination[
+            min(max(int(v), 0), lens.height - 1), min(max(int(u), 0), lens.width - 1)
+        ]
         hull = np.asarray(cv2.convexHull(corners), np.int32)
         left, top, wide, high = cv2.boundingRect(hull)
         box = _within(lens.height, top, top + high), _within(lens.width, left, left + wide)
@@ -156,7 +179,9 @@ class Occluders:
 
 def _within(size: int, low: int, high: int) -> slice:
     """Whole pixels of an image side of `size` px around a stretch in sixteenths of a pixel."""
-    return slice(max((low >> SUBPIXEL_BITS) - _SOFT, 0), min((high >> SUBPIXEL_BITS) + _SOFT + 1, size))
+    return slice(
+        max((low >> SUBPIXEL_BITS) - _SOFT, 0), min((high >> SUBPIXEL_BITS) + _SOFT + 1, size)
+    )
 
 
 def fill(picture: Picture, covers: Sequence[Cover]) -> None:

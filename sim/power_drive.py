@@ -1,4 +1,5 @@
-"""A CiA 402 drive's power state machine, whatever its mode of operation: commands, faults, quick stop, loss of master and SYNC."""
+"""A CiA 402 drive's power state machine, whatever its mode of operation: commands, faults, quick
+stop, loss of master and SYNC."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final
 
-from services.comm.canopen import Abort, NmtState, SdoAbortError
-from services.comm.cia402 import (
+from petrobot.services.comm.canopen import Abort, NmtState, SdoAbortError
+from petrobot.services.comm.cia402 import (
     Command,
     Fault,
     Mode,
@@ -19,7 +20,7 @@ from services.comm.cia402 import (
     command_of,
     from_units,
 )
-from sim.canopen_node import CanopenNode
+from petrobot.sim.canopen_node import CanopenNode
 
 _REGISTERS: Final = {
     Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,
@@ -32,7 +33,11 @@ POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_
 """States in which the motor has torque."""
 _DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 _ENABLED: Final = State.OPERATION_ENABLED
-_REMOTE, _VOLTAGE, _FOLLOWS = int(StatusBit.REMOTE), int(StatusBit.VOLTAGE_ENABLED), int(StatusBit.FOLLOWS_COMMAND)
+_REMOTE, _VOLTAGE, _FOLLOWS = (
+    int(StatusBit.REMOTE),
+    int(StatusBit.VOLTAGE_ENABLED),
+    int(StatusBit.FOLLOWS_COMMAND),
+)
 RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
 """Statusword of a drive that follows its set points, without the bits of its mode."""
 ENABLE_MASK, ENABLE = Command.ENABLE_OPERATION.value
@@ -44,16 +49,19 @@ def _calm() -> None:
 
 
 class PowerDrive(CanopenNode, ABC):
-    """One drive without its motor. A motor's drive names its `mode` and says how it begins, ramps down and loses its torque."""
+    """One drive without its motor. A motor's drive names its `mode` and says how it begins, ramps
+    down and loses its torque."""
 
     mode: ClassVar[Mode]
     """The one mode of operation that it knows."""
     fixed: ClassVar[tuple[Object, ...]] = (Object.MODE,)
     """What must not be written while the motor has torque."""
 
-    def __init__(self, node: int, eds: str, sync_patience: int, stir: Callable[[], None] = _calm) -> None:
-        """`sync_patience`: periods of 1006h without SYNC after which an enabled drive stops by itself; `stir` is called
-        whenever something happens that may change the motor's torque."""
+    def __init__(
+        self, node: int, eds: str, sync_patience: int, stir: Callable[[], None] = _calm
+    ) -> None:
+        """`sync_patience`: periods of 1006h without SYNC after which an enabled drive stops by
+        itself; `stir` is called whenever something happens that may change the motor's torque."""
         super().__init__(node, eds)
         self.stir = stir
         self.state = State.NOT_READY_TO_SWITCH_ON
@@ -67,7 +75,8 @@ class PowerDrive(CanopenNode, ABC):
     # What a motor and its mode of operation add.
     @abstractmethod
     def begin(self, resumed: bool) -> None:
-        """Operation is enabled: let the brake go and take set points; `resumed`: out of a quick stop."""
+        """Operation is enabled: let the brake go and take set points; `resumed`: out of a quick
+        stop."""
 
     @abstractmethod
     def ramp_down(self, deceleration: float) -> None:
@@ -82,11 +91,13 @@ class PowerDrive(CanopenNode, ABC):
         return 0
 
     def refresh(self) -> None:
-        """The objects have their defaults again, or the network state has changed: show what is so."""
+        """The objects have their defaults again, or the network state has changed: show what is
+        so."""
 
     # Hooks of the CANopen node.
     def on_nmt(self, now: float, before: NmtState) -> None:
-        """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion (6007h = 2)."""
+        """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion
+        (6007h = 2)."""
         if before is NmtState.BOOT_UP:
             if self.state not in _DOWN:
                 self._enter(State.SWITCH_ON_DISABLED)
@@ -113,7 +124,9 @@ class PowerDrive(CanopenNode, ABC):
 
     def after_configuring(self) -> None:
         """Take over how the drive watches itself."""
-        self._sync_patience = self._patient_periods * self.values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
+        self._sync_patience = (
+            self._patient_periods * self.values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
+        )
 
     def check_write(self, index: int, sub: int, value: int) -> None:
         """No other mode than its own, and no change of configuration while the motor has torque."""
@@ -124,12 +137,16 @@ class PowerDrive(CanopenNode, ABC):
 
     # What happens to a drive.
     def trip(self, fault: Fault) -> None:
-        """A fault occurs: EMCY, then a ramp to rest (the brake at once if there is no power for it), then FAULT."""
+        """A fault occurs: EMCY, then a ramp to rest (the brake at once if there is no power for
+        it), then FAULT."""
         if self.state in _DOWN:
             return
         self.fault = fault
         self.report(fault, _REGISTERS.get(fault, 0x21))
-        if self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE) or fault in _POWERLESS:
+        if (
+            self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+            or fault in _POWERLESS
+        ):
             self._enter(State.FAULT)
         else:
             self._quick_stop(State.FAULT_REACTION_ACTIVE)

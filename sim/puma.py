@@ -1,8 +1,8 @@
 """The arm as a body that torques move: rigid-body dynamics, rotors, friction, brakes, hard stops.
 
-Mass matrix and bias torques come from PyBullet on the published values; rotor inertia (up to 2.3 kg m^2 at the joint, more
-than most links) is added here, as URDF has no place for it. Integration is semi-implicit Euler. An arm that stands
-still, held by friction or brakes, costs next to nothing.
+Mass matrix and bias torques come from PyBullet on the published values; rotor inertia (up to 2.3 kg
+m^2 at the joint, more than most links) is added here, as URDF has no place for it. Integration is
+semi-implicit Euler. An arm that stands still, held by friction or brakes, costs next to nothing.
 """
 
 from __future__ import annotations
@@ -15,24 +15,27 @@ from typing import Any
 import numpy as np
 import pybullet
 
-from services.comm.compiled import packed
-from sim.arm_motion import Matrix, Six, held, held_packed, motors, stepped, stepped_packed
-from sim.puma_model import JOINTS, ArmModel, Link
-from sim.puma_urdf import urdf
-from sim.truth import Vector
+from petrobot.services.comm.compiled import packed
+from petrobot.sim.arm_motion import Matrix, Six, held, held_packed, motors, stepped, stepped_packed
+from petrobot.sim.puma_model import JOINTS, ArmModel, Link
+from petrobot.sim.puma_urdf import urdf
+from petrobot.sim.truth import Vector
 
 _REFRESH = (0.01, 0.01, 0.1, 0.1)
-"""rad, of joints 2 to 5; the mass matrix is computed anew when a joint has moved so far: it changes by less than 1 % meanwhile.
-It does not depend on joint 1, and on the wrist only by its light links."""
+"""rad, of joints 2 to 5; the mass matrix is computed anew when a joint has moved so far: it
+changes by less than 1 % meanwhile. It does not depend on joint 1, and on the wrist only by its
+light links."""
 _STICTION = 1.05
-"""Dry friction of a joint at rest as a multiple of that of a moving one: where sliding dies down, the joint sticks."""
+"""Dry friction of a joint at rest as a multiple of that of a moving one: where sliding dies down,
+the joint sticks."""
 _REST: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _BRAKE = 2.0
 """Torque of a joint's brake as a multiple of the motor's."""
 
 
 class RigidBody:
-    """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics client of its own."""
+    """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics
+    client of its own."""
 
     def __init__(self, model: ArmModel, gravity: float, flange_load: Link | None = None) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
@@ -41,25 +44,37 @@ class RigidBody:
             file = Path(folder) / "arm.urdf"
             file.write_text(urdf(model, flange_load), encoding="utf-8")
             self._body = pybullet.loadURDF(
-                str(file), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=self._client
+                str(file),
+                useFixedBase=True,
+                flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                physicsClientId=self._client,
             )
         self._zero = [0.0] * JOINTS
 
     def mass_matrix(self, q: Sequence[float]) -> Vector:
         """(6, 6) kg m^2."""
-        return np.array(pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client))
+        return np.array(
+            pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client)
+        )
 
     def bias(self, q: Sequence[float], qd: Sequence[float]) -> Six:
         """Six torques (N m) that hold the arm against gravity, Coriolis and centrifugal forces."""
-        torques: Six = pybullet.calculateInverseDynamics(self._body, q, qd, self._zero, physicsClientId=self._client)
+        torques: Six = pybullet.calculateInverseDynamics(
+            self._body, q, qd, self._zero, physicsClientId=self._client
+        )
         return torques
 
     def link_frame(self, q: Sequence[float], link: int) -> tuple[Vector, Vector]:
-        """Origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for checks."""
+        """Origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for
+        checks."""
         for joint, angle in enumerate(q):
             pybullet.resetJointState(self._body, joint, angle, physicsClientId=self._client)
-        state = pybullet.getLinkState(self._body, link, computeForwardKinematics=1, physicsClientId=self._client)
-        return np.array(state[4]), np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+        state = pybullet.getLinkState(
+            self._body, link, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        return np.array(state[4]), np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(
+            3, 3
+        )
 
     def close(self) -> None:
         """End the physics client."""
@@ -71,9 +86,9 @@ class RigidBody:
 class ArmPlant:
     """The arm as its drives feel it: six torques in, six positions and speeds out.
 
-    `q` (rad) and `qd` (rad/s) are as the encoders show them. Drives put torques (N m at the joint) into `tau` and engage or
-    release brakes; `step` moves the arm on. Plain floats, as six numbers are too few for an array to pay (11 us a step
-    against 30).
+    `q` (rad) and `qd` (rad/s) are as the encoders show them. Drives put torques (N m at the joint)
+    into `tau` and engage or release brakes; `step` moves the arm on. Plain floats, as six numbers
+    are too few for an array to pay (11 us a step against 30).
     """
 
     def __init__(
@@ -84,7 +99,8 @@ class ArmPlant:
         speed_factor: float = 1.0,
         load: Link | None = None,
     ) -> None:
-        """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what the flange carries."""
+        """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what
+        the flange carries."""
         self.model = model
         self.q: Six = _six(start)
         self.qd: Six = _REST
@@ -102,7 +118,8 @@ class ArmPlant:
         self._hold = self._stick = _REST
         self._greatest = _six(model.speed)
         self._packs = hasattr(stepped_packed, "py_func")
-        """Whether kernels are compiled: then they are handed what seldom changes packed, else as it stands."""
+        """Whether kernels are compiled: then they are handed what seldom changes packed, else as it
+        stands."""
         for joint in range(JOINTS):
             self.brake(joint)
         self._friction = _REST
@@ -112,7 +129,8 @@ class ArmPlant:
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Kernels are compiled, or read from where they are kept, now and not when the arm first moves."""
+        """Kernels are compiled, or read from where they are kept, now and not when the arm first
+        moves."""
         self._held(_REST)
         self._stepped(0.001, _REST, self._bias)
 
@@ -146,7 +164,14 @@ class ArmPlant:
     def _pack(self) -> None:
         """The numbers that compiled kernels read have changed."""
         if self._packs:
-            groups = self._limit, self._greatest, self._viscous, self._hold, self._stick, *self._ends
+            groups = (
+                self._limit,
+                self._greatest,
+                self._viscous,
+                self._hold,
+                self._stick,
+                *self._ends,
+            )
             self._numbers = packed(stepped_packed, [number for group in groups for number in group])
 
     def step(self, dt: float, tau: Sequence[float] | None = None) -> None:
@@ -172,7 +197,9 @@ class ArmPlant:
     def _stepped(self, dt: float, asked: Six, bias: Six) -> tuple[Six, Six, Six, bool]:
         """Angles, speeds and dry friction after `dt`, and whether the arm then stands still."""
         if self._packs:
-            return stepped_packed(dt, self.q, self.qd, asked, bias, self._friction, self._rows, self._numbers)
+            return stepped_packed(
+                dt, self.q, self.qd, asked, bias, self._friction, self._rows, self._numbers
+            )
         return stepped(
             dt,
             self.q,

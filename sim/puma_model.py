@@ -1,6 +1,8 @@
-"""The arm as numbers and geometry: read from the arm file, forward kinematics, solid parts. SI units, radians.
+"""The arm as numbers and geometry: read from the arm file, forward kinematics, solid parts. SI
+units, radians.
 
-The laboratory reads the published values from the file that services.toml or cell.toml names; it has no copy of its own.
+The laboratory reads the published values from the file that services.toml or cell.toml names; it
+has no copy of its own.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim.truth import LaboratoryError, Vector, read_toml
+from petrobot.sim.truth import LaboratoryError, Vector, read_toml
 
 JOINTS = 6
 _DEGREE = math.pi / 180.0
@@ -54,7 +56,8 @@ class Frame3(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Mass (kg), centre of mass (m) and principal inertia about it (kg m^2) in the link's own DH frame."""
+    """Mass (kg), centre of mass (m) and principal inertia about it (kg m^2) in the link's own DH
+    frame."""
 
     mass: float
     centre: tuple[float, float, float]
@@ -63,7 +66,8 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """One entry a joint, base to flange. `rotor`, `viscous`, `coulomb` are seen at the joint (kg m^2, N m s/rad, N m)."""
+    """One entry a joint, base to flange. `rotor`, `viscous`, `coulomb` are seen at the joint (kg
+    m^2, N m s/rad, N m)."""
 
     base: tuple[float, float, float]
     d: tuple[float, ...]
@@ -92,7 +96,8 @@ class ArmModel:
         return tuple(frames)
 
     def _chain(self, q: Sequence[float], frames: list[Frame3] | None) -> Frame3:
-        """Frame 6, and all on the way to it appended to `frames` if one asks for them. Plain floats: 8 us a pose."""
+        """Frame 6, and all on the way to it appended to `frames` if one asks for them. Plain
+        floats: 8 us a pose."""
         xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
         ox, oy, oz = self.base
         for angle, d, a, (ca, sa) in zip(q, self.d, self.a, self.twists, strict=True):
@@ -110,8 +115,11 @@ class ArmModel:
         """Frame 6 at joint angles `q` (six, rad)."""
         return self._chain(q, None)
 
-    def solid_parts(self, q: Sequence[float], cup_bottom: tuple[float, float, float]) -> tuple[Vector, Vector]:
-        """Capsules of the arm: end points (6, 2, 3) in the base frame and radii (6,), m; the last holds the cup."""
+    def solid_parts(
+        self, q: Sequence[float], cup_bottom: tuple[float, float, float]
+    ) -> tuple[Vector, Vector]:
+        """Capsules of the arm: end points (6, 2, 3) in the base frame and radii (6,), m; the last
+        holds the cup."""
         frames = self.frames(q)
         shoulder, elbow, wrist = frames[1].origin, frames[2].origin, frames[4].origin
         beside = frames[2].point((0.0, 0.0, self.d[2]))
@@ -125,26 +133,36 @@ class ArmModel:
             (flange, frames[JOINTS].point(cup_bottom)),
         ]
         r = self.radii
-        return np.array(ends), np.array([r["base"], r["upper_arm"], r["forearm"], r["forearm"], r["wrist"], 0.015])
+        return np.array(ends), np.array(
+            [r["base"], r["upper_arm"], r["forearm"], r["forearm"], r["wrist"], 0.015]
+        )
 
 
 def read_arm(path: Path) -> ArmModel:
-    """The arm of a file like services/motion/puma560.toml. Raises LaboratoryError naming file, key and remedy."""
+    """The arm of a file like services/motion/puma560.toml. Raises LaboratoryError naming file, key
+    and remedy."""
     table = read_toml(path)
     try:
         joints, links = table["joint"], table["link"]
         if len(joints) != JOINTS or len(links) != JOINTS:
             raise LaboratoryError(
-                f"{path}: {len(joints)} [[joint]] and {len(links)} [[link]]; there must be {JOINTS} of each"
+                f"{path}: {len(joints)} [[joint]] and {len(links)} [[link]]; there must be "
+                f"{JOINTS} of each"
             )
         return _model(table, joints, links)
     except KeyError as fault:
-        raise LaboratoryError(f"{path}: key {fault} is missing; the head of the shipped file lists the keys") from fault
+        raise LaboratoryError(
+            f"{path}: key {fault} is missing; the head of the shipped file lists the keys"
+        ) from fault
     except (TypeError, ValueError) as fault:
-        raise LaboratoryError(f"{path}: {fault}; the head of the shipped file says what each key holds") from fault
+        raise LaboratoryError(
+            f"{path}: {fault}; the head of the shipped file says what each key holds"
+        ) from fault
 
 
-def _model(table: Mapping[str, Any], joints: list[dict[str, Any]], links: list[dict[str, Any]]) -> ArmModel:
+def _model(
+    table: Mapping[str, Any], joints: list[dict[str, Any]], links: list[dict[str, Any]]
+) -> ArmModel:
     def column(key: str) -> Vector:
         return np.array([float(joint[key]) for joint in joints])
 
@@ -156,7 +174,10 @@ def _model(table: Mapping[str, Any], joints: list[dict[str, Any]], links: list[d
         d=tuple(column("d").tolist()),
         a=tuple(column("a").tolist()),
         alpha=tuple((column("alpha") * _DEGREE).tolist()),
-        twists=tuple((round(math.cos(t), 15), round(math.sin(t), 15)) for t in (column("alpha") * _DEGREE).tolist()),
+        twists=tuple(
+            (round(math.cos(t), 15), round(math.sin(t), 15))
+            for t in (column("alpha") * _DEGREE).tolist()
+        ),
         lower=limits[:, 0],
         upper=limits[:, 1],
         speed=column("speed") * _DEGREE,
@@ -168,5 +189,7 @@ def _model(table: Mapping[str, Any], joints: list[dict[str, Any]], links: list[d
         links=tuple(Link(float(n["mass"]), tuple(n["centre"]), tuple(n["inertia"])) for n in links),
         flange=float(table["frame"]["flange"]),
         radii={key: float(value) for key, value in table["body"].items()},
-        poses={name: np.array(pose, dtype=float) * _DEGREE for name, pose in table["poses"].items()},
+        poses={
+            name: np.array(pose, dtype=float) * _DEGREE for name, pose in table["poses"].items()
+        },
     )

@@ -1,12 +1,14 @@
-"""The laboratory on the wall clock: bus, camera and calls over sockets, the world paced by absolute deadlines.
+"""The laboratory on the wall clock: bus, camera and calls over sockets, the world paced by absolute
+deadlines.
 
-A thread paces the world: it waits in the bus's sockets until the next deadline, answers frames as they come, and at each
-deadline moves the world on to it, so the world is never ahead of the clock. Calls are served by an asyncio loop in the main
-thread; both hold one lock while they touch the laboratory.
+A thread paces the world: it waits in the bus's sockets until the next deadline, answers frames as
+they come, and at each deadline moves the world on to it, so the world is never ahead of the clock.
+Calls are served by an asyncio loop in the main thread; both hold one lock while they touch the
+laboratory.
 
-Catch-up: a tick that begins late is followed at once by the next ones until the world has caught up. A world more than
-`SLIP` behind (a stopped process, a machine out of breath) does not run after the clock: its time slips, and `slipped` says
-by how much in all.
+Catch-up: a tick that begins late is followed at once by the next ones until the world has caught
+up. A world more than `SLIP` behind (a stopped process, a machine out of breath) does not run after
+the clock: its time slips, and `slipped` says by how much in all.
 """
 
 from __future__ import annotations
@@ -24,17 +26,17 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Final
 
-from services.comm.callee import Callee, Offer, Order, StartRun
-from services.comm.camera import ImageServer
-from services.comm.can_hub import Hub
-from services.comm.credentials import credentials
-from services.comm.directory import Directory, resolve
-from services.comm.listening import listening, refuse_unusable
-from services.comm.messages import Call, Outcome
-from services.comm.party import TICK
-from services.comm.server import Server
-from sim.laboratory_party import LaboratoryParty, answer_command
-from sim.truth import LaboratoryError
+from petrobot.services.comm.callee import Callee, Offer, Order, StartRun
+from petrobot.services.comm.camera import ImageServer
+from petrobot.services.comm.can_hub import Hub
+from petrobot.services.comm.credentials import credentials
+from petrobot.services.comm.directory import Directory, resolve
+from petrobot.services.comm.listening import listening, refuse_unusable
+from petrobot.services.comm.messages import Call, Outcome
+from petrobot.services.comm.party import TICK
+from petrobot.services.comm.server import Server
+from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
+from petrobot.sim.truth import LaboratoryError
 
 SLIP: Final = 0.1
 """s behind the clock from which on the world's time slips."""
@@ -45,9 +47,12 @@ PRIORITY = 5
 
 
 class Pacemaker:
-    """Moves a laboratory along with the clock and carries frames and images. `run` until `stop`, in a thread of its own."""
+    """Moves a laboratory along with the clock and carries frames and images. `run` until `stop`, in
+    a thread of its own."""
 
-    def __init__(self, laboratory: LaboratoryParty, hub: Hub | None, images: ImageServer | None) -> None:
+    def __init__(
+        self, laboratory: LaboratoryParty, hub: Hub | None, images: ImageServer | None
+    ) -> None:
         """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none."""
         self.lock = threading.Lock()
         self.slipped = 0.0
@@ -57,7 +62,9 @@ class Pacemaker:
         self._port = hub.port() if hub else None
         self._images = images
         self._generation = 0
-        self._jobs: queue.SimpleQueue[tuple[Callable[[], Outcome], Future[Outcome]]] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], Outcome], Future[Outcome]]] = (
+            queue.SimpleQueue()
+        )
         self._stopped = threading.Event()
         self._begin = 0.0
 
@@ -66,7 +73,8 @@ class Pacemaker:
         self._stopped.set()
 
     def run(self) -> None:
-        """Go on until stopped. Ahead of other processes where that is permitted: drives and world do not wait for anybody."""
+        """Go on until stopped. Ahead of other processes where that is permitted: drives and world
+        do not wait for anybody."""
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         self._begin = time.monotonic() - self._laboratory.now
@@ -83,7 +91,8 @@ class Pacemaker:
             self._do_jobs()
 
     def submit(self, job: Callable[[], Outcome]) -> Future[Outcome]:
-        """Have something done between two ticks, in the pacemaker's own thread: in another it could keep the world waiting."""
+        """Have something done between two ticks, in the pacemaker's own thread: in another it could
+        keep the world waiting."""
         done: Future[Outcome] = Future()
         self._jobs.put((job, done))
         return done
@@ -134,22 +143,28 @@ class Pacemaker:
 
 
 class LaboratoryShell:
-    """A running laboratory of one simulated node of services.toml. Between `start` and `close` it serves."""
+    """A running laboratory of one simulated node of services.toml. Between `start` and `close` it
+    serves."""
 
     def __init__(self, directory: Directory, name: str) -> None:
-        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an address that cannot
-        be."""
+        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an
+        address that cannot be."""
         self._directory = directory
         self._name = name
         self.laboratory = _made(directory, name)
         channel, address = bus_channel(directory), camera_address(directory)
         with _had(f"{directory.source}: the simulated bus's channel {channel}"):
             self._hub = Hub(channel) if channel else None
-        with _had(f"{directory.source}: the simulated camera's address {':'.join(map(str, address or ()))}"):
+        with _had(
+            f"{directory.source}: the simulated camera's address "
+            f"{':'.join(map(str, address or ()))}"
+        ):
             self._images = ImageServer(*address) if address else None
         self.pacemaker = Pacemaker(self.laboratory, self._hub, self._images)
         offers = {
-            service: Offer(inline=None if service == self.laboratory.between_ticks else self._answer)
+            service: Offer(
+                inline=None if service == self.laboratory.between_ticks else self._answer
+            )
             for service in self.laboratory.services
         }
         callee = Callee(name, secrets.token_hex(8), offers, directory=directory.hash)
@@ -163,7 +178,8 @@ class LaboratoryShell:
         self._fault: BaseException | None = None
 
     async def start(self) -> None:
-        """Make all ready that takes long, start the world's clock, then listen. Raises DirectoryError, KeyNeededError."""
+        """Make all ready that takes long, start the world's clock, then listen. Raises
+        DirectoryError, KeyNeededError."""
         if self._images is not None:
             self.laboratory.make_ready({})
         gc.collect()
@@ -213,24 +229,34 @@ class LaboratoryShell:
                 task.add_done_callback(self._preparing.discard)
 
     async def _prepare(self, call: Call) -> None:
-        """What takes long comes first (a camera that hangs elsewhere needs seconds to draw its still scene): not in the loop,
-        not in a tick."""
+        """What takes long comes first (a camera that hangs elsewhere needs seconds to draw its
+        still scene): not in the loop, not in a tick."""
         with contextlib.suppress(ValueError):  # the answer says what is wrong with the arguments
             await asyncio.to_thread(self.laboratory.make_ready, call.arguments)
-        outcome = await asyncio.wrap_future(self.pacemaker.submit(lambda: self.laboratory.answer(call)))
+        outcome = await asyncio.wrap_future(
+            self.pacemaker.submit(lambda: self.laboratory.answer(call))
+        )
         self.server.callee.finish(
-            self.server.now(), call.id, outcome.status, outcome.values, outcome.cause, outcome.text, outcome.executed
+            self.server.now(),
+            call.id,
+            outcome.status,
+            outcome.values,
+            outcome.cause,
+            outcome.text,
+            outcome.executed,
         )
         self.server.flush()
 
 
 def _made(directory: Directory, name: str) -> LaboratoryParty:
-    """The laboratory that the node's `sim` makes. Raises LaboratoryError for one that is no `LaboratoryParty`."""
+    """The laboratory that the node's `sim` makes. Raises LaboratoryError for one that is no
+    `LaboratoryParty`."""
     made = resolve(directory.nodes[name].sim)(directory, name)
     if not isinstance(made, LaboratoryParty):
         raise LaboratoryError(
-            f"{directory.source}: [nodes.{name}] sim makes a {type(made).__name__}; in real time it must be a "
-            "sim.laboratory_party.LaboratoryParty"
+            f"{directory.source}: [nodes.{name}] sim makes a {type(made).__name__}; in real "
+            "time it must be a "
+            "petrobot.sim.laboratory_party.LaboratoryParty"
         )
     return made
 
@@ -242,11 +268,14 @@ def _had(what: str) -> Iterator[None]:
         yield
     except OSError as fault:
         why = os.strerror(fault.errno) if fault.errno else str(fault)
-        raise LaboratoryError(f"{what}: {why}; end the process that listens there, or give another port") from fault
+        raise LaboratoryError(
+            f"{what}: {why}; end the process that listens there, or give another port"
+        ) from fault
 
 
 def bus_channel(directory: Directory) -> str:
-    """Channel of the simulated bus: that of the device that speaks `petrobot_stream`; empty without one."""
+    """Channel of the simulated bus: that of the device that speaks `petrobot_stream`; empty without
+    one."""
     channels = set()
     for device in directory.devices.values():
         can = device.config.get("can") or device.config
@@ -254,29 +283,39 @@ def bus_channel(directory: Directory) -> str:
             channels.add(str(can.get("channel", "")))
     if len(channels) > 1:
         raise LaboratoryError(
-            f"{directory.source}: buses {', '.join(sorted(channels))}: the laboratory has one; use one"
+            f"{directory.source}: buses {', '.join(sorted(channels))}: the laboratory has "
+            "one; use one"
         )
     return channels.pop() if channels else ""
 
 
 def camera_address(directory: Directory) -> tuple[str, int] | None:
-    """Where the simulated camera listens: the `address` of the device with `source = "sim"`; None without one."""
+    """Where the simulated camera listens: the `address` of the device with `source = "sim"`; None
+    without one."""
     addresses = {
-        str(d.config.get("address", "")) for d in directory.devices.values() if d.config.get("source") == "sim"
+        str(d.config.get("address", ""))
+        for d in directory.devices.values()
+        if d.config.get("source") == "sim"
     }
     if not addresses:
         return None
     if len(addresses) > 1:
-        raise LaboratoryError(f"{directory.source}: cameras at {', '.join(sorted(addresses))}: the laboratory has one")
+        raise LaboratoryError(
+            f"{directory.source}: cameras at {', '.join(sorted(addresses))}: the laboratory has one"
+        )
     host, _, port = addresses.pop().rpartition(":")
     if not host or not port.isdigit():
-        raise LaboratoryError(f'{directory.source}: a device with source = "sim" needs address = "host:port"')
+        raise LaboratoryError(
+            f'{directory.source}: a device with source = "sim" needs address = "host:port"'
+        )
     return host, int(port)
 
 
 async def serve(directory: Directory, name: str) -> None:
     """Run the laboratory until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
-    refuse_unusable(directory, name)  # a second laboratory is told of its node's address, not of its bus's
+    refuse_unusable(
+        directory, name
+    )  # a second laboratory is told of its node's address, not of its bus's
     shell = LaboratoryShell(directory, name)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -1,4 +1,5 @@
-"""Keeps the score: what was thrown, what could have been caught, what was, and how far off the rest went by."""
+"""Keeps the score: what was thrown, what could have been caught, what was, and how far off the rest
+went by."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sim.course import Course, Outcome
-from sim.oracle import Oracle, Verdict
+from petrobot.sim.course import Course, Outcome
+from petrobot.sim.oracle import Oracle, Verdict
 
 PLOTS: Final = {
     "catch_map": {
@@ -51,7 +52,8 @@ class _Entry:
 
 
 class Referee:
-    """Writes down each throw from its release on. `began` is the simulated time (s) from which releases are counted."""
+    """Writes down each throw from its release on. `began` is the simulated time (s) from which
+    releases are counted."""
 
     def __init__(self, seed: int, regime: str, oracle: Oracle, began: float) -> None:
         self._seed = seed
@@ -61,7 +63,8 @@ class Referee:
         self._entries: list[_Entry] = []
 
     def enter(self, course: Course, q: Sequence[float]) -> Verdict:
-        """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again for the score."""
+        """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again
+        for the score."""
         verdict = self._oracle.judge(course.throw, q)
         self._entries.append(_Entry(course, verdict))
         return verdict
@@ -72,11 +75,12 @@ class Referee:
         return self._entries[-1].verdict if self._entries else None
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        """All throws so far in plain data: `throws` (see `_row`) and, for those who look closer, `courses` (see `_course`);
-        counts are of throws that are over.
+        """All throws so far in plain data: `throws` (see `_row`) and, for those who look closer,
+        `courses` (see `_course`); counts are of throws that are over.
 
-        `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and `cause`. A throw takes the
-        status of the cycle in which it was released, None if it was released in none.
+        `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and
+        `cause`. A throw takes the status of the cycle in which it was released, None if it was
+        released in none.
         """
         rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
         over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
@@ -85,7 +89,8 @@ class Referee:
             "regime": self._regime,
             "throws": rows,
             "courses": [
-                _course(entry, self._began, status["run"]) for entry, status in zip(self._entries, rows, strict=True)
+                _course(entry, self._began, status["run"])
+                for entry, status in zip(self._entries, rows, strict=True)
             ],
             "plots": PLOTS,
             "over": len(over),
@@ -99,12 +104,17 @@ def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> 
     age = now - course.released_at
     for cycle in cycles:
         if cycle["begun_ago"] >= age >= cycle["ended_ago"]:
-            return {"status": cycle["status"], "cause": cycle.get("cause", ""), "run": cycle.get("n")}
+            return {
+                "status": cycle["status"],
+                "cause": cycle.get("cause", ""),
+                "run": cycle.get("n"),
+            }
     return {"status": None, "cause": "", "run": None}
 
 
 def _row(entry: _Entry) -> dict[str, Any]:
-    """One throw: its speed at release (m/s), what became of it, how far from the middle of the mouth it came (mm)."""
+    """One throw: its speed at release (m/s), what became of it, how far from the middle of the
+    mouth it came (mm)."""
     course, verdict = entry.course, entry.verdict
     return {
         "n": course.throw.n,
@@ -117,7 +127,8 @@ def _row(entry: _Entry) -> dict[str, Any]:
 
 
 def _course(entry: _Entry, began: float, run: int | None) -> dict[str, Any]:
-    """How one throw went, in m, m/s and s; durations count from its release, None: it did not happen."""
+    """How one throw went, in m, m/s and s; durations count from its release, None: it did not
+    happen."""
     course, exit_state = entry.course, entry.course.exit_state
     return {
         "n": course.throw.n,

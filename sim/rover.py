@@ -1,7 +1,9 @@
-"""The rover's body: wheels that lag, slip and skid, a battery that sags, and the way that comes of them.
+"""The rover's body: wheels that lag, slip and skid, a battery that sags, and the way that comes of
+them.
 
-Differential drive. Between two moments at which anything changes the wheels' speeds have a closed form (first-order lag of a
-constant set point), and the body goes along a circular arc; so it is moved only when somebody looks or something changes.
+Differential drive. Between two moments at which anything changes the wheels' speeds have a closed
+form (first-order lag of a constant set point), and the body goes along a circular arc; so it is
+moved only when somebody looks or something changes.
 """
 
 from __future__ import annotations
@@ -11,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from sim.track_elements import Pose
-from sim.track_truth import RoverTruth
+from petrobot.sim.track_elements import Pose
+from petrobot.sim.track_truth import RoverTruth
 
 SLOT: Final = 0.02
 """s between two draws of slip and two looks at the battery, whatever happens in between."""
@@ -56,7 +58,8 @@ class Wheel:
 
 
 class Rover:
-    """Wheels 0 (left) and 1 (right) and the body on them. `move_to` brings it up to a moment; times are the caller's clock (s)."""
+    """Wheels 0 (left) and 1 (right) and the body on them. `move_to` brings it up to a moment; times
+    are the caller's clock (s)."""
 
     def __init__(self, truth: RoverTruth, rng: np.random.Generator, now: float = 0.0) -> None:
         """`rng` draws the slip."""
@@ -122,10 +125,13 @@ class Rover:
         slip_left, slip_right = self._slip
         way_left = turned_left * left.radius * (1.0 - slip_left)
         way_right = turned_right * right.radius * (1.0 - slip_right)
-        self._drive(dt, 0.5 * (way_left + way_right), (way_right - way_left) / self.truth.track_width)
+        self._drive(
+            dt, 0.5 * (way_left + way_right), (way_right - way_left) / self.truth.track_width
+        )
 
     def _drive(self, dt: float, way: float, turned: float) -> None:
-        """Along an arc; lateral acceleration takes some of the turn away and pushes the body outwards."""
+        """Along an arc; lateral acceleration takes some of the turn away and pushes the body
+        outwards."""
         truth = self.truth
         lateral = way * turned / (dt * dt)
         turned /= 1.0 + truth.slip_turn * abs(lateral)
@@ -143,7 +149,10 @@ class Rover:
         if not self._slips:
             self._slips = self._rng.standard_normal((_DRAWN, 2)).tolist()
         fresh, keep, slip = self._slips.pop(), self._keep, self._slip
-        self._slip = [keep * slip[0] + self._fresh * fresh[0], keep * slip[1] + self._fresh * fresh[1]]
+        self._slip = [
+            keep * slip[0] + self._fresh * fresh[0],
+            keep * slip[1] + self._fresh * fresh[1],
+        ]
         settings, power = self.truth.settings, self.truth.settings["electronics"]
         for side, wheel in enumerate(self.wheels):
             rising = (wheel.speed - self._lasted[side]) / SLOT

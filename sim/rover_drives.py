@@ -1,20 +1,31 @@
-"""The rover's CAN bus: two CiA 402 wheel drives in cyclic synchronous velocity mode and the retroreflector sensor."""
+"""The rover's CAN bus: two CiA 402 wheel drives in cyclic synchronous velocity mode and the
+retroreflector sensor."""
 
 from __future__ import annotations
 
 import math
 from typing import Final
 
-from services.comm.canbus import Frame
-from services.comm.canopen import SYNC_ID
-from services.comm.cia402 import UNITS, Fault, Mode, Object, State, StatusBit, fault_text, to_units
-from sim.canopen_node import CanopenNode
-from sim.power_drive import POWERED, PowerDrive
-from sim.rover import SLOT, Rover
-from sim.rover_sensor import ReflectorSensor
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import SYNC_ID
+from petrobot.services.comm.cia402 import (
+    UNITS,
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    fault_text,
+    to_units,
+)
+from petrobot.sim.canopen_node import CanopenNode
+from petrobot.sim.power_drive import POWERED, PowerDrive
+from petrobot.sim.rover import SLOT, Rover
+from petrobot.sim.rover_sensor import ReflectorSensor
 
 SYNC_PATIENCE: Final = 5
-"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 100 ms at 50 Hz, 5 cm of way at 0.5 m/s."""
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 100 ms at 50 Hz, 5 cm
+of way at 0.5 m/s."""
 _STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
     (int(each), 0)
     for each in (
@@ -61,7 +72,9 @@ class WheelDrive(PowerDrive):
         position = round(self._count() * (_TURN * UNITS / rover.truth.encoder_counts))
         values[_POSITION] = (position + _HALF) % _WHOLE - _HALF
         values[_VELOCITY] = to_units(self._speed)
-        values[_TORQUE] = round(1000.0 * rover.torques[self.side] / rover.truth.settings["rated_torque"])
+        values[_TORQUE] = round(
+            1000.0 * rover.torques[self.side] / rover.truth.settings["rated_torque"]
+        )
         values[_VOLTAGE] = round(1000.0 * rover.voltage)
         values[_MAX_SPEED] = to_units(rover.top_speed)
         self.changed()
@@ -77,7 +90,9 @@ class WheelDrive(PowerDrive):
         since, self._synced = now - self._synced, now
         counted, self._counted = self._counted, self._count()
         if since > 0.0:
-            self._speed = (self._counted - counted) * _TURN / self._rover.truth.encoder_counts / since
+            self._speed = (
+                (self._counted - counted) * _TURN / self._rover.truth.encoder_counts / since
+            )
         if self.state is State.OPERATION_ENABLED:
             self._aim(self.values[_TARGET] / UNITS, min(since, _LONGEST))
 
@@ -123,14 +138,19 @@ class WheelDrive(PowerDrive):
         change = (self._ramp or 0.0) * SLOT
         self._reference = math.copysign(max(abs(self._reference) - change, 0.0), self._reference)
         self._wheel.target = self._reference
-        if self.state is State.FAULT_REACTION_ACTIVE and self._reference == 0.0 and abs(self._wheel.speed) < _AT_REST:
+        if (
+            self.state is State.FAULT_REACTION_ACTIVE
+            and self._reference == 0.0
+            and abs(self._wheel.speed) < _AT_REST
+        ):
             self.ramp_ended()
 
 
 class RoverBus:
     """Everything on the rover's bus but the master: drives 1 (left) and 2 (right), sensor 3.
 
-    In each tick: `receive` what came, then `step(now)`, then send what `drain` gives. Times are seconds on the caller's clock.
+    In each tick: `receive` what came, then `step(now)`, then send what `drain` gives. Times are
+    seconds on the caller's clock.
     """
 
     def __init__(self, rover: Rover, sensor: ReflectorSensor, now: float = 0.0) -> None:
@@ -180,7 +200,8 @@ class RoverBus:
         return frames
 
     def power(self, closed: bool) -> None:
-        """Close or open the power chain (emergency stop). Open: the drives lose power and the brakes fall in."""
+        """Close or open the power chain (emergency stop). Open: the drives lose power and the
+        brakes fall in."""
         for drive in self.drives:
             drive.powered = closed
             if not closed:

@@ -1,4 +1,5 @@
-"""The retroreflector sensor on the rover's bus: bearing and range of reflectors in view, misses and false returns."""
+"""The retroreflector sensor on the rover's bus: bearing and range of reflectors in view, misses and
+false returns."""
 
 from __future__ import annotations
 
@@ -8,9 +9,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from sim.canopen_node import CanopenNode
-from sim.track_elements import Pose
-from sim.track_truth import SensorTruth
+from petrobot.sim.canopen_node import CanopenNode
+from petrobot.sim.track_elements import Pose
+from petrobot.sim.track_truth import SensorTruth
 
 SENSOR_NODE: Final = 3
 """Node id."""
@@ -29,9 +30,13 @@ class Echo(NamedTuple):
 
 
 def look(
-    truth: SensorTruth, pose: Pose, reflectors: Sequence[tuple[float, float]], rng: np.random.Generator
+    truth: SensorTruth,
+    pose: Pose,
+    reflectors: Sequence[tuple[float, float]],
+    rng: np.random.Generator,
 ) -> list[Echo]:
-    """Echoes of one turn of the sensor on a rover at `pose`, nearest first; `reflectors` are points (x, y) in m."""
+    """Echoes of one turn of the sensor on a rover at `pose`, nearest first; `reflectors` are points
+    (x, y) in m."""
     c, s = math.cos(pose.heading), math.sin(pose.heading)
     x, y = pose.x + truth.forward * c, pose.y + truth.forward * s
     echoes: list[Echo] = []
@@ -40,13 +45,20 @@ def look(
         ahead, aside = dx * c + dy * s, dy * c - dx * s
         level = math.hypot(ahead, aside)
         bearing, slant = math.atan2(aside, ahead), math.hypot(level, truth.below)
-        if abs(bearing) > truth.half_angle or slant > truth.range or truth.below > level * math.tan(truth.fan):
+        if (
+            abs(bearing) > truth.half_angle
+            or slant > truth.range
+            or truth.below > level * math.tan(truth.fan)
+        ):
             continue
         if rng.random() >= truth.miss:
             noise = rng.standard_normal(2).tolist()
             bearing += truth.bearing_offset + truth.bearing_noise * noise[0]
             echoes.append(
-                Echo(_rounded(bearing, truth.step), slant + truth.range_offset + truth.range_noise * noise[1])
+                Echo(
+                    _rounded(bearing, truth.step),
+                    slant + truth.range_offset + truth.range_noise * noise[1],
+                )
             )
     if truth.false and rng.random() < truth.false:
         bearing = float(rng.uniform(-truth.half_angle, truth.half_angle))

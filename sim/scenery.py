@@ -1,6 +1,8 @@
-"""What stands still before the simulated camera: floor, table with its lines and marks, and the calibration board.
+"""What stands still before the simulated camera: floor, table with its lines and marks, and the
+calibration board.
 
-Surfaces are planes with a grey level under even light; `sim/camera.py` adds light, lens and noise. Lengths in m.
+Surfaces are planes with a grey level under even light; `sim/camera.py` adds light, lens and noise.
+Lengths in m.
 """
 
 from __future__ import annotations
@@ -30,12 +32,14 @@ MARK_RADIUS = 0.018
 STRIPE = 8
 """Rows of an image that are worked out at a time."""
 MARKS = ((0.25, 0.22), (0.25, -0.30), (0.80, 0.36), (0.80, -0.20), (1.30, 0.28), (1.30, -0.36))
-"""Round stickers on the table, as large as a ball: (m from the near edge, y); they tempt a detector that looks for circles."""
+"""Round stickers on the table, as large as a ball: (m from the near edge, y); they tempt a detector
+that looks for circles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The table of the cell: height of its top, x of the near edge, length along x, width along y (m)."""
+    """The table of the cell: height of its top, x of the near edge, length along x, width along y
+    (m)."""
 
     top: float
     near_edge: float
@@ -43,7 +47,9 @@ class Table:
     width: float
 
     @classmethod
-    def of(cls, cell: Mapping[str, Any], top: float | None = None, near_edge: float | None = None) -> Table:
+    def of(
+        cls, cell: Mapping[str, Any], top: float | None = None, near_edge: float | None = None
+    ) -> Table:
         """Read from the cell's `[table]`; `top` and `near_edge` (m) replace the nominal ones."""
         table = cell["table"]
         return cls(
@@ -56,7 +62,9 @@ class Table:
     def contains(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """Where points of the table's plane lie on the table."""
         inside: NDArray[np.bool_] = (
-            (x >= self.near_edge) & (x <= self.near_edge + self.length) & (np.abs(y) <= self.width / 2)
+            (x >= self.near_edge)
+            & (x <= self.near_edge + self.length)
+            & (np.abs(y) <= self.width / 2)
         )
         return inside
 
@@ -81,10 +89,12 @@ def floor_grey(x: Array, y: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
-    """A calibration board: `columns` x `rows` inner corners, `square` m wide, with a white margin of one square.
+    """A calibration board: `columns` x `rows` inner corners, `square` m wide, with a white margin
+    of one square.
 
-    The board frame has its origin at the first inner corner, x along the columns, y along the rows, z out of the board.
-    The square between the first corner and the board's nearest outer corner is black.
+    The board frame has its origin at the first inner corner, x along the columns, y along the rows,
+    z out of the board. The square between the first corner and the board's nearest outer corner is
+    black.
     """
 
     columns: int = 9
@@ -105,17 +115,27 @@ class Chessboard:
 
     def outline(self) -> Array:
         """The board's four outer corners (4, 3), board frame."""
-        near, right, far = -2 * self.square, (self.columns + 1) * self.square, (self.rows + 1) * self.square
-        return np.array([[near, near, 0.0], [right, near, 0.0], [right, far, 0.0], [near, far, 0.0]])
+        near, right, far = (
+            -2 * self.square,
+            (self.columns + 1) * self.square,
+            (self.rows + 1) * self.square,
+        )
+        return np.array(
+            [[near, near, 0.0], [right, near, 0.0], [right, far, 0.0], [near, far, 0.0]]
+        )
 
 
 def stripes(rows: int) -> Iterator[slice]:
-    """An image's rows, a few at a time: what is worked out of so many pixels fits into a core's cache."""
+    """An image's rows, a few at a time: what is worked out of so many pixels fits into a core's
+    cache."""
     return (slice(first, first + STRIPE) for first in range(0, rows, STRIPE))
 
 
-def supersampled(pixels: NDArray[np.float64], grey_at: Callable[[NDArray[np.float64]], Array], samples: int) -> Array:
-    """Mean grey level of each pixel from `samples` x `samples` points inside it; `pixels` (..., 2), result (...)."""
+def supersampled(
+    pixels: NDArray[np.float64], grey_at: Callable[[NDArray[np.float64]], Array], samples: int
+) -> Array:
+    """Mean grey level of each pixel from `samples` x `samples` points inside it; `pixels` (..., 2),
+    result (...)."""
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     offsets = [np.array([du, dv]) for dv in steps for du in steps]
     mean: Array = np.empty(pixels.shape[:-1])

@@ -1,4 +1,5 @@
-"""The position loop inside one drive: interpolation between cyclic set points, cascade control, quick-stop ramp."""
+"""The position loop inside one drive: interpolation between cyclic set points, cascade control,
+quick-stop ramp."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class DriveRating:
-    """What a drive was sized and commissioned for, at the joint: torque (N m), speed (rad/s), inertia it expects (kg m^2)."""
+    """What a drive was sized and commissioned for, at the joint: torque (N m), speed (rad/s),
+    inertia it expects (kg m^2)."""
 
     torque: float
     speed: float
@@ -20,24 +22,27 @@ POSITION_GAIN = 45.0
 VELOCITY_GAIN = 180.0
 """1/s, of the velocity loop; with the inertia it gives a torque."""
 INTEGRAL_GAIN = 40.0
-"""1/s, of the velocity loop's integrator: carries gravity and friction, as drives without a model of the arm must."""
+"""1/s, of the velocity loop's integrator: carries gravity and friction, as drives without a model
+of the arm must."""
 CYCLE = 0.001
-"""s, of the loop inside the drive: it compares the angle with where the joint is to be at the cycle's end, however long the steps
-are in which the plant is computed. So steps of 2 ms lead to the same path as those of 1 ms, to 0.2 mm at the cup
-(tests/sim/test_puma.py)."""
+"""s, of the loop inside the drive: it compares the angle with where the joint is to be at the
+cycle's end, however long the steps are in which the plant is computed. So steps of 2 ms lead to the
+same path as those of 1 ms, to 0.2 mm at the cup (tests/sim/test_puma.py)."""
 DEAD_BAND = 1e-4
-"""rad; while the set point stands and the error is smaller, the integrator keeps its value, as commercial drives do so that
-integrator and dry friction do not hunt for ever.
+"""rad; while the set point stands and the error is smaller, the integrator keeps its value, as
+commercial drives do so that integrator and dry friction do not hunt for ever.
 
-This project's choice, small beside the 0.5 degrees in which the arm counts as being at home; no data sheet says it.
+This project's choice, small beside the 0.5 degrees in which the arm counts as being at home; no
+data sheet says it.
 """
 
 
 class JointServo:
     """Torque for one joint from set points that come once a period.
 
-    Between set points the reference is a uniform quadratic B-spline of the last three: continuous in velocity, exact at
-    rest, one and a half periods behind. Torque = J (a + Kv (v + Kp e - qd)) + integral, at most the rated torque.
+    Between set points the reference is a uniform quadratic B-spline of the last three: continuous
+    in velocity, exact at rest, one and a half periods behind. Torque = J (a + Kv (v + Kp e - qd)) +
+    integral, at most the rated torque.
     """
 
     def __init__(self, rating: DriveRating, q: float) -> None:
@@ -58,7 +63,8 @@ class JointServo:
         self.error = 0.0
 
     def aim(self, target: float) -> None:
-        """Take the next set point (rad); one that asks for more than the greatest speed is cut and marks `limited`."""
+        """Take the next set point (rad); one that asks for more than the greatest speed is cut and
+        marks `limited`."""
         if self._ramp is not None:
             return
         _, before, last = self._points

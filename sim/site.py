@@ -1,4 +1,5 @@
-"""One laboratory site: the nominal cell, the arm and the drives' ratings, read from the files that services.toml names."""
+"""One laboratory site: the nominal cell, the arm and the drives' ratings, read from the files that
+services.toml names."""
 
 from __future__ import annotations
 
@@ -7,18 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from services.comm.directory import Directory
-from sim.arm_motion import Six
-from sim.cup_motion import carried, numbers_of
-from sim.drives import ratings
-from sim.puma_model import ArmModel, Frame3, Link, read_arm
-from sim.servo import DriveRating
-from sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
+from petrobot.services.comm.directory import Directory
+from petrobot.sim.arm_motion import Six
+from petrobot.sim.cup_motion import carried, numbers_of
+from petrobot.sim.drives import ratings
+from petrobot.sim.puma_model import ArmModel, Frame3, Link, read_arm
+from petrobot.sim.servo import DriveRating
+from petrobot.sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What the laboratory stands on. `laboratory` is the file of errors, regimes and disturbances."""
+    """What the laboratory stands on. `laboratory` is the file of errors, regimes and
+    disturbances."""
 
     cell: Mapping[str, Any]
     arm: ArmModel
@@ -31,7 +33,8 @@ class Site:
 
 
 def read_site(cell_file: Path, laboratory: Path = LABORATORY_FILE) -> Site:
-    """Read the site from a file like services/cell.toml; the arm's file is named there, relative to it."""
+    """Read the site from a file like services/cell.toml; the arm's file is named there, relative to
+    it."""
     cell = read_toml(cell_file)
     try:
         arm_file = cell_file.parent / cell["arm"]["model"]
@@ -50,12 +53,16 @@ def read_site(cell_file: Path, laboratory: Path = LABORATORY_FILE) -> Site:
 
 
 def site_of(directory: Directory) -> Site:
-    """The site that services.toml names: `[parameters] cell`, and `laboratory` if it is not the shipped one."""
+    """The site that services.toml names: `[parameters] cell`, and `laboratory` if it is not the
+    shipped one."""
     if "cell" not in directory.parameters:
-        raise LaboratoryError(f'{directory.source}: [parameters] cell is missing; write cell = "services/cell.toml"')
+        raise LaboratoryError(
+            f'{directory.source}: [parameters] cell is missing; write cell = "services/cell.toml"'
+        )
     laboratory = directory.parameters.get("laboratory")
     return read_site(
-        directory.file(directory.parameters["cell"]), directory.file(laboratory) if laboratory else LABORATORY_FILE
+        directory.file(directory.parameters["cell"]),
+        directory.file(laboratory) if laboratory else LABORATORY_FILE,
     )
 
 
@@ -75,12 +82,14 @@ class CupMount:
         self._numbers = numbers_of(arm, self._zero, (self._x, self._y, self._z), self._mouth)
 
     def frame(self, q: Six) -> Frame3:
-        """The cup's frame at encoder angles (rad): origin in the middle of the mouth, z out of it."""
+        """The cup's frame at encoder angles (rad): origin in the middle of the mouth, z out of
+        it."""
         x, y, z, origin = carried(q, self._numbers)
         return Frame3(x, y, z, origin)
 
     def solid_parts(self, q: Sequence[float]) -> tuple[Any, Any]:
-        """Capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m, base frame."""
+        """Capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m, base
+        frame."""
         return self._arm.solid_parts(self._true(q), self._bottom)
 
     def load(self, mass: float, radius: float, depth: float) -> Link:

@@ -12,15 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from sim.ball import BallModel, BallState
-from sim.truth import Truth
+from petrobot.sim.ball import BallModel, BallState
+from petrobot.sim.truth import Truth
 
 _STREAM = 0x7468  # keeps the thrower's draws apart from other draws of the same seed
 
 
 @dataclass(frozen=True, slots=True)
 class Throw:
-    """One throw: `speed` (m/s) and `start` at release, where it is aimed at (`exit_y`, m) and what the ball meets."""
+    """One throw: `speed` (m/s) and `start` at release, where it is aimed at (`exit_y`, m) and what
+    the ball meets."""
 
     n: int
     delay: float
@@ -34,12 +35,15 @@ class Throw:
 
 
 def draw_throw(seed: int, n: int, cell: Mapping[str, Any], truth: Truth) -> Throw:
-    """Throw `n` (1, 2, ...) of `seed`: from 0.1 m before the far edge towards a point of the near edge."""
+    """Throw `n` (1, 2, ...) of `seed`: from 0.1 m before the far edge towards a point of the near
+    edge."""
     rng = np.random.default_rng((seed, n, _STREAM))
     ball, settings = cell["ball"], truth.settings
     delay = float(rng.uniform(*settings["thrower"]["delay"]))
     speed = float(rng.uniform(*truth.speed))
-    y, exit_y = (float(v) for v in rng.uniform(-ball["exit_half_width"], ball["exit_half_width"], 2))
+    y, exit_y = (
+        float(v) for v in rng.uniform(-ball["exit_half_width"], ball["exit_half_width"], 2)
+    )
     share = float(rng.uniform(*settings["ball"]["spin"]))
     spread = settings["ball"]["rolling_resistance_spread"]
     resistance = float(ball["rolling_resistance"] * (1.0 + rng.uniform(-spread, spread)))
@@ -48,14 +52,19 @@ def draw_throw(seed: int, n: int, cell: Mapping[str, Any], truth: Truth) -> Thro
     way = math.hypot(way_x, way_y)
     vx, vy = speed * way_x / way, speed * way_y / way
     model = BallModel.of(ball, settings["ball"]["friction"])
-    start = BallState((x, y, truth.table.top + model.radius), (vx, vy, 0.0), model.spin_of_rolling(vx, vy, share))
+    start = BallState(
+        (x, y, truth.table.top + model.radius), (vx, vy, 0.0), model.spin_of_rolling(vx, vy, share)
+    )
     return Throw(n, delay, speed, start, exit_y, share, resistance)
 
 
 class Thrower:
-    """Releases one throw after the other, each a seeded delay after all was ready for it without a break."""
+    """Releases one throw after the other, each a seeded delay after all was ready for it without a
+    break."""
 
-    def __init__(self, cell: Mapping[str, Any], truth: Truth, seed: int, throws: int | None = None) -> None:
+    def __init__(
+        self, cell: Mapping[str, Any], truth: Truth, seed: int, throws: int | None = None
+    ) -> None:
         """`throws` limits their number; None: no limit."""
         self._cell = cell
         self._truth = truth
@@ -75,8 +84,8 @@ class Thrower:
         return self._next is None
 
     def advance(self, now: float, ready: bool) -> Throw | None:
-        """The throw to release at `now` (s), None while there is none. `ready`: images are taken, the last ball is gone,
-        the cup is empty and the arm stands still at home."""
+        """The throw to release at `now` (s), None while there is none. `ready`: images are taken,
+        the last ball is gone, the cup is empty and the arm stands still at home."""
         if not ready or self._next is None:
             self._ready_since = None
             return None

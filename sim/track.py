@@ -1,8 +1,9 @@
-"""The chessboard track: elements from square to square, centre line by arc length, nearest point, colour of the floor.
+"""The chessboard track: elements from square to square, centre line by arc length, nearest point,
+colour of the floor.
 
-Squares of 2 m, black and white in turn; a track of 50 mm in the opposite colour of each square; every element crosses one
-square from the middle of an edge to the middle of another: a straight of 2 m or a quarter circle of 1 m radius (section 6
-and figure 2 of the paper).
+Squares of 2 m, black and white in turn; a track of 50 mm in the opposite colour of each square;
+every element crosses one square from the middle of an edge to the middle of another: a straight of
+2 m or a quarter circle of 1 m radius (section 6 and figure 2 of the paper).
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.track_elements import BAR_MARGIN, SQUARE, Element, Kind, Pose, Square
+from petrobot.sim.track_elements import BAR_MARGIN, SQUARE, Element, Kind, Pose, Square
 
 BOARD: Final = 8
 """Squares along each side of the board."""
 _CLOSE: Final = 0.3
-"""m off a square's own element up to which no other element can be nearer: others keep 1 m off, or join it at its ends."""
+"""m off a square's own element up to which no other element can be nearer: others keep 1 m off, or
+join it at its ends."""
 
 
 class TrackError(ValueError):
@@ -29,8 +31,9 @@ class TrackError(ValueError):
 
 
 class Near(NamedTuple):
-    """The point of the centre line nearest to another point: its arc length (m), the other point's offset from it (m, positive to
-    the left of the track's direction), its distance (m) and the element's index."""
+    """The point of the centre line nearest to another point: its arc length (m), the other point's
+    offset from it (m, positive to the left of the track's direction), its distance (m) and the
+    element's index."""
 
     s: float
     offset: float
@@ -39,7 +42,8 @@ class Near(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """An interruption: arc lengths where the track ends and where it resumes (m), and the reflector above the latter (m)."""
+    """An interruption: arc lengths where the track ends and where it resumes (m), and the reflector
+    above the latter (m)."""
 
     start: float
     end: float
@@ -57,7 +61,8 @@ def white(square: Square) -> bool:
 
 
 class Track:
-    """A valid track. Its board reaches from (0, 0) to (16, 16) m; the chessboard goes on around it, without a track."""
+    """A valid track. Its board reaches from (0, 0) to (16, 16) m; the chessboard goes on around it,
+    without a track."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
         """Raises TrackError for elements that make no track."""
@@ -69,7 +74,8 @@ class Track:
 
     @classmethod
     def of(cls, square: Square, heading: int, kinds: str, unpainted: Sequence[int] = ()) -> Track:
-        """The track that begins in `square` with `heading` (quarter turns from x) and has these elements ("S", "L", "R").
+        """The track that begins in `square` with `heading` (quarter turns from x) and has these
+        elements ("S", "L", "R").
 
         `unpainted` are the indices of the elements that interruptions replace. Raises TrackError.
         """
@@ -79,7 +85,9 @@ class Track:
             try:
                 kind = Kind(letter)
             except ValueError as fault:
-                raise TrackError(f"element {letter!r}: there are S (straight), L (left) and R (right)") from fault
+                raise TrackError(
+                    f"element {letter!r}: there are S (straight), L (left) and R (right)"
+                ) from fault
             element = Element(kind, square, heading, start, number not in unpainted)
             elements.append(element)
             square, heading, start = element.next_square, element.next_heading, element.end
@@ -87,10 +95,16 @@ class Track:
 
     @classmethod
     def by_seed(
-        cls, seed: int, elements: int = 14, interruptions: int = 2, kinds: str = "mixed", arcs: float = 0.5
+        cls,
+        seed: int,
+        elements: int = 14,
+        interruptions: int = 2,
+        kinds: str = "mixed",
+        arcs: float = 0.5,
     ) -> Track:
-        """A random track: so many elements, of which interruptions replace straights, arcs or either (`kinds`: "straight", "arcs",
-        "mixed"); `arcs` is the share of arcs where there is a choice. Raises TrackError for what cannot be."""
+        """A random track: so many elements, of which interruptions replace straights, arcs or
+        either (`kinds`: "straight", "arcs", "mixed"); `arcs` is the share of arcs where there is a
+        choice. Raises TrackError for what cannot be."""
         _check_wish(elements, interruptions, kinds, arcs)
         rng = np.random.default_rng((seed, _DRAWS))
         for _ in range(_ATTEMPTS):
@@ -101,19 +115,26 @@ class Track:
             if letters is not None and unpainted is not None:
                 return cls.of(square, heading, letters, unpainted)
         raise TrackError(
-            f"no track of {elements} elements with {interruptions} interruptions was found: ask for fewer of these or more of those"
+            f"no track of {elements} elements with {interruptions} interruptions was found: "
+            "ask for fewer of these or more of those"
         )
 
     @classmethod
     def contest(cls) -> Track:
-        """The fixed competition-like track: 24 elements, of which two arcs and a straight are interrupted."""
+        """The fixed competition-like track: 24 elements, of which two arcs and a straight are
+        interrupted."""
         return cls.of(*CONTEST)
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Track:
         """The track that `plain` gave. Raises TrackError, KeyError."""
         i, j = plain["square"]
-        return cls.of((int(i), int(j)), int(plain["heading"]), str(plain["elements"]), tuple(plain["unpainted"]))
+        return cls.of(
+            (int(i), int(j)),
+            int(plain["heading"]),
+            str(plain["elements"]),
+            tuple(plain["unpainted"]),
+        )
 
     def plain(self) -> dict[str, Any]:
         """Plain data from which `read` makes the track again."""
@@ -122,7 +143,9 @@ class Track:
             "square": list(first.square),
             "heading": first.heading,
             "elements": "".join(element.kind for element in self.elements),
-            "unpainted": [number for number, element in enumerate(self.elements) if not element.painted],
+            "unpainted": [
+                number for number, element in enumerate(self.elements) if not element.painted
+            ],
         }
 
     def _check(self) -> None:
@@ -138,9 +161,12 @@ class Track:
             raise TrackError(f"track {kinds!r}: the square after its end is not free")
         unpainted = [number for number, element in enumerate(self.elements) if not element.painted]
         apart = all(b - a > _PAINTED_BETWEEN for a, b in pairwise(unpainted))
-        if not apart or any(not _PAINTED_AT_ENDS <= n < len(kinds) - _PAINTED_AT_ENDS for n in unpainted):
+        if not apart or any(
+            not _PAINTED_AT_ENDS <= n < len(kinds) - _PAINTED_AT_ENDS for n in unpainted
+        ):
             raise TrackError(
-                f"track {kinds!r}: interruptions {unpainted} must leave two painted elements at each end and between them"
+                f"track {kinds!r}: interruptions {unpainted} must leave two painted elements "
+                "at each end and between them"
             )
 
     # Centre line
@@ -179,14 +205,18 @@ class Track:
         return element.at(s - element.start)
 
     def nearest(self, x: float, y: float) -> Near:
-        """The point of the centre line nearest to (x, y), painted or not; gaps count as if they were painted."""
+        """The point of the centre line nearest to (x, y), painted or not; gaps count as if they
+        were painted."""
         square = math.floor(x / SQUARE), math.floor(y / SQUARE)
         own = self._of_square.get(square)
         if own is not None:
             found = self._near(own, x, y)
             if found.distance < _CLOSE:
                 return found
-        return min((self._near(number, x, y) for number in range(len(self.elements))), key=lambda near: near.distance)
+        return min(
+            (self._near(number, x, y) for number in range(len(self.elements))),
+            key=lambda near: near.distance,
+        )
 
     def _near(self, number: int, x: float, y: float) -> Near:
         element = self.elements[number]
@@ -242,8 +272,11 @@ def _orders(rng: np.random.Generator, arcs: float) -> list[Kind]:
     return [*turns, Kind.STRAIGHT] if rng.random() < arcs else [Kind.STRAIGHT, *turns]
 
 
-def _walk(rng: np.random.Generator, square: Square, heading: int, elements: int, arcs: float) -> str | None:
-    """A way of so many elements over the board that uses no square twice and has a free square after its end; depth first."""
+def _walk(
+    rng: np.random.Generator, square: Square, heading: int, elements: int, arcs: float
+) -> str | None:
+    """A way of so many elements over the board that uses no square twice and has a free square
+    after its end; depth first."""
     first = Element(Kind.STRAIGHT, square, heading, 0.0)
     way, used = [first], {square}
     tries: list[Iterator[Kind]] = [iter(())]
@@ -266,7 +299,8 @@ def _walk(rng: np.random.Generator, square: Square, heading: int, elements: int,
 
 
 def _step(last: Element, kinds: Iterator[Kind], used: set[Square]) -> Element | None:
-    """The next element after `last` of the first kind that leads on to a free square; None when no kind is left."""
+    """The next element after `last` of the first kind that leads on to a free square; None when no
+    kind is left."""
     square, heading = last.next_square, last.next_heading
     if not _on_board(square) or square in used:
         return None
@@ -277,11 +311,16 @@ def _step(last: Element, kinds: Iterator[Kind], used: set[Square]) -> Element | 
     return None
 
 
-def _interrupt(rng: np.random.Generator, letters: str, interruptions: int, kinds: str) -> tuple[int, ...] | None:
-    """Indices of elements to replace, far enough from each other and from both ends; None when there are too few."""
+def _interrupt(
+    rng: np.random.Generator, letters: str, interruptions: int, kinds: str
+) -> tuple[int, ...] | None:
+    """Indices of elements to replace, far enough from each other and from both ends; None when
+    there are too few."""
     chosen: list[int] = []
     inner = range(_PAINTED_AT_ENDS, len(letters) - _PAINTED_AT_ENDS)
     for number in rng.permutation([n for n in inner if letters[n] in KINDS[kinds]]).tolist():
-        if len(chosen) < interruptions and all(abs(number - other) > _PAINTED_BETWEEN for other in chosen):
+        if len(chosen) < interruptions and all(
+            abs(number - other) > _PAINTED_BETWEEN for other in chosen
+        ):
             chosen.append(number)
     return tuple(sorted(chosen)) if len(chosen) == interruptions else None

@@ -1,7 +1,9 @@
-"""The rover's forward camera: perspective view of the floor, blurred by motion, in changing light, with flashes and noise.
+"""The rover's forward camera: perspective view of the floor, blurred by motion, in changing light,
+with flashes and noise.
 
-Body frame: origin on the floor below the middle of the axle, x forward, y left, z up. Camera frame: x right, y down, z forward.
-All pixels look at the floor, so each image is a homography of the floor's pictures: a matrix for the whole image.
+Body frame: origin on the floor below the middle of the axle, x forward, y left, z up. Camera frame:
+x right, y down, z forward. All pixels look at the floor, so each image is a homography of the
+floor's pictures: a matrix for the whole image.
 """
 
 from __future__ import annotations
@@ -14,24 +16,28 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim.track_floor import COARSE, FINE, Floor, Picture, Window
+from petrobot.sim.track_floor import COARSE, FINE, Floor, Picture, Window
 
 Array = NDArray[np.float64]
 
 STILL: Final = 0.0005
-"""m by which the farthest floor in view moves during an exposure, below which one view of it is enough."""
+"""m by which the farthest floor in view moves during an exposure, below which one view of it is
+enough."""
 _BLUR: Final = 0.5 / math.sqrt(3.0)
-"""Two views so much of the exposure before and after its middle spread a point as evenly as the whole exposure (equal variance)."""
+"""Two views so much of the exposure before and after its middle spread a point as evenly as the
+whole exposure (equal variance)."""
 _NOISE_SIZE: Final = 320
 _NOISE_ZERO: Final = 128.0
 """Grey level of the noise field that stands for none."""
 _SAMPLING: Final = 3.0
-"""Cells of the fine picture that a pixel may cover along the view before the coarse one is looked at."""
+"""Cells of the fine picture that a pixel may cover along the view before the coarse one is looked
+at."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where the camera is on the rover (m, rad) and how it sees (px): pitch down, yaw to the left, roll to the right."""
+    """Where the camera is on the rover (m, rad) and how it sees (px): pitch down, yaw to the left,
+    roll to the right."""
 
     forward: float
     height: float
@@ -57,20 +63,28 @@ class Mount:
     def project(self, points: ArrayLike) -> Array:
         """Pixels (..., 2) of body-frame points on the floor (..., 2)."""
         floor = np.asarray(points, float)
-        at = np.stack([floor[..., 0] - self.forward, floor[..., 1], np.full(floor.shape[:-1], -self.height)], axis=-1)
+        at = np.stack(
+            [floor[..., 0] - self.forward, floor[..., 1], np.full(floor.shape[:-1], -self.height)],
+            axis=-1,
+        )
         seen = at @ self.rotation.T
         return np.asarray(self.focal * seen[..., :2] / seen[..., 2:] + self.principal)
 
     def to_floor(self) -> Array:
-        """(3, 3) homography from pixels (u, v, 1) to the body frame's floor. Raises ValueError for a pixel above the horizon."""
+        """(3, 3) homography from pixels (u, v, 1) to the body frame's floor. Raises ValueError for
+        a pixel above the horizon."""
         u0, v0 = self.principal
         rays = self.rotation.T @ np.array(
             [[1.0, 0.0, -u0], [0.0, 1.0, -v0], [0.0, 0.0, self.focal]]
         )  # of pixels, body frame
         corners = np.array([[u, v, 1.0] for u in (0, self.width - 1) for v in (0, self.rows - 1)])
         if (corners @ rays[2] >= 0.0).any():
-            raise ValueError("the camera looks over the horizon: give it more pitch or a longer focal length")
-        return np.array([self.height * rays[0] - self.forward * rays[2], self.height * rays[1], -rays[2]])
+            raise ValueError(
+                "the camera looks over the horizon: give it more pitch or a longer focal length"
+            )
+        return np.array(
+            [self.height * rays[0] - self.forward * rays[2], self.height * rays[1], -rays[2]]
+        )
 
 
 class Motion(NamedTuple):
@@ -87,10 +101,15 @@ class FloorCamera:
     """Takes images of a `Floor`; noise from `rng`."""
 
     def __init__(
-        self, mount: Mount, exposure: float, greys: tuple[float, float], noise: float, vignetting: float
+        self,
+        mount: Mount,
+        exposure: float,
+        greys: tuple[float, float],
+        noise: float,
+        vignetting: float,
     ) -> None:
-        """`exposure` in s; `greys` of black and white paint; `noise` in grey levels (sigma); `vignetting`: share of the light
-        that the corners lose."""
+        """`exposure` in s; `greys` of black and white paint; `noise` in grey levels (sigma);
+        `vignetting`: share of the light that the corners lose."""
         self.mount = mount
         self.exposure = exposure
         self._to_floor = mount.to_floor()
@@ -104,7 +123,12 @@ class FloorCamera:
         self._noise = np.asarray(np.clip(np.rint(_NOISE_ZERO + noise * field), 0, 255), np.uint8)
         self._parts = [
             _Part(self._to_floor, 0, self._split, Window(COARSE, self._farthest(0.0))),
-            _Part(self._to_floor, self._split, mount.rows, Window(FINE, self._farthest(float(self._split)))),
+            _Part(
+                self._to_floor,
+                self._split,
+                mount.rows,
+                Window(FINE, self._farthest(float(self._split))),
+            ),
         ]
 
     def _farthest(self, row: float) -> float:
@@ -116,7 +140,8 @@ class FloorCamera:
         return np.array([x / w, y / w])
 
     def _split_row(self) -> int:
-        """First row whose pixels cover less than `_SAMPLING` cells of the fine picture along the view."""
+        """First row whose pixels cover less than `_SAMPLING` cells of the fine picture along the
+        view."""
         u = self.mount.width / 2
         for row in range(self.mount.rows):
             if np.linalg.norm(self._ground(u, row) - self._ground(u, row + 1)) < _SAMPLING * FINE:
@@ -132,7 +157,8 @@ class FloorCamera:
         veil: float = 0.0,
         grain: float = 1.0,
     ) -> Picture:
-        """One image (rows, width). `light`: factor, `veil`: grey levels of stray light, `grain`: factor on the noise."""
+        """One image (rows, width). `light`: factor, `veil`: grey levels of stray light, `grain`:
+        factor on the noise."""
         black, share = self._black, (self._white - self._black) / 255.0
         if self.exposure * (abs(motion.speed) + abs(motion.turn) * self._reach) < STILL:
             still = self._view(floor, motion, 0.0)
@@ -142,9 +168,13 @@ class FloorCamera:
             before, after = self._view(floor, motion, -during), self._view(floor, motion, during)
             grey = cv2.addWeighted(before, 0.5 * share, after, 0.5 * share, black)
         grey = cv2.multiply(grey, self._lit, scale=1.0 / 255.0)
-        row, column = (int(rng.integers(_NOISE_SIZE - size)) for size in (self.mount.rows, self.mount.width))
+        row, column = (
+            int(rng.integers(_NOISE_SIZE - size)) for size in (self.mount.rows, self.mount.width)
+        )
         noise = self._noise[row : row + self.mount.rows, column : column + self.mount.width]
-        return np.asarray(cv2.addWeighted(grey, light, noise, grain, veil - grain * _NOISE_ZERO), np.uint8)
+        return np.asarray(
+            cv2.addWeighted(grey, light, noise, grain, veil - grain * _NOISE_ZERO), np.uint8
+        )
 
     def _view(self, floor: Floor, motion: Motion, later: float) -> Picture:
         """The paint that each pixel sees, `later` seconds than `motion`."""
@@ -156,7 +186,9 @@ class FloorCamera:
         for part, picture in zip(self._parts, (floor.coarse, floor.fine), strict=True):
             if part.bottom > part.top:
                 part.window.look(picture, floor.version, x, y)
-                body = np.array([[c, -s, x - part.window.x], [s, c, y - part.window.y], [0.0, 0.0, 1.0]])
+                body = np.array(
+                    [[c, -s, x - part.window.x], [s, c, y - part.window.y], [0.0, 0.0, 1.0]]
+                )
                 cv2.warpPerspective(
                     part.window.part,
                     part.cells @ body @ part.to_floor,
@@ -169,10 +201,15 @@ class FloorCamera:
 
 
 class _Part:
-    """Some rows of the image: their homography to the body frame's floor, and the window of the picture that they look at."""
+    """Some rows of the image: their homography to the body frame's floor, and the window of the
+    picture that they look at."""
 
     def __init__(self, to_floor: Array, top: int, bottom: int, window: Window) -> None:
         self.top, self.bottom, self.window = top, bottom, window
-        self.to_floor: Array = to_floor @ np.array([[1.0, 0.0, 0.0], [0.0, 1.0, float(top)], [0.0, 0.0, 1.0]])
+        self.to_floor: Array = to_floor @ np.array(
+            [[1.0, 0.0, 0.0], [0.0, 1.0, float(top)], [0.0, 0.0, 1.0]]
+        )
         cell = window.cell
-        self.cells: Array = np.array([[1.0 / cell, 0.0, -0.5], [0.0, 1.0 / cell, -0.5], [0.0, 0.0, 1.0]])
+        self.cells: Array = np.array(
+            [[1.0 / cell, 0.0, -0.5], [0.0, 1.0 / cell, -0.5], [0.0, 0.0, 1.0]]
+        )

@@ -1,4 +1,5 @@
-"""One element of the chessboard track: how it crosses its square, its centre line, and how far points lie within its paint."""
+"""One element of the chessboard track: how it crosses its square, its centre line, and how far
+points lie within its paint."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ HALF_WIDTH: Final = 0.025
 BAR_LENGTH, BAR_WIDTH = 0.50, 0.05
 """m, of the T's crossbar."""
 BAR_MARGIN: Final = 0.25
-"""m between the crossbar and the end of its square: paint of one colour all around it, or it would be no T."""
+"""m between the crossbar and the end of its square: paint of one colour all around it, or it would
+be no T."""
 _DIRECTIONS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Unit vectors of the headings 0, 90, 180, 270 degrees."""
 
@@ -56,7 +58,8 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One element. `heading` counts quarter turns from x; `start` is its entrance's arc length (m)."""
+    """One element. `heading` counts quarter turns from x; `start` is its entrance's arc length
+    (m)."""
 
     kind: Kind
     square: Square
@@ -73,10 +76,13 @@ class Element:
     def entrance(self) -> tuple[float, float]:
         """Where it is entered (m)."""
         dx, dy = _DIRECTIONS[self.heading]
-        return (self.square[0] + 0.5 * (1 - dx)) * SQUARE, (self.square[1] + 0.5 * (1 - dy)) * SQUARE
+        return (self.square[0] + 0.5 * (1 - dx)) * SQUARE, (
+            self.square[1] + 0.5 * (1 - dy)
+        ) * SQUARE
 
     def at(self, way: float) -> Pose:
-        """The pose `way` metres after the entrance; before the entrance and after the exit the line goes on straight."""
+        """The pose `way` metres after the entrance; before the entrance and after the exit the line
+        goes on straight."""
         turn, inside = self.kind.turn, min(max(way, 0.0), self.kind.length)
         if turn:
             angle = inside / RADIUS
@@ -86,10 +92,13 @@ class Element:
         beyond = way - inside
         u, w = u + beyond * math.cos(angle), w + beyond * turn * math.sin(angle)
         (x, y), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
-        return Pose(x + u * dx - w * dy, y + u * dy + w * dx, self.heading * 0.5 * math.pi + turn * angle)
+        return Pose(
+            x + u * dx - w * dy, y + u * dy + w * dx, self.heading * 0.5 * math.pi + turn * angle
+        )
 
     def nearest(self, x: float, y: float) -> tuple[float, float, float]:
-        """Way after the entrance (m, within the element), offset to the left (m) and distance (m) of a point."""
+        """Way after the entrance (m, within the element), offset to the left (m) and distance (m)
+        of a point."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
         if self.kind is Kind.STRAIGHT:
@@ -97,19 +106,25 @@ class Element:
             return way, w, math.hypot(u - way, w)
         turn = self.kind.turn
         angle = min(max(math.atan2(u, RADIUS - turn * w), 0.0), 0.5 * math.pi)
-        aside = math.hypot(u - RADIUS * math.sin(angle), turn * w - RADIUS * (1.0 - math.cos(angle)))
+        aside = math.hypot(
+            u - RADIUS * math.sin(angle), turn * w - RADIUS * (1.0 - math.cos(angle))
+        )
         return angle * RADIUS, turn * (RADIUS - math.hypot(u, RADIUS - turn * w)), aside
 
     def depth(self, x: Array, y: Array) -> Array:
-        """How far (m) points (...,) of its square lie within the track, were it painted; negative outside."""
+        """How far (m) points (...,) of its square lie within the track, were it painted; negative
+        outside."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
-        aside = w if self.kind is Kind.STRAIGHT else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
+        aside = (
+            w if self.kind is Kind.STRAIGHT else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
+        )
         inside: Array = HALF_WIDTH - np.abs(aside)
         return inside
 
     def tee_depth(self, x: Array, y: Array) -> Array:
-        """The same where a straight element ends in a T: a crossbar before its exit, and nothing beyond that."""
+        """The same where a straight element ends in a T: a crossbar before its exit, and nothing
+        beyond that."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, np.abs((y - y0) * dx - (x - x0) * dy)
         before_end = SQUARE - BAR_MARGIN - u

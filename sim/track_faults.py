@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from sim.faults import Fault, FaultKinds
+from petrobot.sim.faults import Fault, FaultKinds
 
 ROVER_FAULTS: Final = FaultKinds(
     keys={

@@ -1,6 +1,8 @@
-"""The film of a run from above, with what the rover's camera saw, as a video or an animated picture. From a score alone.
+"""The film of a run from above, with what the rover's camera saw, as a video or an animated
+picture. From a score alone.
 
-`python -m sim.track_film RUN.json --film run.webm --plan run.svg` makes film and floor plan of a result file.
+`python -m petrobot.sim.track_film RUN.json --film run.webm --plan run.svg` makes film and floor
+plan of a result file.
 """
 
 from __future__ import annotations
@@ -17,11 +19,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.track import BOARD, Track, TrackError
-from sim.track_camera import FloorCamera, Motion, Mount
-from sim.track_elements import SQUARE
-from sim.track_floor import COARSE, ORIGIN, Floor
-from sim.track_plan import floor_plan, summary
+from petrobot.sim.track import BOARD, Track, TrackError
+from petrobot.sim.track_camera import FloorCamera, Motion, Mount
+from petrobot.sim.track_elements import SQUARE
+from petrobot.sim.track_floor import COARSE, ORIGIN, Floor
+from petrobot.sim.track_plan import floor_plan, summary
 
 Picture = NDArray[np.uint8]
 
@@ -55,7 +57,10 @@ class View:
         self.scale = float(WIDTH / max(wide, tall))
         first, last = ((np.array((self._low, high)) - ORIGIN) / COARSE).round().astype(int)
         part = floor.coarse[first[1] : last[1], first[0] : last[0]][::-1]
-        size = 2 * round(wide * self.scale / 2), 2 * round(tall * self.scale / 2)  # encoders want even numbers
+        size = (
+            2 * round(wide * self.scale / 2),
+            2 * round(tall * self.scale / 2),
+        )  # encoders want even numbers
         grey = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.uint8)
         muted = cv2.convertScaleAbs(grey, alpha=0.75, beta=45.0)
         self.still = np.asarray(cv2.cvtColor(muted, cv2.COLOR_GRAY2BGR), np.uint8)
@@ -77,7 +82,8 @@ class View:
 def images(
     score: Mapping[str, Any], nominal: Mapping[str, Any], fps: float = 20.0, speedup: float = 4.0
 ) -> Iterator[Picture]:
-    """The film's images (rows, columns, 3), blue, green, red: the run `speedup` times as fast as it was.
+    """The film's images (rows, columns, 3), blue, green, red: the run `speedup` times as fast as it
+    was.
 
     `nominal`: the rover's file, for the camera's view in the corner.
     """
@@ -93,7 +99,9 @@ def images(
         at = view.pixel(x, y)
         cv2.line(trail, before, at, _PATH, 2, cv2.LINE_AA)
         before = at
-        image = np.full((max(trail.shape[0], _EYE[1] + 40), trail.shape[1] + _EYE[0] + 16, 3), _PANEL, np.uint8)
+        image = np.full(
+            (max(trail.shape[0], _EYE[1] + 40), trail.shape[1] + _EYE[0] + 16, 3), _PANEL, np.uint8
+        )
         image[: trail.shape[0], : trail.shape[1]] = trail
         view.draw_rover(image, x, y, heading)
         seen = camera.take(view.floor, Motion(x, y, heading, 0.0, 0.0), rng)
@@ -105,19 +113,37 @@ def _inset(image: Picture, seen: Picture, text: str) -> None:
     """The camera's view and the time, right of the plan."""
     left = image.shape[1] - _EYE[0] - 8
     image[8 : 8 + _EYE[1], left : left + _EYE[0]] = seen[..., None]
-    cv2.putText(image, text, (left, _EYE[1] + 28), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(
+        image, text, (left, _EYE[1] + 28), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA
+    )
 
 
 def _camera(nominal: Mapping[str, Any]) -> FloorCamera:
     u, v = nominal["principal_px"]
-    mount = Mount(nominal["forward"], nominal["height"], nominal["pitch"], 0.0, 0.0, nominal["focal_px"], (u, v), *_EYE)
-    return FloorCamera(mount, nominal["exposure"], (nominal["black"], nominal["white"]), nominal["noise"], 0.0)
+    mount = Mount(
+        nominal["forward"],
+        nominal["height"],
+        nominal["pitch"],
+        0.0,
+        0.0,
+        nominal["focal_px"],
+        (u, v),
+        *_EYE,
+    )
+    return FloorCamera(
+        mount, nominal["exposure"], (nominal["black"], nominal["white"]), nominal["noise"], 0.0
+    )
 
 
 def film(
-    score: Mapping[str, Any], nominal: Mapping[str, Any], path: Path, fps: float = 20.0, speedup: float = 4.0
+    score: Mapping[str, Any],
+    nominal: Mapping[str, Any],
+    path: Path,
+    fps: float = 20.0,
+    speedup: float = 4.0,
 ) -> int:
-    """Write the film; the format goes by the suffix (.webm, .mp4, .avi, .gif, .webp). Gives the number of images.
+    """Write the film; the format goes by the suffix (.webm, .mp4, .avi, .gif, .webp). Gives the
+    number of images.
 
     Raises FilmError for another suffix, a run without a path, or a file that cannot be written.
     """
@@ -125,7 +151,9 @@ def film(
     if suffix in _ANIMATED:
         return _write_animation(list(images(score, nominal, fps, speedup)), path, fps)
     if suffix not in _FOURCC:
-        raise FilmError(f"{path}: no film format {suffix!r}; there are {', '.join((*_FOURCC, *_ANIMATED))}")
+        raise FilmError(
+            f"{path}: no film format {suffix!r}; there are {', '.join((*_FOURCC, *_ANIMATED))}"
+        )
     writer: cv2.VideoWriter | None = None
     count = 0
     for image in images(score, nominal, fps, speedup):
@@ -133,7 +161,9 @@ def film(
             size = image.shape[1], image.shape[0]
             writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*_FOURCC[suffix]), fps, size)
             if not writer.isOpened():
-                raise FilmError(f"{path}: this OpenCV writes no {suffix} there; try .gif, or another folder")
+                raise FilmError(
+                    f"{path}: this OpenCV writes no {suffix} there; try .gif, or another folder"
+                )
         writer.write(image)
         count += 1
     if writer is not None:
@@ -153,20 +183,33 @@ def _write_animation(pictures: Sequence[Picture], path: Path, fps: float) -> int
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     commands = argparse.ArgumentParser(
-        prog="python -m sim.track_film",
+        prog="python -m petrobot.sim.track_film",
         description="Draws the floor plan and the film of a run on the track from its result file.",
-        epilog="example:\n  python -m sim.track_film run.json --plan run.svg --film run.webm\n\n"
+        epilog="example:\n  python -m petrobot.sim.track_film run.json --plan run.svg --film "
+        "run.webm\n\n"
         "exit codes: 0 done, 2 a file that cannot be used",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands.add_argument("result", type=Path, help="what `petrobot run follow_track --json FILE` wrote")
+    commands.add_argument(
+        "result", type=Path, help="what `petrobot run follow_track --json FILE` wrote"
+    )
     commands.add_argument("--plan", type=Path, metavar="FILE", help="write the floor plan (SVG)")
     commands.add_argument(
-        "--animate", type=float, default=0.0, metavar="S", help="let the plan's rover drive, S seconds a run"
+        "--animate",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="let the plan's rover drive, S seconds a run",
     )
-    commands.add_argument("--film", type=Path, metavar="FILE", help="write the film (.webm, .mp4, .avi, .gif, .webp)")
-    commands.add_argument("--speedup", type=float, default=4.0, help="how many times as fast as the run was (4)")
-    commands.add_argument("--rover", type=Path, default=ROVER_FILE, help="the rover's numbers (the shipped ones)")
+    commands.add_argument(
+        "--film", type=Path, metavar="FILE", help="write the film (.webm, .mp4, .avi, .gif, .webp)"
+    )
+    commands.add_argument(
+        "--speedup", type=float, default=4.0, help="how many times as fast as the run was (4)"
+    )
+    commands.add_argument(
+        "--rover", type=Path, default=ROVER_FILE, help="the rover's numbers (the shipped ones)"
+    )
     return commands
 
 
@@ -183,12 +226,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(summary(score))
     except KeyError as fault:
         print(
-            f"python -m sim.track_film: {options.result}: no key {fault}; give a result of a run on the track",
+            f"python -m petrobot.sim.track_film: {options.result}: no key {fault}; give a "
+            "result of a run on the track",
             file=sys.stderr,
         )
         return 2
     except (OSError, ValueError, TrackError) as fault:
-        print(f"python -m sim.track_film: {fault}", file=sys.stderr)
+        print(f"python -m petrobot.sim.track_film: {fault}", file=sys.stderr)
         return 2
     return 0
 

@@ -1,4 +1,5 @@
-"""The floor as a picture: the chessboard with a track painted on it, fine for what is near and coarse for what is far."""
+"""The floor as a picture: the chessboard with a track painted on it, fine for what is near and
+coarse for what is far."""
 
 from __future__ import annotations
 
@@ -11,17 +12,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.track import BOARD, Track, white
-from sim.track_elements import SQUARE, Element, Kind, Square
+from petrobot.sim.track import BOARD, Track, white
+from petrobot.sim.track_elements import SQUARE, Element, Kind, Square
 
 Picture = NDArray[np.uint8]
 
 FINE: Final = 0.005
-"""m, side of a cell of the fine picture: a tenth of the track's width, its edges smoothed over a cell."""
+"""m, side of a cell of the fine picture: a tenth of the track's width, its edges smoothed over a
+cell."""
 COARSE: Final = 0.010
 """m, of the coarse picture, in which two by two cells are averaged."""
 MARGIN: Final = 2
-"""Squares around the board: what the camera sees of the hall while the rover is within 1 m of the board."""
+"""Squares around the board: what the camera sees of the hall while the rover is within 1 m of the
+board."""
 SLACK: Final = 0.4
 """m that the rover may go before a window is copied anew."""
 _SIDE: Final = round(SQUARE / FINE)
@@ -31,7 +34,8 @@ ORIGIN: Final = -MARGIN * SQUARE
 
 
 class Floor:
-    """Pictures of the floor, 0 (black paint) to 255 (white paint): row along y, column along x, both from `ORIGIN`."""
+    """Pictures of the floor, 0 (black paint) to 255 (white paint): row along y, column along x,
+    both from `ORIGIN`."""
 
     def __init__(self) -> None:
         self.version = 0
@@ -60,11 +64,12 @@ class Floor:
 
 
 class Window:
-    """The part of a picture that a rover sees, copied whenever it has gone so far that it could see beyond: small enough to stay
-    in a processor's cache, where the whole floor (23 MB) does not."""
+    """The part of a picture that a rover sees, copied whenever it has gone so far that it could see
+    beyond: small enough to stay in a processor's cache, where the whole floor (23 MB) does not."""
 
     def __init__(self, cell: float, reach: float) -> None:
-        """`cell`: side of the picture's cells, `reach`: how far from its own place the rover sees (m)."""
+        """`cell`: side of the picture's cells, `reach`: how far from its own place the rover sees
+        (m)."""
         self.cell = cell
         self.part = np.zeros((0, 0), np.uint8)
         self.x = self.y = math.nan
@@ -80,8 +85,13 @@ class Window:
             return
         self._middle, self._version = (x, y), version
         rows, columns = picture.shape
-        left = min(max(math.floor((x - ORIGIN) / self.cell) - self._half, 0), max(columns - 2 * self._half, 0))
-        bottom = min(max(math.floor((y - ORIGIN) / self.cell) - self._half, 0), max(rows - 2 * self._half, 0))
+        left = min(
+            max(math.floor((x - ORIGIN) / self.cell) - self._half, 0),
+            max(columns - 2 * self._half, 0),
+        )
+        bottom = min(
+            max(math.floor((y - ORIGIN) / self.cell) - self._half, 0), max(rows - 2 * self._half, 0)
+        )
         self.part = picture[bottom : bottom + 2 * self._half, left : left + 2 * self._half].copy()
         self.x, self.y = ORIGIN + left * self.cell, ORIGIN + bottom * self.cell
 
@@ -94,7 +104,9 @@ def _squares() -> Iterator[Square]:
 
 def _chessboard(side: int) -> Picture:
     squares = BOARD + 2 * MARGIN
-    colours = np.array([255 * white(square) for square in _squares()], np.uint8).reshape(squares, squares)
+    colours = np.array([255 * white(square) for square in _squares()], np.uint8).reshape(
+        squares, squares
+    )
     return np.repeat(np.repeat(colours, side, axis=0), side, axis=1)
 
 

@@ -1,6 +1,8 @@
-"""The laboratory of the mobile robot: floor, rover, drives, sensor and camera as one party, which answers as hardware would.
+"""The laboratory of the mobile robot: floor, rover, drives, sensor and camera as one party, which
+answers as hardware would.
 
-The world moves on only when something is due: a slot of the rover, a frame, an image. A tick in between costs next to nothing.
+The world moves on only when something is due: a slot of the rover, a frame, an image. A tick in
+between costs next to nothing.
 """
 
 from __future__ import annotations
@@ -11,23 +13,23 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from services.comm.canbus import Frame
-from services.comm.directory import Directory
-from services.comm.party import TICK
-from sim.faults import Fault, FaultPlan
-from sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
-from sim.rover import Rover
-from sim.rover_drives import RoverBus
-from sim.rover_sensor import Echo, ReflectorSensor, look
-from sim.track import Track
-from sim.track_camera import FloorCamera, Motion
-from sim.track_elements import Pose
-from sim.track_faults import read_rover_fault
-from sim.track_floor import Floor, Picture
-from sim.track_light import Hall
-from sim.track_referee import Referee
-from sim.track_truth import RoverTruth, TrackSite, TrackTruth, track_site_of
-from sim.truth import LaboratoryError
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.party import TICK
+from petrobot.sim.faults import Fault, FaultPlan
+from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.rover import Rover
+from petrobot.sim.rover_drives import RoverBus
+from petrobot.sim.rover_sensor import Echo, ReflectorSensor, look
+from petrobot.sim.track import Track
+from petrobot.sim.track_camera import FloorCamera, Motion
+from petrobot.sim.track_elements import Pose
+from petrobot.sim.track_faults import read_rover_fault
+from petrobot.sim.track_floor import Floor, Picture
+from petrobot.sim.track_light import Hall
+from petrobot.sim.track_referee import Referee
+from petrobot.sim.track_truth import RoverTruth, TrackSite, TrackTruth, track_site_of
+from petrobot.sim.truth import LaboratoryError
 
 REGIME: Final = "straight"
 """The regime if none is asked for."""
@@ -36,7 +38,8 @@ _SLIP, _LIGHT, _IMAGE, _ECHO, _FAULTS, _FALLEN = 0x736C, 0x6C69, 0x696D, 0x6563,
 
 
 class TrackLaboratory(LaboratoryParty):
-    """The party of the simulated node `name`. `where` gives the party of an endpoint (`Directory.party`)."""
+    """The party of the simulated node `name`. `where` gives the party of an endpoint
+    (`Directory.party`)."""
 
     def __init__(
         self,
@@ -49,7 +52,8 @@ class TrackLaboratory(LaboratoryParty):
         boot: str = "laboratory",
         directory: str = "",
     ) -> None:
-        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in services.comm.callee."""
+        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in
+        services.comm.callee."""
         super().__init__(name, where, boot, directory)
         cv2.setNumThreads(1)  # cores are shared with other nodes
         self._site = site
@@ -62,15 +66,21 @@ class TrackLaboratory(LaboratoryParty):
         self._prepare(seed, truth, truth.course.track(seed))
 
     def _prepare(self, seed: int, truth: TrackTruth, track: Track) -> None:
-        """A new experiment: rover at the start, score empty, everything drawn anew. Drives and counters stay as they are."""
+        """A new experiment: rover at the start, score empty, everything drawn anew. Drives and
+        counters stay as they are."""
         self.truth, self.track = truth, track
         self._floor.paint(track)
         self._camera = self._camera_of(truth)
         self._hall = Hall(truth.light, np.random.default_rng((seed, _LIGHT)), self.now)
         self._image_draws = np.random.default_rng((seed, _IMAGE))
         self._echo_draws = np.random.default_rng((seed, _ECHO))
-        hangs = np.random.default_rng((seed, _FALLEN)).random(len(track.gaps)) >= truth.reflector_missing
-        self._reflectors = [(gap.x, gap.y) for gap, there in zip(track.gaps, hangs, strict=True) if there]
+        hangs = (
+            np.random.default_rng((seed, _FALLEN)).random(len(track.gaps))
+            >= truth.reflector_missing
+        )
+        self._reflectors = [
+            (gap.x, gap.y) for gap, there in zip(track.gaps, hangs, strict=True) if there
+        ]
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
         self.bus.power(True)
         self.bus.sensor.dead = False
@@ -125,7 +135,8 @@ class TrackLaboratory(LaboratoryParty):
         self.exposures.put(now, now + self._site.settings["camera"]["readout"], self.picture(now))
 
     def picture(self, now: float) -> Picture:
-        """What the camera sees at a moment that the world has come to (s): (rows, width) grey levels."""
+        """What the camera sees at a moment that the world has come to (s): (rows, width) grey
+        levels."""
         rover = self.rover
         rover.move_to(now)
         light = self._hall.at(now)
@@ -153,11 +164,13 @@ class TrackLaboratory(LaboratoryParty):
             self.bus.trip(int(fault.value) - 1)
 
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `services`. Raises ValueError (LaboratoryError, TrackError among them) for arguments that cannot be.
+        """Answer one of `services`. Raises ValueError (LaboratoryError, TrackError among them) for
+        arguments that cannot be.
 
-        laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None, speed=None): a new experiment, gives
-        nothing; `speed` (m/s) is refused if no wheel goes so fast; other parameters of the task are not the laboratory's
-        business; laboratory_score(): see sim.track_referee; laboratory_fault(kind, after=0, ...): see sim.track_faults.
+        laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None,
+        speed=None): a new experiment, gives nothing; `speed` (m/s) is refused if no wheel goes so
+        fast; other parameters of the task are not the laboratory's business; laboratory_score():
+        see sim.track_referee; laboratory_fault(kind, after=0, ...): see sim.track_faults.
         """
         if service == SCORE:
             return self.referee.score(self.now)
@@ -168,7 +181,9 @@ class TrackLaboratory(LaboratoryParty):
         seed = whole_number(arguments, "seed", 0) or 0
         truth = self._site.truth(str(arguments.get("regime", REGIME)))
         _check_speed(arguments.get("speed"), truth.rover)
-        elements, interruptions = (whole_number(arguments, key, None) for key in ("elements", "interruptions"))
+        elements, interruptions = (
+            whole_number(arguments, key, None) for key in ("elements", "interruptions")
+        )
         self._prepare(seed, truth, truth.course.track(seed, elements, interruptions))
         return {}
 
@@ -192,7 +207,8 @@ def _check_speed(speed: object, rover: RoverTruth) -> None:
     most = round(rover.top_speed * min(wheel.radius for wheel in rover.wheels), 1)
     if speed is not None and not (isinstance(speed, int | float) and 0.0 < speed <= most):
         raise LaboratoryError(
-            f"speed = {speed!r}: give one above 0 and up to {most} m/s, which is what the wheels can do"
+            f"speed = {speed!r}: give one above 0 and up to {most} m/s, which is what the "
+            "wheels can do"
         )
 
 
@@ -203,4 +219,6 @@ _WATCH: Final = 0.02
 def make_laboratory(directory: Directory, name: str) -> TrackLaboratory:
     """The laboratory of the simulated node `name` of the location file. Raises LaboratoryError."""
     boot = f"{name} in lock step"
-    return TrackLaboratory(name, track_site_of(directory), directory.party, boot=boot, directory=directory.hash)
+    return TrackLaboratory(
+        name, track_site_of(directory), directory.party, boot=boot, directory=directory.hash
+    )

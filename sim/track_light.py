@@ -7,18 +7,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.track_truth import LightTruth
+from petrobot.sim.track_truth import LightTruth
 
 
 class Light(NamedTuple):
-    """What falls on the floor: a factor on the nominal light, and stray light in the lens (grey levels)."""
+    """What falls on the floor: a factor on the nominal light, and stray light in the lens (grey
+    levels)."""
 
     level: float
     veil: float
 
 
 class Hall:
-    """The hall's light from `began` (s) on; asked for moments that never go back. Flashes come at random, with `rng`."""
+    """The hall's light from `began` (s) on; asked for moments that never go back. Flashes come at
+    random, with `rng`."""
 
     def __init__(self, truth: LightTruth, rng: np.random.Generator, began: float) -> None:
         self._truth = truth

@@ -1,8 +1,10 @@
-"""Keeps the score of a run on the track: how far off the centre line, interruptions recovered, where and when it stopped.
+"""Keeps the score of a run on the track: how far off the centre line, interruptions recovered,
+where and when it stopped.
 
-The rules (docs/decisions/mobile-contract.md): what counts is the body's origin. It is *on* the track until it is more than `LEFT`
-off; over an interruption it is in a *gap* until it is within `REGAINED` of the centre line behind it; *lost* after it has left the
-track, until it is back on a painted element no farther back than it was; and at the *end* once it has come to the T.
+The rules (docs/decisions/mobile-contract.md): what counts is the body's origin. It is *on* the
+track until it is more than `LEFT` off; over an interruption it is in a *gap* until it is within
+`REGAINED` of the centre line behind it; *lost* after it has left the track, until it is back on a
+painted element no farther back than it was; and at the *end* once it has come to the T.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
 
-from sim.track import BOARD, Gap, Near, Track
-from sim.track_elements import SQUARE, Pose
+from petrobot.sim.track import BOARD, Gap, Near, Track
+from petrobot.sim.track_elements import SQUARE, Pose
 
 LEFT: Final = 0.30
 """m off the centre line at which the track counts as left."""
@@ -35,7 +37,8 @@ OFF_BOARD: Final = 1.0
 ROW_PERIOD: Final = 0.2
 """s between two rows of the path."""
 _BEHIND, _AHEAD = 0.6, 1.2
-"""m along the track by which the nearest point may have moved since the last look: farther is another part of the track."""
+"""m along the track by which the nearest point may have moved since the last look: farther is
+another part of the track."""
 
 
 class Phase(StrEnum):
@@ -49,7 +52,8 @@ class Phase(StrEnum):
 
 @dataclass(slots=True)
 class _Crossing:
-    """What became of one interruption. `aside` is the greatest distance from the line that would have been there (m)."""
+    """What became of one interruption. `aside` is the greatest distance from the line that would
+    have been there (m)."""
 
     gap: Gap
     kind: str
@@ -99,8 +103,8 @@ class Referee:
         ]
 
     def watch(self, now: float, pose: Pose, speed: float) -> bool:
-        """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover has just left the board, where
-        somebody presses its emergency stop."""
+        """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover
+        has just left the board, where somebody presses its emergency stop."""
         if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
             self._path.append((now - self.began, *pose))
         if self.stopped is not None or self._removed:
@@ -151,7 +155,9 @@ class Referee:
                 crossing.entered = now
 
     def _cross(self, now: float, pose: Pose, near: Near) -> None:
-        open_gaps = [each for each in self._crossings if each.entered is not None and each.ended is None]
+        open_gaps = [
+            each for each in self._crossings if each.entered is not None and each.ended is None
+        ]
         for crossing in open_gaps:
             crossing.aside = max(crossing.aside, near.distance)
         if self._painted(near) and near.distance <= REGAINED and near.s >= self.s:
@@ -162,7 +168,9 @@ class Referee:
         for crossing in self._crossings:
             if crossing.ended is None and crossing.gap.end <= near.s + 1e-9:
                 crossing.ended = now
-                crossing.recovered = crossing.entered is not None and near.s <= crossing.gap.end + IN_TIME
+                crossing.recovered = (
+                    crossing.entered is not None and near.s <= crossing.gap.end + IN_TIME
+                )
                 if not crossing.recovered:
                     self._penalize(now, "interruption_missed", pose, crossing.gap.end)
         self.phase, self.s = Phase.ON, max(self.s, near.s)
@@ -189,12 +197,15 @@ class Referee:
     def _penalize(self, now: float, kind: str, pose: Pose, s: float | None = None) -> None:
         begun = self.began if self.departed is None else self.departed
         row = {"s": self.s if s is None else s, "x": pose.x, "y": pose.y, "after": now - begun}
-        self.penalties.append({"kind": kind, **{key: round(value, 3) for key, value in row.items()}})
+        self.penalties.append(
+            {"kind": kind, **{key: round(value, 3) for key, value in row.items()}}
+        )
 
     # The score
 
     def score(self, now: float) -> dict[str, Any]:
-        """How the run went, as plain data (docs/decisions/mobile-contract.md); the keys without a unit are counts or flags."""
+        """How the run went, as plain data (docs/decisions/mobile-contract.md); the keys without a
+        unit are counts or flags."""
         begun = now if self.departed is None else self.departed
         overrun = any(each["kind"] == "not_stopped" for each in self.penalties)
         stopped_at_t = self.stopped is not None and not overrun
@@ -208,7 +219,9 @@ class Referee:
             "time_s": round(duration, 3),
             "penalties": penalties,
             "penalty_count": len(penalties),
-            "rms_mm": round(1000.0 * math.sqrt(self._squares / self._off), 3) if self._off else None,
+            "rms_mm": round(1000.0 * math.sqrt(self._squares / self._off), 3)
+            if self._off
+            else None,
             "max_mm": round(1000.0 * self._most, 3) if self._off else None,
             "interruptions": len(self._crossings),
             "recovered": sum(crossing.recovered for crossing in self._crossings),
@@ -218,7 +231,10 @@ class Referee:
             "way_m": round(self._way, 3),
             "mean_speed": round(self._way / duration, 4) if duration > 0.0 else 0.0,
             "track": self.track.plain(),
-            "path": [[round(t, 3), round(x, 3), round(y, 3), round(heading, 3)] for t, x, y, heading in self._path],
+            "path": [
+                [round(t, 3), round(x, 3), round(y, 3), round(heading, 3)]
+                for t, x, y, heading in self._path
+            ],
         }
 
     def _all_penalties(self, now: float, stopped_at_t: bool, overrun: bool) -> list[dict[str, Any]]:

@@ -1,7 +1,8 @@
-"""What the rover's cell really is: the nominal numbers, one rover's seeded errors, and a regime's track and disturbances.
+"""What the rover's cell really is: the nominal numbers, one rover's seeded errors, and a regime's
+track and disturbances.
 
-Only the laboratory reads this. A regime name is a kind of track and any number of disturbances of `sim/track.toml`, joined by
-`+` (or a comma): `straight`, `arcs+drift`, `mixed+flash+slip`.
+Only the laboratory reads this. A regime name is a kind of track and any number of disturbances of
+`sim/track.toml`, joined by `+` (or a comma): `straight`, `arcs+drift`, `mixed+flash+slip`.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from services.comm.directory import Directory
-from sim.track import Track
-from sim.track_camera import Mount
-from sim.truth import LaboratoryError, read_toml
+from petrobot.services.comm.directory import Directory
+from petrobot.sim.track import Track
+from petrobot.sim.track_camera import Mount
+from petrobot.sim.truth import LaboratoryError, read_toml
 
 LABORATORY_FILE = Path(__file__).with_name("track.toml")
 
@@ -93,8 +94,11 @@ class Course:
     elements: int
     interruptions: int
 
-    def track(self, seed: int, elements: int | None = None, interruptions: int | None = None) -> Track:
-        """The track of a seed; numbers given go before the regime's. Raises sim.track.TrackError."""
+    def track(
+        self, seed: int, elements: int | None = None, interruptions: int | None = None
+    ) -> Track:
+        """The track of a seed; numbers given go before the regime's. Raises
+        sim.track.TrackError."""
         if self.kinds == "contest":
             return Track.contest()
         return Track.by_seed(
@@ -144,7 +148,8 @@ class TrackSite:
             )
         except KeyError as fault:
             raise LaboratoryError(
-                f"{LABORATORY_FILE.name} or {self.source}: key {fault} is missing; the shipped files show it"
+                f"{LABORATORY_FILE.name} or {self.source}: key {fault} is missing; the "
+                "shipped files show it"
             ) from fault
 
 
@@ -154,31 +159,44 @@ def read_track_site(rover: Path, laboratory: Path = LABORATORY_FILE) -> TrackSit
 
 
 def track_site_of(directory: Directory) -> TrackSite:
-    """The site that the location file names: `[parameters] rover`, and `laboratory` if it is not the shipped one."""
+    """The site that the location file names: `[parameters] rover`, and `laboratory` if it is not
+    the shipped one."""
     if "rover" not in directory.parameters:
-        raise LaboratoryError(f'{directory.source}: [parameters] rover is missing; write rover = "rover.toml"')
+        raise LaboratoryError(
+            f'{directory.source}: [parameters] rover is missing; write rover = "rover.toml"'
+        )
     laboratory = directory.parameters.get("laboratory")
     return read_track_site(
-        directory.file(directory.parameters["rover"]), directory.file(laboratory) if laboratory else LABORATORY_FILE
+        directory.file(directory.parameters["rover"]),
+        directory.file(laboratory) if laboratory else LABORATORY_FILE,
     )
 
 
-def _disturbed(settings: Mapping[str, Any], regime: str) -> tuple[Mapping[str, Any], dict[str, Any]]:
+def _disturbed(
+    settings: Mapping[str, Any], regime: str
+) -> tuple[Mapping[str, Any], dict[str, Any]]:
     base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
     regimes, disturbances = settings["regimes"], settings["disturbances"]
     if base not in regimes:
         raise LaboratoryError(
-            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as 'arcs' or 'arcs+slip'"
+            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as "
+            "'arcs' or 'arcs+slip'"
         )
     values, set_by = dict(settings["nominal"]), dict[str, str]()
     for name in names:
         if name not in disturbances:
-            raise LaboratoryError(f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}")
+            raise LaboratoryError(
+                f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}"
+            )
         for key, value in disturbances[name].items():
             if key not in values:
-                raise LaboratoryError(f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are")
+                raise LaboratoryError(
+                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are"
+                )
             if key in set_by:
-                raise LaboratoryError(f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them")
+                raise LaboratoryError(
+                    f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them"
+                )
             values[key], set_by[key] = value, name
     return regimes[base], values
 
@@ -195,7 +213,10 @@ def _rover(
     radii[0] *= 1.0 + values["wheel_radius_left"]
     lags = rover["wheel_lag"] * (1.0 + rng.normal(0.0, errors["wheel_lag"], 2))
     return RoverTruth(
-        wheels=(WheelTruth(float(radii[0]), float(lags[0])), WheelTruth(float(radii[1]), float(lags[1]))),
+        wheels=(
+            WheelTruth(float(radii[0]), float(lags[0])),
+            WheelTruth(float(radii[1]), float(lags[1])),
+        ),
         track_width=float(rover["track_width"] * (1.0 + rng.normal(0.0, errors["track_width"]))),
         top_speed=float(rover["top_speed"]),
         nominal_voltage=float(rover["battery_voltage"]),
@@ -215,7 +236,10 @@ def _rover(
 
 
 def _camera(
-    nominal: Mapping[str, Any], errors: Mapping[str, Any], values: Mapping[str, Any], rng: np.random.Generator
+    nominal: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
 ) -> Mount:
     pitch, yaw, roll = rng.normal(0.0, errors["camera_angle"], 3)
     du, dv = rng.normal(0.0, errors["camera_principal_px"], 2)

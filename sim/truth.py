@@ -1,7 +1,8 @@
-"""What the simulated cell really is: the nominal cell, one installation's seeded errors, and a regime's disturbances.
+"""What the simulated cell really is: the nominal cell, one installation's seeded errors, and a
+regime's disturbances.
 
-Only the laboratory reads this. A regime name is a regime and any number of disturbances of `sim/laboratory.toml`,
-joined by `+` (or a comma): `A`, `B+latency200`, `A+dim+arm50`.
+Only the laboratory reads this. A regime name is a regime and any number of disturbances of
+`sim/laboratory.toml`, joined by `+` (or a comma): `A`, `B+latency200`, `A+dim+arm50`.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ LABORATORY_FILE = Path(__file__).with_name("laboratory.toml")
 
 
 class LaboratoryError(ValueError):
-    """A laboratory or cell file, or a regime name, that cannot be used; the text names file, key and remedy."""
+    """A laboratory or cell file, or a regime name, that cannot be used; the text names file, key
+    and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraTruth:
-    """The camera as it really hangs: a point p (base frame, m) has camera coordinates `rotation @ (p - position)`."""
+    """The camera as it really hangs: a point p (base frame, m) has camera coordinates `rotation @
+    (p - position)`."""
 
     position: Vector
     """(3,) optical centre in the base frame, m."""
@@ -53,7 +56,8 @@ class CupTruth:
 
 @dataclass(frozen=True, slots=True)
 class TableTruth:
-    """The table as it really stands: top at height `top`, x from `near_edge` to `far_edge`, |y| <= `half_width` (m)."""
+    """The table as it really stands: top at height `top`, x from `near_edge` to `far_edge`, |y| <=
+    `half_width` (m)."""
 
     top: float
     near_edge: float
@@ -89,11 +93,14 @@ class Truth:
 
     def light(self, time: float) -> float:
         """Relative brightness at `time` (s); 1 is nominal."""
-        return self.light_level * (1.0 + self.light_drift * float(np.sin(2.0 * np.pi * time / self.light_period)))
+        return self.light_level * (
+            1.0 + self.light_drift * float(np.sin(2.0 * np.pi * time / self.light_period))
+        )
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as a dict. Raises LaboratoryError naming the file when it is missing or not TOML."""
+    """A TOML file as a dict. Raises LaboratoryError naming the file when it is missing or not
+    TOML."""
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
@@ -106,30 +113,41 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, float], dict[str, Any]]:
-    """Speed range and the disturbed values of a regime name. Raises LaboratoryError for an unknown or contradictory one."""
+    """Speed range and the disturbed values of a regime name. Raises LaboratoryError for an unknown
+    or contradictory one."""
     base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
     regimes, disturbances = settings["regimes"], settings["disturbances"]
     if base not in regimes:
         raise LaboratoryError(
-            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as 'A' or 'A+dim'"
+            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as 'A' "
+            "or 'A+dim'"
         )
     values = dict(settings["nominal"])
     set_by: dict[str, str] = {}
     for name in names:
         if name not in disturbances:
-            raise LaboratoryError(f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}")
+            raise LaboratoryError(
+                f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}"
+            )
         for key, value in disturbances[name].items():
             if key not in values:
-                raise LaboratoryError(f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are")
+                raise LaboratoryError(
+                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are"
+                )
             if key in set_by:
-                raise LaboratoryError(f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them")
+                raise LaboratoryError(
+                    f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them"
+                )
             values[key], set_by[key] = value, name
     low, high = regimes[base]["speed"]
     return (float(low), float(high)), values
 
 
-def read_truth(cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LABORATORY_FILE) -> Truth:
-    """The truth of a regime: nominal `cell` (services/cell.toml), this installation's errors, the regime's disturbances."""
+def read_truth(
+    cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LABORATORY_FILE
+) -> Truth:
+    """The truth of a regime: nominal `cell` (services/cell.toml), this installation's errors, the
+    regime's disturbances."""
     settings = read_toml(laboratory)
     try:
         speed, values = disturb(settings, regime)
@@ -169,14 +187,21 @@ def rotation_from_vector(vector: Vector) -> Vector:
 
 
 def _camera(
-    nominal: Mapping[str, Any], errors: Mapping[str, Any], values: Mapping[str, Any], rng: np.random.Generator
+    nominal: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
 ) -> CameraTruth:
-    position = np.asarray(nominal["position"], dtype=float) + rng.normal(0.0, errors["camera_position"], 3)
+    position = np.asarray(nominal["position"], dtype=float) + rng.normal(
+        0.0, errors["camera_position"], 3
+    )
     turn = rng.normal(0.0, errors["camera_rotation"], 3)
     focal = nominal["focal_px"] * (1.0 + rng.normal(0.0, errors["camera_focal"]))
     centre = (nominal["width"] - 1) / 2.0, (nominal["height"] - 1) / 2.0
     dx, dy = rng.normal(0.0, errors["camera_principal_px"], 2)
-    k1, k2, p1, p2 = np.asarray(nominal["distortion"]) * (1.0 + rng.normal(0.0, errors["camera_distortion"], 4))
+    k1, k2, p1, p2 = np.asarray(nominal["distortion"]) * (
+        1.0 + rng.normal(0.0, errors["camera_distortion"], 4)
+    )
     right, forward = np.asarray(nominal["image_x"], dtype=float), np.array([0.0, 0.0, -1.0])
     looks_down = np.array([right, np.cross(forward, right), forward])
     later = rotation_from_vector(np.asarray(values["camera_turn"], dtype=float))
@@ -190,7 +215,10 @@ def _camera(
 
 
 def _cup(
-    nominal: Mapping[str, Any], errors: Mapping[str, Any], values: Mapping[str, Any], rng: np.random.Generator
+    nominal: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
 ) -> CupTruth:
     axis = np.asarray(nominal["axis"], dtype=float)
     mouth = np.asarray(nominal["mouth"], dtype=float) + rng.normal(0.0, errors["cup_mouth"], 3)
@@ -204,7 +232,9 @@ def _cup(
     )
 
 
-def _table(nominal: Mapping[str, Any], errors: Mapping[str, Any], rng: np.random.Generator) -> TableTruth:
+def _table(
+    nominal: Mapping[str, Any], errors: Mapping[str, Any], rng: np.random.Generator
+) -> TableTruth:
     near = nominal["near_edge"] + rng.normal(0.0, errors["table_edge"])
     return TableTruth(
         top=float(nominal["top"] + rng.normal(0.0, errors["table_top"])),

@@ -1,8 +1,9 @@
 """The ball's world: table, flight, cup and floor, each stepped no finer than is exact there.
 
-On the flat table and in free flight the ball follows closed forms (sim/ball.py), one evaluation a tick. Only where it may
-touch the cup, an edge or anything else from above does the contact space (sim/contact.py) take over at 1 kHz; a ball that
-lies still in a standing cup costs nothing. The light barrier and the closest approach to the cup are watched here.
+On the flat table and in free flight the ball follows closed forms (sim/ball.py), one evaluation a
+tick. Only where it may touch the cup, an edge or anything else from above does the contact space
+(sim/contact.py) take over at 1 kHz; a ball that lies still in a standing cup costs nothing. The
+light barrier and the closest approach to the cup are watched here.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Any
 
-from services.comm.party import TICK
-from sim.ball import BallModel, BallState, TableMotion, fly
-from sim.contact import ContactSpace
-from sim.course import Barrier, Course, Outcome
-from sim.puma_model import Frame3
-from sim.thrower import Throw
-from sim.truth import Truth
+from petrobot.services.comm.party import TICK
+from petrobot.sim.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.contact import ContactSpace
+from petrobot.sim.course import Barrier, Course, Outcome
+from petrobot.sim.puma_model import Frame3
+from petrobot.sim.thrower import Throw
+from petrobot.sim.truth import Truth
 
 _HAND_SPEED = 3.0
 """m/s, faster than the arm can carry the cup."""
@@ -53,9 +54,9 @@ class Where(StrEnum):
 class World:
     """One ball at most, where it is and what became of it. Times `now` are simulated seconds.
 
-    Each tick: `begin`; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at the end of that millisecond;
-    then `end`. `begin` and `end` ask for the cup's pose only when the ball may be near it: a pose costs more than they do.
-    The same object means the same pose.
+    Each tick: `begin`; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at
+    the end of that millisecond; then `end`. `begin` and `end` ask for the cup's pose only when the
+    ball may be near it: a pose costs more than they do. The same object means the same pose.
     """
 
     def __init__(self, cell: Mapping[str, Any], truth: Truth) -> None:
@@ -78,7 +79,8 @@ class World:
         self._start: BallState | None = None
         self._motion: TableMotion | None = None
         self._leaves = (math.inf, 0)
-        """Seconds after `_start_at` when the ball rolls over an edge, and 0 if that is the near one."""
+        """Seconds after `_start_at` when the ball rolls over an edge, and 0 if that is the near
+        one."""
         self._still_since: float | None = None
 
     # What the laboratory asks
@@ -121,7 +123,8 @@ class World:
     # One tick
 
     def begin(self, now: float, cup: CupPose) -> None:
-        """Start of a tick at `now`; `cup` gives the cup's frame (origin: mouth centre, z out of the mouth)."""
+        """Start of a tick at `now`; `cup` gives the cup's frame (origin: mouth centre, z out of the
+        mouth)."""
         ball = self.ball
         if ball is None:
             return
@@ -138,7 +141,8 @@ class World:
             self._look(now, ball, cup())
 
     def _look(self, now: float, ball: BallState, cup: Frame3) -> None:
-        """Into the contact space if ball and cup may touch within the tick; else note when that must be asked again."""
+        """Into the contact space if ball and cup may touch within the tick; else note when that
+        must be asked again."""
         self._cup = cup
         spare = self._gap(ball, cup) - self._way_within_tick(ball)
         if spare <= 0.0:
@@ -216,17 +220,24 @@ class World:
         self.where = Where.CONTACT
 
     def _leave_contact(self, now: float, ball: BallState) -> None:
-        """The cup is far: on to the closed forms if the ball rolls flat on the table or flies clear of it."""
+        """The cup is far: on to the closed forms if the ball rolls flat on the table or flies clear
+        of it."""
         height = ball.position[2] - self._truth.table.top - self.model.radius
         if self._over_table(ball) and abs(height) < 1e-3 and abs(ball.velocity[2]) < _FLAT_SPEED:
             x, y, _ = ball.position
             vx, vy, _ = ball.velocity
-            self._roll(now, BallState((x, y, self._truth.table.top + self.model.radius), (vx, vy, 0.0), ball.spin))
+            self._roll(
+                now,
+                BallState(
+                    (x, y, self._truth.table.top + self.model.radius), (vx, vy, 0.0), ball.spin
+                ),
+            )
         elif not self._near_table(ball):
             self._soar(now, ball)
 
     def _go_on_table(self, now: float) -> None:
-        """Roll on; where the centre crosses an edge it flies from there, or tips over it when it is too slow to."""
+        """Roll on; where the centre crosses an edge it flies from there, or tips over it when it is
+        too slow to."""
         motion = self._motion
         if motion is None:
             return
@@ -248,10 +259,15 @@ class World:
 
     def _settle(self, now: float, ball: BallState, before: Frame3, cup: Frame3) -> None:
         """A ball that lies still in a cup that hardly moves is left alone."""
-        still = _norm(ball.velocity) < self._settings["ball"]["rest_speed"] and self._inside(ball, cup)
+        still = _norm(ball.velocity) < self._settings["ball"]["rest_speed"] and self._inside(
+            ball, cup
+        )
         if still and before is not cup:
             creep = _CREEP * self.fine_dt
-            still = _distance(before.origin, cup.origin) < creep and _distance(before.z, cup.z) < 10.0 * creep
+            still = (
+                _distance(before.origin, cup.origin) < creep
+                and _distance(before.z, cup.z) < 10.0 * creep
+            )
         if not still:
             self._still_since = None
         elif self._still_since is None:
@@ -300,9 +316,15 @@ class World:
         if course is None:
             return
         age = now - course.released_at
-        rests = self.where is Where.TABLE and self._motion is not None and _norm(ball.velocity) == 0.0
+        rests = (
+            self.where is Where.TABLE and self._motion is not None and _norm(ball.velocity) == 0.0
+        )
         lies = rests and now - self._start_at > self._motion_rests() + rules["removed_after"]
-        stuck = age > rules["lost_after"] and not self._barrier.output and self.where is not Where.AT_REST
+        stuck = (
+            age > rules["lost_after"]
+            and not self._barrier.output
+            and self.where is not Where.AT_REST
+        )
         if ball.position[2] < self.model.radius or lies or stuck:
             self.take_away(now)
 
@@ -320,7 +342,9 @@ class World:
         height, aside = _seen_from(cup, ball)
         half, wall = self._truth.cup.depth / 2.0, self._cup_wall
         beyond = max(abs(height + half) - half - wall, 0.0)
-        return math.hypot(beyond, max(aside - self._truth.cup.radius - wall, 0.0)) - self.model.radius
+        return (
+            math.hypot(beyond, max(aside - self._truth.cup.radius - wall, 0.0)) - self.model.radius
+        )
 
     def _way_within_tick(self, ball: BallState) -> float:
         return _AHEAD * (_norm(ball.velocity) + _HAND_SPEED)
@@ -331,12 +355,16 @@ class World:
         return table.near_edge < x < table.far_edge and abs(y) < table.half_width
 
     def _near_table(self, ball: BallState) -> bool:
-        """Whether the ball may touch the table within a tick. One beside it that moves away fast enough cannot."""
+        """Whether the ball may touch the table within a tick. One beside it that moves away fast
+        enough cannot."""
         table, r = self._truth.table, self.model.radius
         x, y, z = ball.position
         vx, vy, _ = ball.velocity
         gap_x, gap_y = max(table.near_edge - x, x - table.far_edge), abs(y) - table.half_width
-        for gap, away in ((gap_x, -vx if x < table.near_edge else vx), (gap_y, math.copysign(vy, y * vy))):
+        for gap, away in (
+            (gap_x, -vx if x < table.near_edge else vx),
+            (gap_y, math.copysign(vy, y * vy)),
+        ):
             if gap >= 0.0 and away > 0.0 and away * away >= self.model.gravity * r:
                 return False
         gap = math.hypot(max(gap_x, 0.0), max(gap_y, 0.0), max(z - table.top, 0.0))
@@ -348,13 +376,15 @@ class World:
 
 
 def _clears_edge(state: BallState, model: BallModel) -> bool:
-    """Whether a ball that crosses an edge at this speed flies off at once: v^2 >= g r, else it tips over the edge."""
+    """Whether a ball that crosses an edge at this speed flies off at once: v^2 >= g r, else it tips
+    over the edge."""
     vx, vy, _ = state.velocity
     return vx * vx + vy * vy >= model.gravity * model.radius
 
 
 def _seen_from(cup: Frame3, ball: BallState) -> tuple[float, float]:
-    """Height of the ball's centre over the mouth's plane and its distance from the cup's axis (m)."""
+    """Height of the ball's centre over the mouth's plane and its distance from the cup's axis
+    (m)."""
     (px, py, pz), (ox, oy, oz), (zx, zy, zz) = ball.position, cup.origin, cup.z
     rx, ry, rz = px - ox, py - oy, pz - oz
     height = rx * zx + ry * zy + rz * zz

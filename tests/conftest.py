@@ -1,4 +1,5 @@
-"""Settings of all tests: property tests judge results, never wall-clock time; no test hangs; who starts processes says so."""
+"""Settings of all tests: property tests judge results, never wall-clock time; no test hangs; who
+starts processes says so."""
 
 from __future__ import annotations
 
@@ -9,7 +10,9 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("petrobot", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True)
+settings.register_profile(
+    "petrobot", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
+)
 settings.load_profile("petrobot")
 
 PROOF_LIMIT_S = 6 * 3600.0
@@ -28,7 +31,8 @@ sys.addaudithook(_note_start)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each long test the limit of the long ones, unless it has a limit of its own; a browser is a process, too."""
+    """Give each long test the limit of the long ones, unless it has a limit of its own; a browser
+    is a process, too."""
     for item in items:
         if isinstance(item, pytest.Function) and "browser" in item.fixturenames:
             item.add_marker("processes")
@@ -47,4 +51,6 @@ def pytest_runtest_protocol() -> Iterator[None]:
 def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
     """A test that starts processes is marked so: those are repeated on a busy machine."""
     yield
-    assert not _started or item.get_closest_marker("processes"), f"mark it `processes`: it starts {_started[0]}"
+    assert not _started or item.get_closest_marker("processes"), (
+        f"mark it `processes`: it starts {_started[0]}"
+    )

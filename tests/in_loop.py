@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from services.comm.server import Server
-from services.node import Node
+from petrobot.services.comm.server import Server
+from petrobot.services.node import Node
 from tests.waiting import beat
 
 

@@ -6,7 +6,8 @@ import socket
 from collections import deque
 
 KEPT = 256
-"""Ports that one test process keeps: more than any test uses, and far from the limit of open files."""
+"""Ports that one test process keeps: more than any test uses, and far from the limit of open
+files."""
 
 _kept: deque[socket.socket] = deque()
 
@@ -14,8 +15,9 @@ _kept: deque[socket.socket] = deque()
 def free_ports(count: int) -> list[int]:
     """Ports of this host that nobody listens on now.
 
-    They stay bound here, without being listened on, so that the system gives them to no other test that runs beside this one,
-    and to no client as its own end. Servers set SO_REUSEADDR and may listen there all the same, as often as they like.
+    They stay bound here, without being listened on, so that the system gives them to no other test
+    that runs beside this one, and to no client as its own end. Servers set SO_REUSEADDR and may
+    listen there all the same, as often as they like.
     """
     ports = []
     for _ in range(count):

@@ -1,4 +1,5 @@
-"""A disk that loses at a power cut what was not synced: bytes of files, names of files and folders, and renames."""
+"""A disk that loses at a power cut what was not synced: bytes of files, names of files and folders,
+and renames."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ import pytest
 
 
 class Disk:
-    """What of a folder would be left. `os.fsync` and `os.fdatasync` tell it what is safe, as POSIX promises and no more: of a
-    file its bytes, of a folder the names in it."""
+    """What of a folder would be left. `os.fsync` and `os.fdatasync` tell it what is safe, as POSIX
+    promises and no more: of a file its bytes, of a folder the names in it."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -35,7 +36,8 @@ class Disk:
             self._bytes[inode] = place.read_bytes()
 
     def left(self, torn: float = 0.0) -> dict[str, bytes]:
-        """Files with their bytes, by path in the root. Of what was appended and not synced, `torn` is there too (0 to 1)."""
+        """Files with their bytes, by path in the root. Of what was appended and not synced, `torn`
+        is there too (0 to 1)."""
         return dict(self._left(self._root.stat().st_ino, "", torn))
 
     def _left(self, folder: int, path: str, torn: float) -> Iterator[tuple[str, bytes]]:
@@ -46,7 +48,11 @@ class Disk:
             safe, now = self._bytes.get(inode, b""), self._root / path / name
             if now.is_dir():
                 continue  # of what is in it nothing is safe
-            if now.is_file() and now.stat().st_ino == inode and (data := now.read_bytes()).startswith(safe):
+            if (
+                now.is_file()
+                and now.stat().st_ino == inode
+                and (data := now.read_bytes()).startswith(safe)
+            ):
                 safe = data[: len(safe) + int(torn * (len(data) - len(safe)))]
             yield f"{path}{name}", safe
 
@@ -58,7 +64,8 @@ class Disk:
 
 @contextmanager
 def power_cut(root: Path) -> Iterator[Disk]:
-    """The disk that a folder is on, from now on; what is in it already is lost if it is not synced again."""
+    """The disk that a folder is on, from now on; what is in it already is lost if it is not synced
+    again."""
     disk = Disk(root)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", disk.synced)

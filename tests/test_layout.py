@@ -40,7 +40,13 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("coordinator.engine", ("coordinator.net", "coordinator.task", "coordinator.conditions")),
     (
         "coordinator.record",
-        ("coordinator.net", "coordinator.task", "coordinator.conditions", "coordinator.engine", "services.comm"),
+        (
+            "coordinator.net",
+            "coordinator.task",
+            "coordinator.conditions",
+            "coordinator.engine",
+            "services.comm",
+        ),
     ),
     (
         "coordinator.mission",
@@ -69,7 +75,8 @@ ALLOWED: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("coordinator.hmi", ("coordinator", "services.comm")),
     ("coordinator", ("coordinator", "services.comm")),
 )
-"""Modules of coordinator reach services and sim only through `services.comm`; launch loads the rest by import path."""
+"""Modules of coordinator reach services and sim only through `services.comm`; launch loads the rest
+by import path."""
 
 PURE = (
     "coordinator.net",
@@ -99,7 +106,16 @@ PURE = (
     "services.mobile.reflectors",
     "services.mobile.wheel_drives",
 )
-IMPURE_IMPORTS = {"asyncio", "socket", "selectors", "subprocess", "threading", "multiprocessing", "random", "secrets"}
+IMPURE_IMPORTS = {
+    "asyncio",
+    "socket",
+    "selectors",
+    "subprocess",
+    "threading",
+    "multiprocessing",
+    "random",
+    "secrets",
+}
 FORBIDDEN_IMPORTS = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
 ROBOT_WORDS = {"puma", "ball", "camera", "cup", "track", "rover", "catch"}
 
@@ -114,14 +130,18 @@ def modules() -> Iterator[tuple[str, Path]]:
 
 def imports(name: str, path: Path) -> Iterator[tuple[int, str]]:
     """Line and dotted name of everything that a module imports, wherever in the file."""
-    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    own = f"petrobot.{name}"
+    package = own if path.name == "__init__.py" else own.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+            yield from ((node.lineno, alias.name.removeprefix("petrobot.")) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
-                base = ".".join([*package.split(".")[: len(package.split(".")) - node.level + 1], base]).rstrip(".")
+                base = ".".join(
+                    [*package.split(".")[: len(package.split(".")) - node.level + 1], base]
+                ).rstrip(".")
+            base = base.removeprefix("petrobot.")
             yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
 
 
@@ -149,9 +169,14 @@ def test_arrows(name: str, path: Path) -> None:
 
 @pytest.mark.parametrize(("name", "path"), MODULES, ids=[name for name, _ in MODULES])
 def test_nothing_unpickled(name: str, path: Path) -> None:
-    """No module loads code from data, and pure rooms have no sockets, processes or randomness of their own."""
-    banned = FORBIDDEN_IMPORTS | (IMPURE_IMPORTS if any(within(name, room) for room in PURE) else set())
-    assert not [f"{path.name}:{line} {t}" for line, t in imports(name, path) if t.split(".")[0] in banned]
+    """No module loads code from data, and pure rooms have no sockets, processes or randomness of
+    their own."""
+    banned = FORBIDDEN_IMPORTS | (
+        IMPURE_IMPORTS if any(within(name, room) for room in PURE) else set()
+    )
+    assert not [
+        f"{path.name}:{line} {t}" for line, t in imports(name, path) if t.split(".")[0] in banned
+    ]
     calls = [
         n.func.id
         for n in ast.walk(ast.parse(path.read_text()))
@@ -163,7 +188,9 @@ def test_nothing_unpickled(name: str, path: Path) -> None:
 @pytest.mark.parametrize(("name", "path"), MODULES, ids=[name for name, _ in MODULES])
 def test_every_module_says_its_role(name: str, path: Path) -> None:
     """A file has one role, said in its first line."""
-    assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), f"{name} has no docstring"
+    assert ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))), (
+        f"{name} has no docstring"
+    )
 
 
 @pytest.mark.parametrize("name", ["coordinator", "services.comm"])
@@ -184,7 +211,9 @@ def test_general_rooms_name_no_robot(name: str) -> None:
             if isinstance(text, str)
             for part in text.lower().split("_")
         }
-        assert not words & (ROBOT_WORDS - ({"camera"} if module == "services.comm.camera" else set())), module
+        assert not words & (
+            ROBOT_WORDS - ({"camera"} if module == "services.comm.camera" else set())
+        ), module
 
 
 OWNED_LOOP = re.compile(r"not self\._over(\(\w+\)|\.is_set\(\))?")
@@ -201,7 +230,9 @@ TESTS = [
 def own_nodes(node: ast.AST) -> Iterator[ast.AST]:
     """What a statement holds, except what lies in functions that it defines."""
     for child in ast.iter_child_nodes(node):
-        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
+        if not isinstance(
+            child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef
+        ):
             yield child
             yield from own_nodes(child)
 
@@ -211,7 +242,9 @@ def has_limit(loop: ast.While, timed: bool) -> bool:
     inside = list(own_nodes(loop))
     names = {ast.unparse(n) for n in ast.walk(loop.test)}
     counted = {
-        ast.unparse(n.target) for n in inside if isinstance(n, ast.AugAssign) and isinstance(n.value, ast.Constant)
+        ast.unparse(n.target)
+        for n in inside
+        if isinstance(n, ast.AugAssign) and isinstance(n.value, ast.Constant)
     }
     called = {
         n.func.attr: ast.unparse(n.func.value)
@@ -221,28 +254,36 @@ def has_limit(loop: ast.While, timed: bool) -> bool:
     compared = {
         name
         for n in inside
-        if isinstance(n, ast.Compare) and any(isinstance(op, ast.Lt | ast.LtE | ast.Gt | ast.GtE) for op in n.ops)
+        if isinstance(n, ast.Compare)
+        and any(isinstance(op, ast.Lt | ast.LtE | ast.Gt | ast.GtE) for op in n.ops)
         for part in ast.walk(n)
         for name in (ast.unparse(part), getattr(part, "attr", ""))
     }
-    never_left = isinstance(loop.test, ast.Constant) and not any(isinstance(n, ast.Return | ast.Break) for n in inside)
+    never_left = isinstance(loop.test, ast.Constant) and not any(
+        isinstance(n, ast.Return | ast.Break) for n in inside
+    )
     return (
         never_left  # no wait: the test cancels or kills it
         or (timed and any(isinstance(n, ast.Await) for n in inside))
         or "left" in called  # tests.waiting.Limit
         or bool(compared & (CLOCKS | counted))
         or any(called.get(verb) in names for verb in ("pop", "popleft"))  # empties what it looks at
-        or any(isinstance(n, ast.NamedExpr) for n in ast.walk(loop.test))  # reads its source to the end
+        or any(
+            isinstance(n, ast.NamedExpr) for n in ast.walk(loop.test)
+        )  # reads its source to the end
         or OWNED_LOOP.fullmatch(ast.unparse(loop.test)) is not None
     )
 
 
 def loops(node: ast.AST, timed: bool = False) -> Iterator[tuple[ast.While, bool]]:
-    """Every `while` of a module, and whether it lies in an `asyncio.timeout` of its own function."""
+    """Every `while` of a module, and whether it lies in an `asyncio.timeout` of its own
+    function."""
     for child in ast.iter_child_nodes(node):
         inner = timed and not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
         if isinstance(child, ast.AsyncWith):
-            inner = inner or any("timeout" in ast.unparse(item.context_expr) for item in child.items)
+            inner = inner or any(
+                "timeout" in ast.unparse(item.context_expr) for item in child.items
+            )
         if isinstance(child, ast.While):
             yield child, inner
         yield from loops(child, inner)

@@ -1,4 +1,5 @@
-"""Waiting in tests: for conditions, never for a guess at how long something takes, and never without a limit."""
+"""Waiting in tests: for conditions, never for a guess at how long something takes, and never
+without a limit."""
 
 from __future__ import annotations
 
@@ -7,16 +8,21 @@ import time
 from collections.abc import Callable
 
 PATIENCE_S = 60.0
-"""How long a wait may last unless it says otherwise (s): more than a busy machine needs, less than a test may last."""
+"""How long a wait may last unless it says otherwise (s): more than a busy machine needs, less than
+a test may last."""
 
 
 class Limit:
-    """The limit of one wait: `while not condition and limit.left(): ...` ends, or fails and says what was awaited.
+    """The limit of one wait: `while not condition and limit.left(): ...` ends, or fails and says
+    what was awaited.
 
-    The limit is `seconds` of the wall clock. In simulated time it is a number of `steps`, which no busy machine uses up.
+    The limit is `seconds` of the wall clock. In simulated time it is a number of `steps`, which no
+    busy machine uses up.
     """
 
-    def __init__(self, awaited: str, seconds: float = PATIENCE_S, *, steps: int | None = None) -> None:
+    def __init__(
+        self, awaited: str, seconds: float = PATIENCE_S, *, steps: int | None = None
+    ) -> None:
         self._awaited = awaited
         self._given = f"{seconds:g} s" if steps is None else f"{steps} steps"
         self._end = time.monotonic() + seconds
@@ -40,7 +46,8 @@ async def beat(seconds: float = 0.005) -> None:
 
 
 async def until(condition: Callable[[], object], awaited: str, seconds: float = PATIENCE_S) -> None:
-    """Wait in the event loop until the condition is true. Raises AssertionError, as `Limit` does."""
+    """Wait in the event loop until the condition is true. Raises AssertionError, as `Limit`
+    does."""
     limit = Limit(awaited, seconds)
     while not condition() and limit.left():
         await beat()

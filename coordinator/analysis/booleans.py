@@ -1,9 +1,11 @@
-"""The ordinary view with boolean variables kept: complementary places `v=true`, `v=false` (and `v=none` while not yet written).
+"""The ordinary view with boolean variables kept: complementary places `v=true`, `v=false` (and
+`v=none` while not yet written).
 
-A variable may change whenever a place whose runs write it is marked; a transition whose condition reads boolean variables
-alone has one case for each assignment that makes it true, with test arcs from these places. So every executed sequence is
-still one of this net (it allows a few more: a run writes at its end only), and safety carries over; with the conditions kept,
-fewer markings are reachable than in the plain ordinary net. Conditions that read anything else are dropped, as there.
+A variable may change whenever a place whose runs write it is marked; a transition whose condition
+reads boolean variables alone has one case for each assignment that makes it true, with test arcs
+from these places. So every executed sequence is still one of this net (it allows a few more: a run
+writes at its end only), and safety carries over; with the conditions kept, fewer markings are
+reachable than in the plain ordinary net. Conditions that read anything else are dropped, as there.
 """
 
 from __future__ import annotations
@@ -12,9 +14,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 
-from coordinator.conditions import ConditionFault
-from coordinator.net import Net
-from coordinator.task import Task, Transition, Variable, VariableType
+from petrobot.coordinator.conditions import ConditionFault
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Task, Transition, Variable, VariableType
 
 VARIABLES = 8
 """Boolean variables that one condition may read: each doubles its cases."""
@@ -25,17 +27,21 @@ Weights = dict[str, int]
 
 @dataclass(frozen=True)
 class BooleanView:
-    """The refined net: its first places are those of the ordinary net; `origin` names the transition of each case."""
+    """The refined net: its first places are those of the ordinary net; `origin` names the
+    transition of each case."""
 
     net: Net
     origin: Mapping[str, str]
 
 
 def boolean_view(task: Task) -> BooleanView:
-    """The ordinary net of a task with its boolean variables. Raises ValueError if a condition reads too many of them."""
+    """The ordinary net of a task with its boolean variables. Raises ValueError if a condition reads
+    too many of them."""
     flat, net = task.flat, task.net
     read = set().union(*(t.when.names for t in flat.transitions.values() if t.when is not None))
-    kept = {v.name: v for v in flat.variables.values() if v.type is VariableType.BOOL and v.name in read}
+    kept = {
+        v.name: v for v in flat.variables.values() if v.type is VariableType.BOOL and v.name in read
+    }
     places = dict(zip(net.places, net.initial, strict=True))
     for v in kept.values():
         places |= {_place(v.name, value): int(value is v.initial) for value in _values(v)}
@@ -63,24 +69,32 @@ def _values(variable: Variable) -> tuple[bool | None, ...]:
 
 
 def _cases(t: Transition, kept: Mapping[str, Variable]) -> Iterator[tuple[str, Weights]]:
-    """(label, test arcs) of each assignment that makes the condition true; one bare case without such a condition."""
+    """(label, test arcs) of each assignment that makes the condition true; one bare case without
+    such a condition."""
     names = sorted(t.when.names) if t.when is not None else []
     if t.when is None or not set(names) <= set(kept):
         yield "", {}
         return
     if len(names) > VARIABLES:
-        raise ValueError(f"transitions.{t.name}.when: {len(names)} boolean variables; at most {VARIABLES} are unfolded")
+        raise ValueError(
+            f"transitions.{t.name}.when: {len(names)} boolean variables; at most {VARIABLES} "
+            "are unfolded"
+        )
     for values in product(*(_values(kept[name]) for name in names)):
         try:
             true = t.when.holds(dict(zip(names, values, strict=True)))
         except ConditionFault:
-            continue  # a variable that was never written gives the condition no truth value: it counts as false
+            # a variable that was never written gives the condition no truth value: it counts as
+            # false
+            continue
         if true:
             said = [_place(name, value) for name, value in zip(names, values, strict=True)]
             yield f" [{', '.join(said)}]", dict.fromkeys(said, 1)
 
 
-def _writes(task: Task, kept: Mapping[str, Variable]) -> Iterator[tuple[str, tuple[Weights, Weights]]]:
+def _writes(
+    task: Task, kept: Mapping[str, Variable]
+) -> Iterator[tuple[str, tuple[Weights, Weights]]]:
     """Changes of a variable while a place whose runs write it is marked."""
     for place in task.flat.places.values():
         for variable in dict.fromkeys(place.out.values()):
@@ -89,4 +103,7 @@ def _writes(task: Task, kept: Mapping[str, Variable]) -> Iterator[tuple[str, tup
             for before, after in product(_values(kept[variable]), VALUES[:2]):
                 if before is not after:
                     was, now = _place(variable, before), _place(variable, after)
-                    yield f"{place.name} writes {now} over {was}", ({place.name: 1, was: 1}, {place.name: 1, now: 1})
+                    yield (
+                        f"{place.name} writes {now} over {was}",
+                        ({place.name: 1, was: 1}, {place.name: 1, now: 1}),
+                    )

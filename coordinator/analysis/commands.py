@@ -1,7 +1,8 @@
-"""What the commands analyse, simulate, convert and show --graph do, as plain functions: (exit code, text, plain data).
+"""What the commands analyse, simulate, convert and show --graph do, as plain functions: (exit code,
+text, plain data).
 
-Paths of tasks are opened by the caller (`load_task`), since this room knows tasks, not task files. Clocks and random seeds
-come from the caller, too.
+Paths of tasks are opened by the caller (`load_task`), since this room knows tasks, not task files.
+Clocks and random seeds come from the caller, too.
 """
 
 from __future__ import annotations
@@ -14,20 +15,26 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.analysis.formats import read_net, written
-from coordinator.analysis.gspn import Gspn
-from coordinator.analysis.netfile import FormatError, NetFile
-from coordinator.analysis.ordinary import OrdinaryView
-from coordinator.analysis.picture import graph_svg
-from coordinator.analysis.rates import read_rates, unit_rates
-from coordinator.analysis.report import CUT, Analysis, analyse
-from coordinator.analysis.simulate import Estimate, Simulation, goal_by_marking, simulate
-from coordinator.analysis.space import EngineName, Limits, explore
-from coordinator.analysis.stochastic import Measured, NoEstimate, stochastic_view
-from coordinator.analysis.whatif import Change, change_gspn, change_net, change_task, read_change
-from coordinator.net import Net
-from coordinator.task import Place, Task, Transition
-from services.comm.whole_file import write_whole
+from petrobot.coordinator.analysis.formats import read_net, written
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.analysis.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.picture import graph_svg
+from petrobot.coordinator.analysis.rates import read_rates, unit_rates
+from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
+from petrobot.coordinator.analysis.simulate import Estimate, Simulation, goal_by_marking, simulate
+from petrobot.coordinator.analysis.space import EngineName, Limits, explore
+from petrobot.coordinator.analysis.stochastic import Measured, NoEstimate, stochastic_view
+from petrobot.coordinator.analysis.whatif import (
+    Change,
+    change_gspn,
+    change_net,
+    change_task,
+    read_change,
+)
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Place, Task, Transition
+from petrobot.services.comm.whole_file import write_whole
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
 
@@ -62,11 +69,12 @@ def analyse_command(
     structure: bool = True,
     changes: Sequence[str] = (),
 ) -> Outcome:
-    """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for bad input.
+    """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for
+    bad input.
 
-    `rates` is a rates file, or "unit". Without a `view` a net with rates, given here or found in its file, is analysed as
-    "gspn", all else as "ordinary". `changes` (see `whatif`) are judged beside the file as it is: the code and the text are
-    those of what would be.
+    `rates` is a rates file, or "unit". Without a `view` a net with rates, given here or found in
+    its file, is analysed as "gspn", all else as "ordinary". `changes` (see `whatif`) are judged
+    beside the file as it is: the code and the text are those of what would be.
     """
     try:
         model = open_model(path, load_task)
@@ -77,7 +85,9 @@ def analyse_command(
         plain = model.net if isinstance(model, NetFile) and rates is not None else None
 
         def found(one: Subject, measured: Measured | None) -> Analysis:
-            tokens = plain and (change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain)
+            tokens = plain and (
+                change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain
+            )
             return analyse(one, name=name or path.stem, view=view, measured=measured, stages=stages, limits=limits,
                            engine=engine, ordinary=tokens)  # fmt: skip
 
@@ -91,18 +101,29 @@ def analyse_command(
         data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
         said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
     said += [f"note: {note}" for note in notes]
-    return Outcome(OK if then.ok else FAULT, "\n".join(said), data | {"notes": [*data["notes"], *notes]}, analysis=then)
+    return Outcome(
+        OK if then.ok else FAULT,
+        "\n".join(said),
+        data | {"notes": [*data["notes"], *notes]},
+        analysis=then,
+    )
 
 
 def _view(model: Task | NetFile, rates: Path | str | None) -> str:
     """What is asked for where nobody says: numbers wherever there are rates."""
-    return "gspn" if isinstance(model, NetFile) and (rates is not None or model.gspn is not None) else "ordinary"
+    return (
+        "gspn"
+        if isinstance(model, NetFile) and (rates is not None or model.gspn is not None)
+        else "ordinary"
+    )
 
 
 def _named(path: Path, error: Exception) -> str:
     """What is wrong, with the file's name once: readers of files name it themselves."""
     told = str(error)
-    return told if isinstance(error, FormatError) or told.startswith(f"{path}:") else f"{path}: {told}"
+    return (
+        told if isinstance(error, FormatError) or told.startswith(f"{path}:") else f"{path}: {told}"
+    )
 
 
 def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
@@ -111,11 +132,14 @@ def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
 
 
 def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
-    """The analysis with its data and text; Ctrl-C leaves out what the arcs alone say, then the numbers."""
+    """The analysis with its data and text; Ctrl-C leaves out what the arcs alone say, then the
+    numbers."""
     try:
         return found, found.to_json(structure=structure), [found.text()]
     except KeyboardInterrupt:
-        part = replace(found, interrupted=True, forecast=None, notes=tuple(dict.fromkeys((*found.notes, CUT))))
+        part = replace(
+            found, interrupted=True, forecast=None, notes=tuple(dict.fromkeys((*found.notes, CUT)))
+        )
         return part, part.to_json(structure=False), [part.text()]
 
 
@@ -125,7 +149,9 @@ Subject = Task | Net | Gspn
 def _changed(subject: Subject, changes: Sequence[Change]) -> tuple[Subject, Measured | None]:
     if isinstance(subject, Task):
         return change_task(subject, Measured(), changes)
-    return (change_gspn(subject, changes) if isinstance(subject, Gspn) else change_net(subject, changes)), None
+    return (
+        change_gspn(subject, changes) if isinstance(subject, Gspn) else change_net(subject, changes)
+    ), None
 
 
 def _compared(now: Analysis, then: Analysis) -> list[str]:
@@ -133,7 +159,9 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
     words = {True: "yes", False: "NO", None: "unknown"}
     rows = [
         (name.replace("_", " "), words[before.holds], words[after.holds])
-        for (name, before), after in zip(now.verdicts().items(), then.verdicts().values(), strict=True)
+        for (name, before), after in zip(
+            now.verdicts().items(), then.verdicts().values(), strict=True
+        )
         if before.holds is not after.holds
     ]
     one, other = now.figures(), then.figures()
@@ -142,12 +170,19 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
     return [*lines, *(f"  {name:28}{before:>14}{after:>14}" for name, before, after in rows)]
 
 
-def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tuple[Subject, str, tuple[str, ...]]:
+def _subject(
+    model: Task | NetFile, rates: Path | str | None, view: str
+) -> tuple[Subject, str, tuple[str, ...]]:
     """(what to analyse, its name, notes)."""
     if isinstance(model, Task):
         if rates is not None:
-            remedy = "leave it out: a task's times are its `estimates` and `mean_wait`, and --what-if changes them"
-            raise FormatError("--rates", str(rates), f"{model.name} is a task; rates are for net files", remedy)
+            remedy = (
+                "leave it out: a task's times are its `estimates` and `mean_wait`, and "
+                "--what-if changes them"
+            )
+            raise FormatError(
+                "--rates", str(rates), f"{model.name} is a task; rates are for net files", remedy
+            )
         return model, model.name, ()
     if rates == "unit":
         return unit_rates(model), model.name, (*model.notes, "every transition has the rate 1/s")
@@ -157,7 +192,9 @@ def _subject(model: Task | NetFile, rates: Path | str | None, view: str) -> tupl
     if view != "gspn":
         return model.net, model.name, model.notes
     if model.gspn is None:
-        raise FormatError(model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit")
+        raise FormatError(
+            model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit"
+        )
     return model.gspn, model.name, model.notes
 
 
@@ -182,7 +219,8 @@ def simulate_command(
     changes: Sequence[str] = (),
     progress: Callable[[int, float], None] | None = None,
 ) -> Outcome:
-    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed there); `changes` as `whatif`."""
+    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed
+    there); `changes` as `whatif`."""
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         if isinstance(model, Task):
@@ -198,13 +236,25 @@ def simulate_command(
         assert isinstance(subject, Gspn)
         gspn = change_gspn(subject, wanted)
         if horizon is None:
-            raise FormatError(str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS")
+            raise FormatError(
+                str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS"
+            )
         seen = simulate(
-            gspn, random, replicas=replicas, horizon=horizon, warmup=warmup, firings=firings, progress=progress
+            gspn,
+            random,
+            replicas=replicas,
+            horizon=horizon,
+            warmup=warmup,
+            firings=firings,
+            progress=progress,
         )
         return _simulated(name or path.stem, seen, notes)
     except (FormatError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
-        told = _named(path, error) if not isinstance(error, MemoryError) else f"{path}: out of memory: fewer --replicas"
+        told = (
+            _named(path, error)
+            if not isinstance(error, MemoryError)
+            else f"{path}: out of memory: fewer --replicas"
+        )
         return Outcome(BAD_INPUT, told, {"error": told})
 
 
@@ -221,17 +271,25 @@ def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
         "mean_tokens": {p: plain(one) for p, one in seen.mean_tokens.items()},
         "notes": list(notes),
     }
-    lines = [f"{name}: {seen.replicas} replicas, {seen.firings} firings" + ("" if seen.complete else " (cut short)")]
+    lines = [
+        f"{name}: {seen.replicas} replicas, {seen.firings} firings"
+        + ("" if seen.complete else " (cut short)")
+    ]
     if seen.completed is not None:
         data["completed"] = plain(seen.completed)
         lines.append(f"  completed {_interval(seen.completed)}")
     if seen.time is not None:
         quantiles = {f"{q:g}": seen.quantile(q) for q in (0.5, 0.9, 0.99)}
         data |= {"time": plain(seen.time), "quantiles": quantiles}
-        lines.append(f"  time {_interval(seen.time)} s; " + ", ".join(f"{q}: {t:.4g} s" for q, t in quantiles.items()))
+        lines.append(
+            f"  time {_interval(seen.time)} s; "
+            + ", ".join(f"{q}: {t:.4g} s" for q, t in quantiles.items())
+        )
     if seen.completed is None:
         lines += [f"  {t:24}{_interval(one)} /s" for t, one in seen.throughput.items()]
-    return Outcome(OK if seen.complete else FAULT, "\n".join([*lines, *(f"note: {n}" for n in notes)]), data)
+    return Outcome(
+        OK if seen.complete else FAULT, "\n".join([*lines, *(f"note: {n}" for n in notes)]), data
+    )
 
 
 def _interval(one: Estimate) -> str:
@@ -239,7 +297,8 @@ def _interval(one: Estimate) -> str:
 
 
 def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: int = 8) -> Outcome:
-    """`petrobot convert`: read one format, write another by the ending; what the target cannot keep is listed."""
+    """`petrobot convert`: read one format, write another by the ending; what the target cannot keep
+    is listed."""
     try:
         model = open_model(source, load_task)
         if isinstance(model, Task):
@@ -252,15 +311,20 @@ def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: 
         return Outcome(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
     except OSError as error:
         return Outcome(
-            BAD_INPUT, f"{target}: {error.strerror or error}; name a file that can be written", {"error": str(error)}
+            BAD_INPUT,
+            f"{target}: {error.strerror or error}; name a file that can be written",
+            {"error": str(error)},
         )
     lost += more
     lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
-    return Outcome(OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost})
+    return Outcome(
+        OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost}
+    )
 
 
 def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]]:
-    """A task as a net file: its stochastic view where rates are needed (.drn), else its ordinary net."""
+    """A task as a net file: its stochastic view where rates are needed (.drn), else its ordinary
+    net."""
     if target.suffix == ".drn":
         view = stochastic_view(task, stages=stages, timer_stages=stages)
         return NetFile(view.gspn.net, task.name, view.gspn), list(view.assumptions)
@@ -283,9 +347,14 @@ def net_file_of(task: Task) -> NetFile:
 
 
 def graph_command(
-    path: Path, load_task: LoadTask, *, witness: tuple[str, ...] | None = None, limits: Limits | None = None
+    path: Path,
+    load_task: LoadTask,
+    *,
+    witness: tuple[str, ...] | None = None,
+    limits: Limits | None = None,
 ) -> Outcome:
-    """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the first deadlock's witness."""
+    """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the
+    first deadlock's witness."""
     try:
         model = open_model(path, load_task)
         net, final = model.net, None
@@ -298,7 +367,11 @@ def graph_command(
     shown = witness if witness is not None else tuple(space.path(stuck[0])) if stuck else ()
     svg = graph_svg(space, witness=shown, final=final)
     partial = "" if space.complete else f" (partial: {space.reason})"
-    return Outcome(OK, f"{len(space)} markings, {space.edges} edges{partial}", {"svg": svg, "witness": list(shown)})
+    return Outcome(
+        OK,
+        f"{len(space)} markings, {space.edges} edges{partial}",
+        {"svg": svg, "witness": list(shown)},
+    )
 
 
 def limited(limits: Limits, progress: Callable[[int, int], None]) -> Limits:

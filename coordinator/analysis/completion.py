@@ -1,8 +1,10 @@
-"""How long until a task is complete, and with what probability: moments, distribution and quantiles from the initial marking.
+"""How long until a task is complete, and with what probability: moments, distribution and quantiles
+from the initial marking.
 
-With h the probability of ever completing, y = E[T; complete] and z = E[T^2; complete], each satisfies x = b + A x over the
-markings that can still complete (A the jump probabilities, s the mean sojourn): h from b = the jumps into the goal,
-y from b = s h, z from b = 2 s^2 h + 2 s A y. The law of T given completion comes from uniformisation.
+With h the probability of ever completing, y = E[T; complete] and z = E[T^2; complete], each
+satisfies x = b + A x over the markings that can still complete (A the jump probabilities, s the
+mean sojourn): h from b = the jumps into the goal, y from b = s h, z from b = 2 s^2 h + 2 s A y. The
+law of T given completion comes from uniformisation.
 """
 
 from __future__ import annotations
@@ -11,10 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from coordinator.analysis.graph import Mask, sum_by
-from coordinator.analysis.gspn import Chain, Values
-from coordinator.analysis.linear import Plan, solve
-from coordinator.analysis.markov import Generator, poisson_weights
+from petrobot.coordinator.analysis.graph import Mask, sum_by
+from petrobot.coordinator.analysis.gspn import Chain, Values
+from petrobot.coordinator.analysis.linear import Plan, solve
+from petrobot.coordinator.analysis.markov import Generator, poisson_weights
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,11 @@ def _apply(chain: Chain, value: Values, x: Values) -> Values:
 
 def _error(chain: Chain, value: Values, x: Values, b: Values) -> float:
     largest = float(np.max(np.abs(x), initial=0.0))
-    return float(np.max(np.abs(b + _apply(chain, value, x) - x), initial=0.0)) / largest if largest else 0.0
+    return (
+        float(np.max(np.abs(b + _apply(chain, value, x) - x), initial=0.0)) / largest
+        if largest
+        else 0.0
+    )
 
 
 LOOK = 16
@@ -84,7 +90,8 @@ LOOK = 16
 
 @dataclass(frozen=True)
 class Law:
-    """The distribution of the time to completion: after k uniform jumps at `rate` the goal is reached with absorbed[k]."""
+    """The distribution of the time to completion: after k uniform jumps at `rate` the goal is
+    reached with absorbed[k]."""
 
     rate: float
     absorbed: Values
@@ -112,26 +119,34 @@ class Law:
 
 
 def law(chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000) -> Law:
-    """The law of the time to completion. `left` is the share of completing runs still under way where it is cut off.
+    """The law of the time to completion. `left` is the share of completing runs still under way
+    where it is cut off.
 
     Raises ArithmeticError if that takes more than `steps` jumps.
     """
     whole = completion(chain, goal)
-    ends = Chain(chain.gspn, chain.space, *_open_edges(chain, whole), chain.vanishing & ~goal & (whole.h > 0))
+    ends = Chain(
+        chain.gspn, chain.space, *_open_edges(chain, whole), chain.vanishing & ~goal & (whole.h > 0)
+    )
     made = Generator.of(ends)
     reached = goal[made.tangible]
     p, absorbed = made.start, [float(made.start[reached].sum())]
-    # what is still to come is weighed by itself: as a difference of sums it would never fall below their rounding
+    # what is still to come is weighed by itself: as a difference of sums it would never fall below
+    # their rounding
     ahead = np.where(reached, 0.0, whole.h[made.tangible])
     while (len(absorbed) - 1) % LOOK or float(np.sum(p * ahead)) > left * whole.probability:
         if len(absorbed) > steps:
-            raise ArithmeticError(f"the law of completion needs more than {steps} jumps; simulate instead")
+            raise ArithmeticError(
+                f"the law of completion needs more than {steps} jumps; simulate instead"
+            )
         p = made.matrix @ p
         absorbed.append(float(p[reached].sum()))
     return Law(made.rate, np.array(absorbed), whole.probability)
 
 
-def _open_edges(chain: Chain, whole: Completion) -> tuple[np.ndarray, np.ndarray, np.ndarray, Values]:
+def _open_edges(
+    chain: Chain, whole: Completion
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Values]:
     """The chain's edges out of markings that are not yet complete but still can be."""
     going = (~whole.goal & (whole.h > 0))[chain.source]
     return chain.source[going], chain.target[going], chain.label[going], chain.amount[going]

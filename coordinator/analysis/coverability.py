@@ -1,10 +1,12 @@
-"""Boundedness of nets whose markings have no end: the Karp-Miller tree, compared with ancestors only.
+"""Boundedness of nets whose markings have no end: the Karp-Miller tree, compared with ancestors
+only.
 
-A new marking that is larger than one of its own ancestors gets omega where it is larger. Comparing with markings of other
-branches would call bounded nets unbounded (p0 -> p1 and p0 -> 2 p1 with one token in p0: p1 holds at most 2). Inhibitors
-make omega unsound, so inhibited places with a proven bound are complemented away first, and without a bound the answer is
-unknown. Capacities are bounds and are complemented in the same way. Priorities only remove behaviour: bounds found
-without them hold, an unbounded place found without them may yet be bounded.
+A new marking that is larger than one of its own ancestors gets omega where it is larger. Comparing
+with markings of other branches would call bounded nets unbounded (p0 -> p1 and p0 -> 2 p1 with one
+token in p0: p1 holds at most 2). Inhibitors make omega unsound, so inhibited places with a proven
+bound are complemented away first, and without a bound the answer is unknown. Capacities are bounds
+and are complemented in the same way. Priorities only remove behaviour: bounds found without them
+hold, an unbounded place found without them may yet be bounded.
 
 Source: R. M. Karp, R. E. Miller, Parallel program schemata, J. Comput. Syst. Sci. 3 (1969).
 """
@@ -15,25 +17,27 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from coordinator.analysis.pack import effect, thresholds
-from coordinator.analysis.structure import place_bounds
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.pack import effect, thresholds
+from petrobot.coordinator.analysis.structure import place_bounds
+from petrobot.coordinator.net import Marking, Net
 
 OMEGA = -1
 """Stands for arbitrarily many tokens in a marking of the tree."""
 EFFORT = 20_000
 """Nodes of the tree at most."""
 COMPARISONS = 100
-"""Comparisons with ancestors at most, for each node that the effort allows: long chains of ancestors end the tree sooner."""
+"""Comparisons with ancestors at most, for each node that the effort allows: long chains of
+ancestors end the tree sooner."""
 
 
 @dataclass(frozen=True, slots=True)
 class Coverability:
     """How many tokens each place can hold, as far as it could be settled.
 
-    `bounded` None means unknown; `reason` says why. `bounds[p]` is exact for a net without priorities and a complete tree,
-    None for an unbounded (or unsettled) place. For a witness of unboundedness: firing `pump` after `prefix` can be
-    repeated for ever and leaves more tokens in the places `grows` each time.
+    `bounded` None means unknown; `reason` says why. `bounds[p]` is exact for a net without
+    priorities and a complete tree, None for an unbounded (or unsettled) place. For a witness of
+    unboundedness: firing `pump` after `prefix` can be repeated for ever and leaves more tokens in
+    the places `grows` each time.
     """
 
     bounded: bool | None
@@ -47,22 +51,35 @@ class Coverability:
     never: tuple[str, ...] = ()
     """Transitions that a complete tree never fires: they are dead, priorities or not."""
     exact: bool = False
-    """Whether every transition that is not in `never` can fire: the tree is complete and the net has no priorities."""
+    """Whether every transition that is not in `never` can fire: the tree is complete and the net
+    has no priorities."""
 
 
-def settle_bounds(net: Net, bounds: Sequence[int | None] | None = None, *, effort: int = EFFORT) -> Coverability:
-    """The complete tree where the effort suffices, else the first place that can grow without end."""
+def settle_bounds(
+    net: Net, bounds: Sequence[int | None] | None = None, *, effort: int = EFFORT
+) -> Coverability:
+    """The complete tree where the effort suffices, else the first place that can grow without
+    end."""
     whole = coverability(net, effort=effort, bounds=bounds)
-    return whole if whole.complete else coverability(net, effort=effort, bounds=bounds, first_omega=True)
+    return (
+        whole
+        if whole.complete
+        else coverability(net, effort=effort, bounds=bounds, first_omega=True)
+    )
 
 
 def coverability(
-    net: Net, *, effort: int = EFFORT, bounds: Sequence[int | None] | None = None, first_omega: bool = False
+    net: Net,
+    *,
+    effort: int = EFFORT,
+    bounds: Sequence[int | None] | None = None,
+    first_omega: bool = False,
 ) -> Coverability:
     """The bounds of all places by the coverability tree.
 
-    `bounds` are proven bounds of places (by default those of the P-invariants), needed where places are inhibited. With
-    `first_omega` the search ends with the first unbounded place (then only `bounded` is settled, not each bound).
+    `bounds` are proven bounds of places (by default those of the P-invariants), needed where places
+    are inhibited. With `first_omega` the search ends with the first unbounded place (then only
+    `bounded` is settled, not each bound).
     """
     proven = list(bounds) if bounds is not None else place_bounds(net)
     limits = [thresholds(net, t) for t in range(len(net.transitions))]
@@ -71,11 +88,15 @@ def coverability(
     if unproven:
         names = ", ".join(net.places[p] for p in unproven)
         unknown = tuple(b if n not in unproven else None for n, b in enumerate(proven))
-        return Coverability(None, unknown, f"no bound is known for the inhibited place {names}", 0, False)
+        return Coverability(
+            None, unknown, f"no bound is known for the inhibited place {names}", 0, False
+        )
     plain = _complemented(net, limits, proven)
     tree = _Tree(plain, len(net.places))
     if not tree.grow(effort, first_omega):
-        return Coverability(None, tuple(proven), f"effort of {effort} nodes", len(tree.nodes), False)
+        return Coverability(
+            None, tuple(proven), f"effort of {effort} nodes", len(tree.nodes), False
+        )
     return _verdict(net, tree, first_omega)
 
 
@@ -84,17 +105,30 @@ def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
     prefix, pump, grows = tree.witness(net)
     unbounded, ranked = tree.omega is not None, len(set(net.priority)) > 1
     complete = not (unbounded and first_omega)
-    never = tuple(name for t, name in enumerate(net.transitions) if t not in tree.fired) if complete else ()
+    never = (
+        tuple(name for t, name in enumerate(net.transitions) if t not in tree.fired)
+        if complete
+        else ()
+    )
     if unbounded and ranked:
         reason = "unbounded without its priorities; with them it may be bounded"
-        return Coverability(None, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never)
-    reason = f"{', '.join(grows)} can grow without end" if unbounded else "no marking covers one of its ancestors"
+        return Coverability(
+            None, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never
+        )
+    reason = (
+        f"{', '.join(grows)} can grow without end"
+        if unbounded
+        else "no marking covers one of its ancestors"
+    )
     exact = complete and not ranked
-    return Coverability(not unbounded, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact)
+    return Coverability(
+        not unbounded, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact
+    )
 
 
 def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[int | None]) -> Net:
-    """The net with every inhibitor and capacity told by a complement place that holds the bound minus the tokens."""
+    """The net with every inhibitor and capacity told by a complement place that holds the bound
+    minus the tokens."""
     places = sorted({p for below in limits for p in below})
     names = [*net.places, *(f"not {net.places[p]}" for p in places)]
     number = {p: len(net.places) + i for i, p in enumerate(places)}
@@ -136,8 +170,9 @@ class _Node:
 class _Tree:
     """The Karp-Miller tree, breadth first, so that chains of ancestors stay short.
 
-    A marking that any node has already expanded is not expanded again: the same marking roots the same subtree, so leaving
-    it out loses no bound; omega itself is only ever introduced by comparison with ancestors.
+    A marking that any node has already expanded is not expanded again: the same marking roots the
+    same subtree, so leaving it out loses no bound; omega itself is only ever introduced by
+    comparison with ancestors.
     """
 
     def __init__(self, net: Net, real: int) -> None:
@@ -183,12 +218,16 @@ class _Tree:
         while up >= 0:
             older = self.nodes[up].marking
             self.compared += 1
-            if older != covered and all(_at_least(a, b) for a, b in zip(covered, older, strict=True)):
+            if older != covered and all(
+                _at_least(a, b) for a, b in zip(covered, older, strict=True)
+            ):
                 wider = tuple(OMEGA if a != b else a for a, b in zip(covered, older, strict=True))
                 if wider != covered:
                     if node.ancestor < 0:
                         node.ancestor = up
-                        node.grown = tuple(p for p, (a, b) in enumerate(zip(covered, older, strict=True)) if a != b)
+                        node.grown = tuple(
+                            p for p, (a, b) in enumerate(zip(covered, older, strict=True)) if a != b
+                        )
                     covered = wider
             up = self.nodes[up].parent
         node.marking = covered

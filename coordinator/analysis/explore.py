@@ -1,4 +1,5 @@
-"""What the exploration engines share: the state of a search that any of them can continue, and their interface."""
+"""What the exploration engines share: the state of a search that any of them can continue, and
+their interface."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.pack import Layout, TooManyTokens, Words
-from coordinator.net import Net
+from petrobot.coordinator.analysis.pack import Layout, TooManyTokens, Words
+from petrobot.coordinator.net import Net
 
 Numbers = NDArray[np.int32]
 Labels = NDArray[Any]
@@ -18,7 +19,8 @@ Labels = NDArray[Any]
 
 @dataclass(frozen=True)
 class Explored:
-    """A breadth-first search so far: markings found, of which the first `len(row) - 1` are expanded."""
+    """A breadth-first search so far: markings found, of which the first `len(row) - 1` are
+    expanded."""
 
     net: Net
     layout: Layout
@@ -35,7 +37,9 @@ class Explored:
         """Only the initial marking, not yet expanded."""
         words = layout.split_many([layout.pack(net.initial)])
         label = np.zeros(0, dtype=np.int16 if len(net.transitions) < 1 << 15 else np.int32)
-        return cls(net, layout, keep_edges, words, np.zeros(1, np.int64), np.zeros(0, np.int32), label)
+        return cls(
+            net, layout, keep_edges, words, np.zeros(1, np.int64), np.zeros(0, np.int32), label
+        )
 
     def relaid(self, layout: Layout) -> Explored:
         """The same search in another layout."""
@@ -44,7 +48,8 @@ class Explored:
 
 
 class Engine(Protocol):
-    """Expands markings in order. After an interruption at any point `explored()` still gives a consistent search."""
+    """Expands markings in order. After an interruption at any point `explored()` still gives a
+    consistent search."""
 
     @property
     def states(self) -> int:
@@ -61,7 +66,8 @@ class Engine(Protocol):
     def expand(self, cap: int | None) -> bool:
         """Expand some more markings; False when none is left.
 
-        Stops right after the marking whose successors bring the number of states to `cap` or beyond.
+        Stops right after the marking whose successors bring the number of states to `cap` or
+        beyond.
         """
 
     def explored(self) -> Explored:
@@ -69,10 +75,12 @@ class Engine(Protocol):
 
 
 def widened_layout(layout: Layout, places: list[int]) -> Layout:
-    """The layout to go on with after these places overflowed. Raises TooManyTokens when words end."""
+    """The layout to go on with after these places overflowed. Raises TooManyTokens when words
+    end."""
     wider = layout.widened(places)
     if wider == layout:
         raise TooManyTokens(
-            "a place holds more tokens than a 64-bit word can count: the net is almost surely unbounded"
+            "a place holds more tokens than a 64-bit word can count: the net is almost "
+            "surely unbounded"
         )
     return wider

@@ -1,4 +1,5 @@
-"""Exploration with plain integers: no set-up, the fastest engine below about ten thousand markings."""
+"""Exploration with plain integers: no set-up, the fastest engine below about ten thousand
+markings."""
 
 from __future__ import annotations
 
@@ -6,23 +7,28 @@ from array import array
 
 import numpy as np
 
-from coordinator.analysis.explore import Explored, widened_layout
-from coordinator.analysis.pack import Layout, Rules, Test, dependents
+from petrobot.coordinator.analysis.explore import Explored, widened_layout
+from petrobot.coordinator.analysis.pack import Layout, Rules, Test, dependents
 
 BLOCK = 512
 """Markings expanded between two looks at the limits."""
 STATE_BYTES = 250
-"""Bytes of one marking here: integer, dictionary entry, list entries and its list of enabled transitions."""
+"""Bytes of one marking here: integer, dictionary entry, list entries and its list of enabled
+transitions."""
 
 
 class IntegerEngine:
-    """Markings as integers in a dictionary; a new marking tests only the transitions that the last firing touched."""
+    """Markings as integers in a dictionary; a new marking tests only the transitions that the last
+    firing touched."""
 
     def __init__(self, begun: Explored) -> None:
         """Go on from a search begun in any engine."""
         self._net, self._keep = begun.net, begun.keep_edges
         self._dependents = dependents(begun.net)
-        self._unaffected = [frozenset(range(len(begun.net.transitions))) - frozenset(deps) for deps in self._dependents]
+        self._unaffected = [
+            frozenset(range(len(begun.net.transitions))) - frozenset(deps)
+            for deps in self._dependents
+        ]
         self._prioritised = len(set(begun.net.priority)) > 1
         self._row = array("q", begun.row.tolist())
         self._target = array("i", begun.target.tolist())
@@ -72,8 +78,14 @@ class IntegerEngine:
         return self.expanded < self._committed
 
     def _expand_one(self, i: int) -> int:
-        """Expand marking i and commit it; gives the offending successor instead if a field overflowed."""
-        order, index, guards, delta = self._order, self._index, self._layout.guards, self._rules.delta
+        """Expand marking i and commit it; gives the offending successor instead if a field
+        overflowed."""
+        order, index, guards, delta = (
+            self._order,
+            self._index,
+            self._layout.guards,
+            self._rules.delta,
+        )
         packed, able = order[i], self._enabled(i)
         targets = []
         for t in self._top(able) if self._prioritised else able:
@@ -120,7 +132,9 @@ class IntegerEngine:
         sub, guard, want = self._sub, self._guard, self._want
         passing = [t for t in candidates if (guarded - sub[t]) & guard[t] == want[t]]
         if self._second:
-            return [t for t in passing if t not in self._second or _passes(self._second[t], guarded)]
+            return [
+                t for t in passing if t not in self._second or _passes(self._second[t], guarded)
+            ]
         return passing
 
     def _top(self, able: list[int]) -> list[int]:

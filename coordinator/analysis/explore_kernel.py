@@ -7,15 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.pack import Rules, Words
-from services.comm.compiled import kernel
+from petrobot.coordinator.analysis.pack import Rules, Words
+from petrobot.services.comm.compiled import kernel
 
 DONE, FULL, CROWDED, OVERFLOWN, CAPPED = 0, 1, 2, 3, 4
-"""Why the loop came back: block expanded, edge buffer full, keys or table crowded, a field overflowed, cap reached."""
+"""Why the loop came back: block expanded, edge buffer full, keys or table crowded, a field
+overflowed, cap reached."""
 
 
 class Kernel(NamedTuple):
-    """The compiled rules as plain arrays: the tests of transition t are first[t] <= k < first[t + 1]."""
+    """The compiled rules as plain arrays: the tests of transition t are first[t] <= k < first[t +
+    1]."""
 
     able: NDArray[np.int64]
     priority: NDArray[np.int64]
@@ -106,9 +108,11 @@ def expand_block(
     target: NDArray[np.int32],
     label: Any,
 ) -> tuple[int, int, int, int]:
-    """Expand markings up to number `stop`; gives (why it came back, expanded, states, edges written).
+    """Expand markings up to number `stop`; gives (why it came back, expanded, states, edges
+    written).
 
-    `row[i]` gets the number of edges of the i-th marking of the block. After OVERFLOWN row `states` is what did not fit.
+    `row[i]` gets the number of edges of the i-th marking of the block. After OVERFLOWN row `states`
+    is what did not fit.
     """
     able, priority, first, word, sub, guard, want, delta, guards = kernel
     out = np.empty(len(able) + 1, dtype=np.int64)
@@ -120,7 +124,9 @@ def expand_block(
             return CAPPED, expanded, states, edges
         if edges > room or states > most:
             return FULL if edges > room else CROWDED, expanded, states, edges
-        count = enabled_into(keys[expanded], able, priority, first, word, sub, guard, want, guards, out)
+        count = enabled_into(
+            keys[expanded], able, priority, first, word, sub, guard, want, guards, out
+        )
         before = states
         for j in range(count):
             t, spilt, hashed = out[j], np.uint64(0), np.uint64(0)
@@ -133,7 +139,8 @@ def expand_block(
             if spilt != 0:
                 keys[before] = keys[states]
                 return OVERFLOWN, expanded, before, edges
-            # Found or added here and not by a helper: a compiled call would count references of its arrays each time.
+            # Found or added here and not by a helper: a compiled call would count references of its
+            # arrays each time.
             slot = np.int64((hashed * factors[words] >> np.uint64(20)) & mask)
             number = np.int64(table[slot])
             while number >= 0:

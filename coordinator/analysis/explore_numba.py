@@ -1,13 +1,21 @@
-"""Exploration by the compiled kernel (numba is an extra, never required): for spaces of many millions of markings."""
+"""Exploration by the compiled kernel (numba is an extra, never required): for spaces of many
+millions of markings."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from coordinator.analysis.explore import Explored, Labels, Numbers, widened_layout
-from coordinator.analysis.explore_kernel import CAPPED, CROWDED, OVERFLOWN, Kernel, enter_all, expand_block
-from coordinator.analysis.explore_numpy import EMPTY, MULTIPLIERS, joined
-from coordinator.analysis.pack import Layout, Rules, Words
+from petrobot.coordinator.analysis.explore import Explored, Labels, Numbers, widened_layout
+from petrobot.coordinator.analysis.explore_kernel import (
+    CAPPED,
+    CROWDED,
+    OVERFLOWN,
+    Kernel,
+    enter_all,
+    expand_block,
+)
+from petrobot.coordinator.analysis.explore_numpy import EMPTY, MULTIPLIERS, joined
+from petrobot.coordinator.analysis.pack import Layout, Rules, Words
 
 BLOCK = 1 << 16
 """Markings expanded between two looks at the limits."""
@@ -16,12 +24,17 @@ BUFFER = 1 << 20
 
 
 class NumbaEngine:
-    """Markings as rows of 64-bit words in an open hash table, expanded one by one by compiled code."""
+    """Markings as rows of 64-bit words in an open hash table, expanded one by one by compiled
+    code."""
 
     def __init__(self, begun: Explored) -> None:
         """Go on from a search begun in any engine."""
         self._net, self._keep = begun.net, begun.keep_edges
-        self._states, self._expanded, self._edges = len(begun.words), len(begun.row) - 1, int(begun.row[-1])
+        self._states, self._expanded, self._edges = (
+            len(begun.words),
+            len(begun.row) - 1,
+            int(begun.row[-1]),
+        )
         self._rows = [begun.row]
         self._targets: list[Numbers] = [begun.target]
         self._labels: list[Labels] = [begun.label]

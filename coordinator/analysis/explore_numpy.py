@@ -1,7 +1,9 @@
-"""Exploration with numpy alone: blocks of markings against every transition at once, and a vectorised hash table.
+"""Exploration with numpy alone: blocks of markings against every transition at once, and a
+vectorised hash table.
 
-The table maps a hash slot to the number of a marking; keys are compared in full, so the search is exact. The hash is
-linear in the words before it is mixed, h(M + d) = h(M) + h(d), so a successor's hash costs one addition.
+The table maps a hash slot to the number of a marking; keys are compared in full, so the search is
+exact. The hash is linear in the words before it is mixed, h(M + d) = h(M) + h(d), so a successor's
+hash costs one addition.
 """
 
 from __future__ import annotations
@@ -11,15 +13,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.explore import Explored, Labels, Numbers, widened_layout
-from coordinator.analysis.pack import Layout, Rules, Words
+from petrobot.coordinator.analysis.explore import Explored, Labels, Numbers, widened_layout
+from petrobot.coordinator.analysis.pack import Layout, Rules, Words
 
 SUCCESSORS = 1 << 17
 """Successors wanted in a block: enough to drown the interpreter, few enough for the cache."""
 TESTS = 1 << 22
 """Marking x transition pairs tested at most in a block."""
 EMPTY = -1
-MULTIPLIERS = np.random.Generator(np.random.PCG64(0x9E3779B97F4A7C15)).integers(1, 1 << 63, 4096, np.uint64) * 2 + 1
+MULTIPLIERS = (
+    np.random.Generator(np.random.PCG64(0x9E3779B97F4A7C15)).integers(1, 1 << 63, 4096, np.uint64)
+    * 2
+    + 1
+)
 MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -68,7 +74,9 @@ class NumpyEngine:
         """Expand a block of markings; False when none is left."""
         if self._expanded == self._states or (cap is not None and self._states >= cap):
             return self._expanded < self._states
-        block = max(1, min(int(SUCCESSORS / self._degree), TESTS // max(1, len(self._net.transitions))))
+        block = max(
+            1, min(int(SUCCESSORS / self._degree), TESTS // max(1, len(self._net.transitions)))
+        )
         if cap is not None:
             block = max(1, min(block, 2 * (cap - self._states)))
         stop = min(self._states, self._expanded + block)
@@ -114,14 +122,26 @@ class NumpyEngine:
         np.take(self._keys[self._expanded :], source, axis=0, out=fresh, mode="clip")
         for w in range(self._layout.words):
             fresh[:, w] += delta[:, w].take(label)
-        spilt = np.bitwise_or.reduce(fresh, axis=0) & self._layout.guard_words if m else np.zeros(1, np.uint64)
-        return self._layout.overflown(self._layout.join_many(spilt[None, :])[0]) if spilt.any() else []
+        spilt = (
+            np.bitwise_or.reduce(fresh, axis=0) & self._layout.guard_words
+            if m
+            else np.zeros(1, np.uint64)
+        )
+        return (
+            self._layout.overflown(self._layout.join_many(spilt[None, :])[0]) if spilt.any() else []
+        )
 
     def _intern(self, source: NDArray[np.int64], label: NDArray[np.int64]) -> Numbers:
-        """Numbers of the successors written behind the known markings; new ones are moved together and counted in."""
+        """Numbers of the successors written behind the known markings; new ones are moved together
+        and counted in."""
         n, m = self._states, len(source)
-        base = _hash(self._keys[self._expanded : self._expanded + (int(source[-1]) + 1 if m else 0)], self._factors)
-        number, new, slot = self._probe(self._slot(base.take(source) + self._delta_hash.take(label)))
+        base = _hash(
+            self._keys[self._expanded : self._expanded + (int(source[-1]) + 1 if m else 0)],
+            self._factors,
+        )
+        number, new, slot = self._probe(
+            self._slot(base.take(source) + self._delta_hash.take(label))
+        )
         order = np.argsort(new)
         rank = np.zeros(m, dtype=np.int32)
         rank[new[order]] = np.arange(n, n + len(new), dtype=np.int32)
@@ -132,11 +152,15 @@ class NumpyEngine:
         self._states = n + len(new)
         return number
 
-    def _probe(self, slot: NDArray[np.int64]) -> tuple[Numbers, NDArray[np.int64], NDArray[np.int64]]:
-        """Find or claim a slot for each successor: its number, then which successors are new, and their slots.
+    def _probe(
+        self, slot: NDArray[np.int64]
+    ) -> tuple[Numbers, NDArray[np.int64], NDArray[np.int64]]:
+        """Find or claim a slot for each successor: its number, then which successors are new, and
+        their slots.
 
-        Successor k counts as marking n + k until it is known whether it is new. Of several that want one empty slot the
-        first gets it; equal ones see the same slots in the same rounds, so the first of them becomes the new marking.
+        Successor k counts as marking n + k until it is known whether it is new. Of several that
+        want one empty slot the first gets it; equal ones see the same slots in the same rounds, so
+        the first of them becomes the new marking.
         """
         number = self._table.take(slot)
         new, taken = [], []
@@ -167,7 +191,12 @@ class NumpyEngine:
         return differ
 
     def _commit(
-        self, stop: int, source: NDArray[np.int64], label: NDArray[np.int64], target: Numbers, cap: int | None
+        self,
+        stop: int,
+        source: NDArray[np.int64],
+        label: NDArray[np.int64],
+        target: Numbers,
+        cap: int | None,
     ) -> None:
         """Take the block in, up to the marking whose successors reach the cap."""
         if cap is not None and self._states >= cap and len(target):
@@ -186,7 +215,9 @@ class NumpyEngine:
         self._rows.append(row)
         self._held += row.nbytes + (6 * len(target) if self._keep else 0)
         self._edges += len(source)
-        self._degree = max(1.0, 0.5 * self._degree + 0.5 * len(source) / max(1, stop - self._expanded))
+        self._degree = max(
+            1.0, 0.5 * self._degree + 0.5 * len(source) / max(1, stop - self._expanded)
+        )
         self._expanded = stop
 
     def _slot(self, hashed: Words) -> NDArray[np.int64]:
@@ -197,7 +228,9 @@ class NumpyEngine:
         """Room for that many further rows, and a table at most half full."""
         wanted = self._states + more
         if wanted > len(self._keys):
-            keys = np.empty((max(wanted, int(1.5 * len(self._keys))), self._layout.words), dtype=np.uint64)
+            keys = np.empty(
+                (max(wanted, int(1.5 * len(self._keys))), self._layout.words), dtype=np.uint64
+            )
             keys[: self._states] = self._keys[: self._states]
             self._keys = keys
         if 2 * wanted > len(self._table):
@@ -205,7 +238,9 @@ class NumpyEngine:
 
     def _grow(self, wanted: int) -> None:
         """A new table for at least that many markings, with all known ones entered."""
-        self._table = np.full(1 << max(12, (4 * wanted - 1).bit_length() - 1), EMPTY, dtype=np.int32)
+        self._table = np.full(
+            1 << max(12, (4 * wanted - 1).bit_length() - 1), EMPTY, dtype=np.int32
+        )
         mask = len(self._table) - 1
         for start in range(0, self._states, SUCCESSORS):
             waiting = np.arange(start, min(start + SUCCESSORS, self._states), dtype=np.int32)
@@ -226,7 +261,8 @@ class NumpyEngine:
 
 
 def joined(parts: list[NDArray[Any]], length: int) -> NDArray[Any]:
-    """The parts one after the other, cut to a length; they are given up on the way, so memory is needed about once."""
+    """The parts one after the other, cut to a length; they are given up on the way, so memory is
+    needed about once."""
     whole = np.empty(length, dtype=parts[0].dtype)
     at = 0
     parts.reverse()

@@ -1,8 +1,10 @@
-"""The forecast of a task from its stochastic view: three reliabilities, time, firings, and what is worth improving.
+"""The forecast of a task from its stochastic view: three reliabilities, time, firings, and what is
+worth improving.
 
-R_conj: the task is completed and every run ended with SUCCESS. R_goal: expected met goals for each run token. P_complete: `final`
-is reached at all. Long-run numbers are those of mission runs back to back (renewal reward): expected firings, or time-weighted
-tokens, of one mission run over its mean length.
+R_conj: the task is completed and every run ended with SUCCESS. R_goal: expected met goals for each
+run token. P_complete: `final` is reached at all. Long-run numbers are those of mission runs back to
+back (renewal reward): expected firings, or time-weighted tokens, of one mission run over its mean
+length.
 """
 
 from __future__ import annotations
@@ -14,26 +16,31 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.analysis.completion import Completion, Law, completion, law
-from coordinator.analysis.graph import Mask, sum_by
-from coordinator.analysis.gspn import Chain, Values
-from coordinator.analysis.linear import Plan, solve
-from coordinator.analysis.markov import visits_before
-from coordinator.analysis.ordinary import OrdinaryView
-from coordinator.analysis.sensitivity import Slope, reliability_slopes, slopes_of, time_slopes
-from coordinator.analysis.space import Limits
-from coordinator.analysis.stochastic import StochasticView
-from coordinator.net import Marking
-from coordinator.task import Counts, End, Status
+from petrobot.coordinator.analysis.completion import Completion, Law, completion, law
+from petrobot.coordinator.analysis.graph import Mask, sum_by
+from petrobot.coordinator.analysis.gspn import Chain, Values
+from petrobot.coordinator.analysis.linear import Plan, solve
+from petrobot.coordinator.analysis.markov import visits_before
+from petrobot.coordinator.analysis.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.sensitivity import (
+    Slope,
+    reliability_slopes,
+    slopes_of,
+    time_slopes,
+)
+from petrobot.coordinator.analysis.space import Limits
+from petrobot.coordinator.analysis.stochastic import StochasticView
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import Counts, End, Status
 
 
 @dataclass(frozen=True, slots=True)
 class Worth:
     """What improving one action of a place would bring; the derivatives are exact.
 
-    `time_share`: per cent of mean mission time saved per per cent of its durations (the bottleneck has the largest).
-    `completion_gain`, `goal_gain`: change of P_complete and of the expected met goals for each unit of probability moved
-    from ERROR to SUCCESS (0 where it never ends in ERROR).
+    `time_share`: per cent of mean mission time saved per per cent of its durations (the bottleneck
+    has the largest). `completion_gain`, `goal_gain`: change of P_complete and of the expected met
+    goals for each unit of probability moved from ERROR to SUCCESS (0 where it never ends in ERROR).
     """
 
     place: str
@@ -78,7 +85,9 @@ class Forecast:
     def _time(self) -> Values:
         """Expected time spent in each marking in one mission run (s)."""
         visits = visits_before(self.chain, self.transient)
-        return np.where(self.transient, visits * np.where(self.transient, self.chain.sojourn, 0.0), 0.0)
+        return np.where(
+            self.transient, visits * np.where(self.transient, self.chain.sojourn, 0.0), 0.0
+        )
 
     @cached_property
     def throughput(self) -> dict[str, float]:
@@ -94,7 +103,8 @@ class Forecast:
 
     @cached_property
     def goal_reliability(self) -> float | None:
-        """R_goal: expected met goals for each run token; None if the task names no goal transitions or runs place."""
+        """R_goal: expected met goals for each run token; None if the task names no goal transitions
+        or runs place."""
         task = self.view.task
         if not task.goal_transitions or not task.runs_place:
             return None
@@ -113,25 +123,34 @@ class Forecast:
 
     @property
     def _spoiling(self) -> list[int]:
-        """Transitions of the GSPN by which a run ends other than with SUCCESS; one that was preempted before has not ended so."""
+        """Transitions of the GSPN by which a run ends other than with SUCCESS; one that was
+        preempted before has not ended so."""
         net, flat = self.chain.gspn.net, self.view.task.flat
         index = net.transition_index
         bad = {Counts.FAILURE, Counts.ERROR}
         lost = {
-            t.name for t in flat.transitions.values() if any(a.counts in bad for a in t.inputs if a.end is End.PREEMPT)
+            t.name
+            for t in flat.transitions.values()
+            if any(a.counts in bad for a in t.inputs if a.end is End.PREEMPT)
         }
         ends = {
             net.place_index[f"{place}.{status}"]
             for place, _, status in self.view.statuses.values()
             if status is not Status.SUCCESS
         }
-        spoilt = [t for t in range(len(net.transitions)) if any(p in ends for p, _ in net.produce[t])]
+        spoilt = [
+            t for t in range(len(net.transitions)) if any(p in ends for p, _ in net.produce[t])
+        ]
         return spoilt + [index[case] for case, name in self.view.origin.items() if name in lost]
 
     @cached_property
     def worth(self) -> tuple[Worth, ...]:
         """What is worth improving, the largest share of time first."""
-        time, complete, goals = time_slopes(self.done), reliability_slopes(self.done), self._goal_slopes()
+        time, complete, goals = (
+            time_slopes(self.done),
+            reliability_slopes(self.done),
+            self._goal_slopes(),
+        )
         actions = dict.fromkeys((place, action) for place, action, _ in self.view.statuses.values())
         by_place: dict[str, list[tuple[str, str]]] = {}
         for key in actions:
@@ -141,7 +160,11 @@ class Forecast:
             whole = -sum(time[name].elasticity for name in self._phases(place))
             share = self._use(keys)
             for key in keys:
-                found.append(Worth(*key, whole * share[key], self._move(key, complete), self._move(key, goals)))
+                found.append(
+                    Worth(
+                        *key, whole * share[key], self._move(key, complete), self._move(key, goals)
+                    )
+                )
         return tuple(sorted(found, key=lambda w: -w.time_share))
 
     def _phases(self, place: str) -> list[str]:
@@ -156,7 +179,8 @@ class Forecast:
         ]
 
     def _use(self, keys: list[tuple[str, str]]) -> dict[tuple[str, str], float]:
-        """Share of a place's runs that each action takes (actions with equal laws share their phases)."""
+        """Share of a place's runs that each action takes (actions with equal laws share their
+        phases)."""
         count = sum_by(self.chain.label, self.flow, len(self.chain.gspn.net.transitions))
         index = self.chain.gspn.net.transition_index
         runs = {key: float(count[index[f"{key[0]}.{key[1]}"]]) for key in keys}
@@ -167,9 +191,17 @@ class Forecast:
         """Derivative for probability moved from ERROR to SUCCESS of one action of a place."""
 
         def gain(status: Status) -> float | None:
-            names = [n for n, (place, action, s) in self.view.statuses.items() if (place, action, s) == (*key, status)]
+            names = [
+                n
+                for n, (place, action, s) in self.view.statuses.items()
+                if (place, action, s) == (*key, status)
+            ]
             weight = sum(slopes[n].value for n in names)
-            return sum(slopes[n].derivative * slopes[n].value for n in names) / weight if weight else None
+            return (
+                sum(slopes[n].derivative * slopes[n].value for n in names) / weight
+                if weight
+                else None
+            )
 
         better, worse = gain(Status.SUCCESS), gain(Status.ERROR)
         return better - worse if better is not None and worse is not None else 0.0
@@ -177,7 +209,9 @@ class Forecast:
     def _goal_slopes(self) -> dict[str, Slope]:
         """Derivatives of the expected number of met goals."""
         chain, goals = self.chain, set(self.view.task.goal_transitions)
-        hits = np.array([self.view.origin.get(name) in goals for name in chain.gspn.net.transitions])[chain.label]
+        hits = np.array(
+            [self.view.origin.get(name) in goals for name in chain.gspn.net.transitions]
+        )[chain.label]
         inside = self.transient[chain.source]
         value = np.where(inside & self.transient[chain.target], chain.probability, 0.0)
         gain = sum_by(chain.source, np.where(inside & hits, chain.probability, 0.0), chain.n)
@@ -190,7 +224,10 @@ class Forecast:
     def recovery_time(self) -> float:
         """The longest mean time back to the nominal flow over all markings that lead there (s)."""
         ordinary = OrdinaryView(self.view.task)
-        nominal = self.chain.space.where(lambda m: ordinary.is_nominal(self.view.projected(m))) & ~self.chain.vanishing
+        nominal = (
+            self.chain.space.where(lambda m: ordinary.is_nominal(self.view.projected(m)))
+            & ~self.chain.vanishing
+        )
         back = completion(self.chain, nominal)
         able = (back.h > 0) & ~nominal
         return float(np.max(back.y[able] / back.h[able], initial=0.0))
@@ -224,7 +261,8 @@ class Forecast:
 
 
 def forecast(view: StochasticView, *, limits: Limits | None = None) -> Forecast:
-    """Solve a stochastic view. Raises ValueError if its space is not complete within the limits (simulate instead)."""
+    """Solve a stochastic view. Raises ValueError if its space is not complete within the limits
+    (simulate instead)."""
     chain = Chain.of(view.gspn, limits=limits)
     ordinary = OrdinaryView(view.task)
     known: dict[Marking, bool] = {}
@@ -238,4 +276,6 @@ def forecast(view: StochasticView, *, limits: Limits | None = None) -> Forecast:
     goal = chain.space.where(final) & ~chain.vanishing
     transient = ~chain.graph.bottom[chain.graph.components] & ~goal
     visits = np.where(transient, visits_before(chain, transient), 0.0)
-    return Forecast(view, chain, completion(chain, goal), transient, visits[chain.source] * chain.probability)
+    return Forecast(
+        view, chain, completion(chain, goal), transient, visits[chain.source] * chain.probability
+    )

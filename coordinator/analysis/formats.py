@@ -1,15 +1,16 @@
-"""Net files by their endings: read any known one, write any that can be written, list what gets lost on the way."""
+"""Net files by their endings: read any known one, write any that can be written, list what gets
+lost on the way."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
-from coordinator.analysis import dot, pnml_writing, storm, tina
-from coordinator.analysis.greatspn import parse_pnpro
-from coordinator.analysis.gspn import Chain
-from coordinator.analysis.netfile import FormatError, NetFile
-from coordinator.analysis.pnml_reading import parse_pnml
+from petrobot.coordinator.analysis import dot, pnml_writing, storm, tina
+from petrobot.coordinator.analysis.greatspn import parse_pnpro
+from petrobot.coordinator.analysis.gspn import Chain
+from petrobot.coordinator.analysis.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.pnml_reading import parse_pnml
 
 READ: dict[str, Callable[[bytes, str], NetFile]] = {
     ".pnml": parse_pnml,
@@ -26,11 +27,15 @@ def read_net(path: Path) -> NetFile:
     """The net in a file. Raises FormatError, also for a file that cannot be opened."""
     reader = READ.get(path.suffix.lower())
     if reader is None:
-        raise FormatError(str(path), "file", f"{path.suffix or 'no'} ending", f"known are {', '.join(READ)}")
+        raise FormatError(
+            str(path), "file", f"{path.suffix or 'no'} ending", f"known are {', '.join(READ)}"
+        )
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise FormatError(str(path), "file", error.strerror or str(error), "give a readable file") from error
+        raise FormatError(
+            str(path), "file", error.strerror or str(error), "give a readable file"
+        ) from error
     return reader(text, str(path))
 
 
@@ -42,7 +47,8 @@ def _utf8(text: bytes, file: str) -> str:
 
 
 def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
-    """(text of the net in the format of the target's ending, what that format does not keep). Raises FormatError."""
+    """(text of the net in the format of the target's ending, what that format does not keep).
+    Raises FormatError."""
     match target.suffix.lower():
         case ".pnml":
             return pnml_writing.write_pnml(model), pnml_writing.losses(model)
@@ -52,7 +58,13 @@ def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
             return dot.write_dot(model), ["a drawing: priorities, capacities and rates"]
         case ".drn":
             if model.gspn is None:
-                raise FormatError(str(target), "rates", "the net has none", "give rates: a CTMC needs them")
-            return storm.write_drn(Chain.of(model.gspn)), ["the net itself: only its chain is written"]
+                raise FormatError(
+                    str(target), "rates", "the net has none", "give rates: a CTMC needs them"
+                )
+            return storm.write_drn(Chain.of(model.gspn)), [
+                "the net itself: only its chain is written"
+            ]
     ending = f"the ending {target.suffix}" if target.suffix else "a file without ending"
-    raise FormatError(str(target), "file", f"no writer for {ending}", f"end its name in {', '.join(WRITE)}")
+    raise FormatError(
+        str(target), "file", f"no writer for {ending}", f"end its name in {', '.join(WRITE)}"
+    )

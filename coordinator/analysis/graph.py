@@ -1,6 +1,8 @@
-"""Directed graphs in compact arrays: reachability, strong components, bottom components, almost sure attraction.
+"""Directed graphs in compact arrays: reachability, strong components, bottom components, almost
+sure attraction.
 
-Used on reachability graphs; knows nothing of nets. Small graphs need no scipy, so that a quick check starts quickly.
+Used on reachability graphs; knows nothing of nets. Small graphs need no scipy, so that a quick
+check starts quickly.
 """
 
 from __future__ import annotations
@@ -40,15 +42,22 @@ class Graph:
         return np.searchsorted(self.target[order], np.arange(self.n + 1)).astype(np.int64), order
 
     def forward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
-        """Vertices that can be reached from the seeds (seeds included) along the given edges (all by default)."""
+        """Vertices that can be reached from the seeds (seeds included) along the given edges (all
+        by default)."""
         return self._spread(seeds, edges, self.row, None, self.target)
 
     def backward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
-        """Vertices from which a seed can be reached (seeds included) along the given edges (all by default)."""
+        """Vertices from which a seed can be reached (seeds included) along the given edges (all by
+        default)."""
         return self._spread(seeds, edges, *self.into, self.source)
 
     def _spread(
-        self, seeds: Mask | Sequence[int], edges: Mask | None, row: Index, order: Index | None, far: NDArray[np.int32]
+        self,
+        seeds: Mask | Sequence[int],
+        edges: Mask | None,
+        row: Index,
+        order: Index | None,
+        far: NDArray[np.int32],
     ) -> Mask:
         reached = np.zeros(self.n, dtype=np.bool_)
         reached[seeds] = True
@@ -64,7 +73,8 @@ class Graph:
         return reached
 
     def path(self, start: int, goals: Mask, edges: Mask | None = None) -> list[int] | None:
-        """Edges of a shortest path from a vertex to any goal along the given edges; None if there is none."""
+        """Edges of a shortest path from a vertex to any goal along the given edges; None if there
+        is none."""
         came = np.full(self.n, -2, dtype=np.int64)
         came[start] = -1
         front = np.array([start])
@@ -85,7 +95,8 @@ class Graph:
 
     @cached_property
     def components(self) -> NDArray[np.int32]:
-        """Number of the strong component of each vertex, shape (n,); numbers from 0, in no order to rely on."""
+        """Number of the strong component of each vertex, shape (n,); numbers from 0, in no order to
+        rely on."""
         if len(self.target) + self.n <= SMALL:
             return _tarjan(self.n, self.row.tolist(), self.target.tolist())
         from scipy.sparse import csr_array
@@ -93,7 +104,9 @@ class Graph:
 
         ones = np.ones(len(self.target), dtype=np.int8)
         matrix = csr_array((ones, self.target, self.row), shape=(self.n, self.n))
-        labels: NDArray[np.int32] = connected_components(matrix, directed=True, connection="strong")[1]
+        labels: NDArray[np.int32] = connected_components(
+            matrix, directed=True, connection="strong"
+        )[1]
         return labels
 
     @cached_property
@@ -110,12 +123,16 @@ class Graph:
         inside: Mask = self.components[self.source] == self.components[self.target]
         return inside
 
-    def almost_sure(self, goal: Mask, free: Mask, *, allowed: Mask | None = None, hits: Mask | None = None) -> Mask:
-        """Vertices from which a strategy reaches `goal`, or takes an edge of `hits`, with probability 1.
+    def almost_sure(
+        self, goal: Mask, free: Mask, *, allowed: Mask | None = None, hits: Mask | None = None
+    ) -> Mask:
+        """Vertices from which a strategy reaches `goal`, or takes an edge of `hits`, with
+        probability 1.
 
-        The strategy may leave out any edge that is `free`; every other edge has positive probability whenever its source
-        is visited (fairness). Before the goal only `allowed` vertices may be visited. The largest set that no other edge
-        leaves and inside which the goal stays reachable (greatest fixed point, as for Markov decision processes).
+        The strategy may leave out any edge that is `free`; every other edge has positive
+        probability whenever its source is visited (fairness). Before the goal only `allowed`
+        vertices may be visited. The largest set that no other edge leaves and inside which the goal
+        stays reachable (greatest fixed point, as for Markov decision processes).
         """
         hits = np.zeros(len(self.target), dtype=np.bool_) if hits is None else hits
         winning = goal.copy() if allowed is None else goal | allowed

@@ -1,12 +1,14 @@
 """Generalized stochastic Petri nets and the Markov chain behind them.
 
-A GSPN is a net whose transitions are timed (exponential, rate 1/s, one, k or unlimited servers) or immediate (weight, and
-the net's priorities; every immediate one ranks above every timed one). Source: M. Ajmone Marsan, G. Balbo, G. Conte et al.,
-Modelling with Generalized Stochastic Petri Nets, Wiley 1995.
+A GSPN is a net whose transitions are timed (exponential, rate 1/s, one, k or unlimited servers) or
+immediate (weight, and the net's priorities; every immediate one ranks above every timed one).
+Source: M. Ajmone Marsan, G. Balbo, G. Conte et al., Modelling with Generalized Stochastic Petri
+Nets, Wiley 1995.
 
-The chain is kept in its extended form, vanishing markings included with sojourn time 0: each edge e of marking i carries an
-amount r_e (rate times servers at work, or weight) and is taken with probability r_e / sum of the marking's amounts. So
-steady states, completion times and derivatives need no elimination, and flows through immediate transitions come for free.
+The chain is kept in its extended form, vanishing markings included with sojourn time 0: each edge e
+of marking i carries an amount r_e (rate times servers at work, or weight) and is taken with
+probability r_e / sum of the marking's amounts. So steady states, completion times and derivatives
+need no elimination, and flows through immediate transitions come for free.
 """
 
 from __future__ import annotations
@@ -18,9 +20,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.graph import Graph, Index, Mask, sum_by
-from coordinator.analysis.space import Limits, Space, explore
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.graph import Graph, Index, Mask, sum_by
+from petrobot.coordinator.analysis.space import Limits, Space, explore
+from petrobot.coordinator.net import Marking, Net
 
 Values = NDArray[np.float64]
 
@@ -33,9 +35,10 @@ class TimelessTrap(ValueError):  # noqa: N818 - names what was found in the net
 class Gspn:
     """A net with a rate or a weight for each transition.
 
-    `rate[t]` (1/s) is None for an immediate transition, whose `weight[t]` counts among those enabled with it. `servers[t]`
-    is how many firings of a timed transition go on at once: 1, k, or None for as many as are enabled. Timed transitions
-    have priority 0 and immediate ones at least 1 in `net`.
+    `rate[t]` (1/s) is None for an immediate transition, whose `weight[t]` counts among those
+    enabled with it. `servers[t]` is how many firings of a timed transition go on at once: 1, k, or
+    None for as many as are enabled. Timed transitions have priority 0 and immediate ones at least 1
+    in `net`.
     """
 
     net: Net
@@ -55,10 +58,16 @@ class Gspn:
             if rate is None and not 0 < weight < float("inf"):
                 raise ValueError(f"{name} has the weight {weight}; a weight is positive and finite")
             if (rate is None) != (self.net.priority[t] > 0):
-                raise ValueError(f"{name}: timed transitions have priority 0, immediate ones 1 or more")
+                raise ValueError(
+                    f"{name}: timed transitions have priority 0, immediate ones 1 or more"
+                )
             servers = self.servers[t]
-            if (servers is None and not self.net.consume[t]) or (servers is not None and servers < 1):
-                raise ValueError(f"{name}: servers are 1 or more, and unlimited only where a token is consumed")
+            if (servers is None and not self.net.consume[t]) or (
+                servers is not None and servers < 1
+            ):
+                raise ValueError(
+                    f"{name}: servers are 1 or more, and unlimited only where a token is consumed"
+                )
 
     @classmethod
     def of(
@@ -69,17 +78,24 @@ class Gspn:
         weights: Mapping[str, float] | None = None,
         servers: Mapping[str, int | None] | None = None,
     ) -> Gspn:
-        """Name the timed transitions with their rates; all others are immediate (weight 1, and above the timed ones).
+        """Name the timed transitions with their rates; all others are immediate (weight 1, and
+        above the timed ones).
 
-        The net's own priorities order the immediate transitions; they are raised together if the lowest is below 1.
+        The net's own priorities order the immediate transitions; they are raised together if the
+        lowest is below 1.
         """
         for given in (rates, weights or {}, servers or {}):
             unknown = [name for name in given if name not in net.transition_index]
             if unknown:
                 raise ValueError(f"{unknown[0]!r} is no transition of the net")
-        immediate = [own for t, own in zip(net.transitions, net.priority, strict=True) if t not in rates]
+        immediate = [
+            own for t, own in zip(net.transitions, net.priority, strict=True) if t not in rates
+        ]
         lift = max(0, 1 - min(immediate, default=1))
-        priority = tuple(0 if t in rates else own + lift for t, own in zip(net.transitions, net.priority, strict=True))
+        priority = tuple(
+            0 if t in rates else own + lift
+            for t, own in zip(net.transitions, net.priority, strict=True)
+        )
         return cls(
             replace(net, priority=priority),
             tuple(float(rates[t]) if t in rates else None for t in net.transitions),
@@ -87,8 +103,11 @@ class Gspn:
             tuple((servers or {}).get(t, 1) for t in net.transitions),
         )
 
-    def changed(self, rates: Mapping[str, float] | None = None, weights: Mapping[str, float] | None = None) -> Gspn:
-        """What if: the same GSPN with some rates (of timed) and weights (of immediate transitions) replaced."""
+    def changed(
+        self, rates: Mapping[str, float] | None = None, weights: Mapping[str, float] | None = None
+    ) -> Gspn:
+        """What if: the same GSPN with some rates (of timed) and weights (of immediate transitions)
+        replaced."""
         rate, weight = list(self.rate), list(self.weight)
         for name, value in (rates or {}).items():
             t = self.net.transition_index[name]
@@ -120,10 +139,11 @@ class Gspn:
 
 @dataclass(frozen=True)
 class Chain:
-    """The extended Markov chain of a GSPN over its reachable markings (vanishing ones included), from marking 0.
+    """The extended Markov chain of a GSPN over its reachable markings (vanishing ones included),
+    from marking 0.
 
-    Edges are sorted by source. `amount[e]` is a rate (1/s) where the source is tangible and a weight where it vanishes.
-    Absorbing markings have no edges.
+    Edges are sorted by source. `amount[e]` is a rate (1/s) where the source is tangible and a
+    weight where it vanishes. Absorbing markings have no edges.
     """
 
     gspn: Gspn
@@ -149,7 +169,10 @@ class Chain:
         """
         space = space or explore(gspn.net, limits=limits)
         if not space.complete:
-            raise ValueError(f"a Markov chain needs all markings; the search stopped: {space.reason}; simulate instead")
+            raise ValueError(
+                f"a Markov chain needs all markings; the search stopped: {space.reason}; "
+                "simulate instead"
+            )
         label = space.label.astype(np.int64)
         timed = np.array([r is not None for r in gspn.rate], dtype=np.bool_)
         vanishing = np.zeros(len(space), dtype=np.bool_)
@@ -159,9 +182,19 @@ class Chain:
             ends = space.where(absorbing)
             kept = ~ends[space.source]
             vanishing &= ~ends
-        base = np.array([r if r is not None else w for r, w in zip(gspn.rate, gspn.weight, strict=True)])
+        base = np.array(
+            [r if r is not None else w for r, w in zip(gspn.rate, gspn.weight, strict=True)]
+        )
         amount = base[label] * _degrees(gspn, space, label)
-        chain = cls(gspn, space, space.source[kept], space.target[kept], label[kept], amount[kept], vanishing)
+        chain = cls(
+            gspn,
+            space,
+            space.source[kept],
+            space.target[kept],
+            label[kept],
+            amount[kept],
+            vanishing,
+        )
         chain._refuse_traps()
         return chain
 
@@ -174,7 +207,8 @@ class Chain:
             names = sorted({self.gspn.net.transitions[t] for t in self.label[trapped[self.source]]})
             where = self.gspn.net.describe(self.space.marking(first))
             raise TimelessTrap(
-                f"time never passes again from {where}: {', '.join(names)} fire for ever; give one a rate"
+                f"time never passes again from {where}: {', '.join(names)} fire for ever; "
+                "give one a rate"
             )
 
     @property
@@ -200,7 +234,8 @@ class Chain:
 
     @cached_property
     def sojourn(self) -> Values:
-        """Mean time in each marking (s): 0 where it vanishes, infinite where it absorbs, shape (n,)."""
+        """Mean time in each marking (s): 0 where it vanishes, infinite where it absorbs, shape
+        (n,)."""
         out = np.full(self.n, np.inf)
         tangible = self.total > 0
         out[tangible] = 1.0 / self.total[tangible]

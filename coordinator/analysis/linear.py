@@ -1,9 +1,11 @@
-"""Linear systems of Markov chains: x = b + A x in the order of strong components, and stationary vectors.
+"""Linear systems of Markov chains: x = b + A x in the order of strong components, and stationary
+vectors.
 
-A is given by its edges: x_i = b_i + sum over edges e of i of a_e x_(target of e). Most robot tasks use runs up, so their
-graphs are long chains of small components: these are solved level by level, each component by itself (dense where small,
-Gauss-Seidel with a triangular factor where large). Stationary vectors: Grassmann-Taksar-Heyman elimination, which subtracts
-nothing and so loses no digits (W. K. Grassmann, M. I. Taksar, D. P. Heyman, Oper. Res. 33, 1985), or Gauss-Seidel.
+A is given by its edges: x_i = b_i + sum over edges e of i of a_e x_(target of e). Most robot tasks
+use runs up, so their graphs are long chains of small components: these are solved level by level,
+each component by itself (dense where small, Gauss-Seidel with a triangular factor where large).
+Stationary vectors: Grassmann-Taksar-Heyman elimination, which subtracts nothing and so loses no
+digits (W. K. Grassmann, M. I. Taksar, D. P. Heyman, Oper. Res. 33, 1985), or Gauss-Seidel.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.analysis.graph import Graph, Index, Mask, ranges, sum_by
-from coordinator.analysis.gspn import Values
+from petrobot.coordinator.analysis.graph import Graph, Index, Mask, ranges, sum_by
+from petrobot.coordinator.analysis.gspn import Values
 
 DENSE = 600
 """Vertices up to which a component is solved by dense elimination."""
@@ -28,15 +30,18 @@ class NotConverged(ArithmeticError):  # noqa: N818 - a fact about an iteration
 
 @dataclass(frozen=True)
 class Plan:
-    """The order in which the components of a graph are solved: successors first. Built once, used for many sides."""
+    """The order in which the components of a graph are solved: successors first. Built once, used
+    for many sides."""
 
     graph: Graph
     waves: tuple[tuple[Index, tuple[Index, ...]], ...]
-    """Each wave: vertices that are components of their own, and the larger components, as vertex numbers."""
+    """Each wave: vertices that are components of their own, and the larger components, as vertex
+    numbers."""
 
     @classmethod
     def of(cls, graph: Graph, inside: Mask | None = None) -> Plan:
-        """The plan for the vertices marked `inside` (all by default); others count as known zeros."""
+        """The plan for the vertices marked `inside` (all by default); others count as known
+        zeros."""
         keep = np.ones(graph.n, dtype=np.bool_) if inside is None else inside
         component = graph.components
         ours, theirs = component[graph.source], component[graph.target]
@@ -70,7 +75,9 @@ def _waves(outer: Graph) -> Index:
     return wave
 
 
-def _split(members: Index, component: Any, wave: Index, loops: Mask) -> list[tuple[Index, tuple[Index, ...]]]:
+def _split(
+    members: Index, component: Any, wave: Index, loops: Mask
+) -> list[tuple[Index, tuple[Index, ...]]]:
     """Members, sorted by wave and component, as waves of single vertices and larger components."""
     waves = []
     for part in np.split(members, np.flatnonzero(np.diff(wave[component[members]])) + 1):
@@ -78,13 +85,16 @@ def _split(members: Index, component: Any, wave: Index, loops: Mask) -> list[tup
             continue
         looping = loops[component[part]]
         larger = part[looping]
-        groups = np.split(larger, np.flatnonzero(np.diff(component[larger])) + 1) if len(larger) else []
+        groups = (
+            np.split(larger, np.flatnonzero(np.diff(component[larger])) + 1) if len(larger) else []
+        )
         waves.append((part[~looping], tuple(groups)))
     return waves
 
 
 def solve(plan: Plan, value: Values, b: Values) -> Values:
-    """x = b + A x with A given by `value` on the plan's edges; b and x have shape (n,) or (n, k)."""
+    """x = b + A x with A given by `value` on the plan's edges; b and x have shape (n,) or (n,
+    k)."""
     graph = plan.graph
     x = np.zeros_like(b, dtype=np.float64)
     for single, groups in plan.waves:
@@ -107,7 +117,8 @@ def _gather(graph: Graph, value: Values, x: Values, vertices: Index) -> Values:
 
 
 def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index) -> None:
-    """Solve one component; what it leads to is known already and the component itself still stands at zero."""
+    """Solve one component; what it leads to is known already and the component itself still stands
+    at zero."""
     x[group] = 0.0
     right = b[group] + _gather(graph, value, x, group)
     edges = ranges(graph.row[group], graph.row[group + 1])
@@ -124,21 +135,26 @@ def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index
 
 
 def triangular(n: int, rows: Index, columns: Index, value: Values) -> tuple[Any, Any]:
-    """(solver of I - upper part, lower part) of a sparse matrix: one backward Gauss-Seidel sweep."""
+    """(solver of I - upper part, lower part) of a sparse matrix: one backward Gauss-Seidel
+    sweep."""
     from scipy.sparse import csc_array, csr_array, eye_array
     from scipy.sparse.linalg import splu
 
     early = columns >= rows
     upper = csc_array((value[early], (rows[early], columns[early])), shape=(n, n))
     lower = csr_array((value[~early], (rows[~early], columns[~early])), shape=(n, n))
-    factor = splu(csc_array(eye_array(n, format="csc") - upper), permc_spec="NATURAL", diag_pivot_thresh=0.0)
+    factor = splu(
+        csc_array(eye_array(n, format="csc") - upper), permc_spec="NATURAL", diag_pivot_thresh=0.0
+    )
     return factor, lower
 
 
 def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) -> Values:
-    """x = right + A x by backward Gauss-Seidel: successors mostly have higher numbers, so news travels in one sweep.
+    """x = right + A x by backward Gauss-Seidel: successors mostly have higher numbers, so news
+    travels in one sweep.
 
-    Where that is slow, the part of the error that is nearly constant over blocks of neighbours is solved for now and then.
+    Where that is slow, the part of the error that is nearly constant over blocks of neighbours is
+    solved for now and then.
     """
     factor, lower = triangular(n, rows, columns, value)
     coarse, x = Coarse(n, rows, columns), factor.solve(right)
@@ -151,14 +167,17 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
         if coarse.is_due(k):
             inverse = coarse.inverse(value) if inverse is None else inverse
             x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)
-    raise NotConverged(f"Gauss-Seidel still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps")
+    raise NotConverged(
+        f"Gauss-Seidel still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps"
+    )
 
 
 def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
     """The probability vector nu = nu P of an irreducible stochastic matrix given by its entries.
 
-    Gauss-Seidel, with aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F. McAllister, W. J. Stewart,
-    Iterative methods for computing stationary distributions, SIAM J. Alg. Disc. Meth. 5, 1984).
+    Gauss-Seidel, with aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F.
+    McAllister, W. J. Stewart, Iterative methods for computing stationary distributions, SIAM J.
+    Alg. Disc. Meth. 5, 1984).
     """
     if n == 1:
         return np.ones(1)
@@ -178,11 +197,15 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
         if coarse.is_due(k):
             x = x * coarse.scale(value, x)
             x /= x.sum()
-    raise NotConverged(f"the stationary vector still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps")
+    raise NotConverged(
+        f"the stationary vector still moved by {np.max(np.abs(x - before)):.2e} after "
+        f"{SWEEPS} sweeps"
+    )
 
 
 class Coarse:
-    """Vertices in blocks of consecutive numbers, neighbours in breadth-first order, for systems that converge slowly."""
+    """Vertices in blocks of consecutive numbers, neighbours in breadth-first order, for systems
+    that converge slowly."""
 
     PATIENCE, EVERY, BLOCKS = 60, 5, 128
 
@@ -200,19 +223,26 @@ class Coarse:
         return sum_by(self.pair, weights, self.count**2).reshape(self.count, self.count)
 
     def scale(self, value: Values, x: Values) -> Values:
-        """By how much each vertex' block is off, up to a common factor, for a stationary vector: the chain of the blocks
+        """By how much each vertex' block is off, up to a common factor, for a stationary vector:
+        the chain of the blocks
 
-        has the probabilities flow(I, J) / sum of x over I, so its stationary vector over these sums is that of the flows.
+        has the probabilities flow(I, J) / sum of x over I, so its stationary vector over these sums
+        is that of the flows.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             factor = gth(self._matrix(value * x[self.rows]))
         # A block whose probability underflows has no flow to judge by: then the sweeps go on alone.
-        return np.asarray(factor[self.block]) if np.isfinite(factor).all() and factor.min() > 0 else np.ones(len(x))
+        return (
+            np.asarray(factor[self.block])
+            if np.isfinite(factor).all() and factor.min() > 0
+            else np.ones(len(x))
+        )
 
     def inverse(self, value: Values, pinned: bool = False) -> Values:
         """The inverse of I - A seen from the blocks, for `correction`.
 
-        `pinned` for a stochastic A: the first block keeps its values, since a solution is then free up to a constant.
+        `pinned` for a stochastic A: the first block keeps its values, since a solution is then free
+        up to a constant.
         """
         size, first = np.bincount(self.block, minlength=self.count), int(pinned)
         matrix = np.diag(size.astype(float)) - self._matrix(value)
@@ -221,12 +251,14 @@ class Coarse:
         return out
 
     def correction(self, inverse: Values, left: Values) -> Values:
-        """What to add to a solution of x = right + A x whose residual is `left`: constant over each block."""
+        """What to add to a solution of x = right + A x whose residual is `left`: constant over each
+        block."""
         return np.asarray((inverse @ sum_by(self.block, left, self.count))[self.block])
 
 
 def gth(matrix: Values) -> Values:
-    """The stationary vector of an irreducible stochastic matrix or generator, shape (n, n), without a subtraction."""
+    """The stationary vector of an irreducible stochastic matrix or generator, shape (n, n), without
+    a subtraction."""
     work = matrix.copy()
     n = len(work)
     for k in range(n - 1, 0, -1):

@@ -1,7 +1,9 @@
-"""The long run of a GSPN: stationary probabilities, throughput, mean tokens, utilisation, bottleneck; and the transient.
+"""The long run of a GSPN: stationary probabilities, throughput, mean tokens, utilisation,
+bottleneck; and the transient.
 
-Each number comes with the residual of the equation that it solves. From the initial marking the long run is the mixture of
-the bottom components' stationary vectors, weighted by the probabilities of ending up in each.
+Each number comes with the residual of the equation that it solves. From the initial marking the
+long run is the mixture of the bottom components' stationary vectors, weighted by the probabilities
+of ending up in each.
 """
 
 from __future__ import annotations
@@ -14,17 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.analysis.graph import Graph, Index, sum_by
-from coordinator.analysis.gspn import Chain, Values
-from coordinator.analysis.linear import Plan, solve, stationary
+from petrobot.coordinator.analysis.graph import Graph, Index, sum_by
+from petrobot.coordinator.analysis.gspn import Chain, Values
+from petrobot.coordinator.analysis.linear import Plan, solve, stationary
 
 
 @dataclass(frozen=True)
 class LongRun:
     """Stationary behaviour from the initial marking.
 
-    `probability[i]` is the share of time in marking i (0 where it vanishes), `flow[e]` how often edge e is taken (1/s) and
-    `residual` the largest imbalance of flow into and out of a marking (1/s).
+    `probability[i]` is the share of time in marking i (0 where it vanishes), `flow[e]` how often
+    edge e is taken (1/s) and `residual` the largest imbalance of flow into and out of a marking
+    (1/s).
     """
 
     chain: Chain
@@ -43,30 +46,44 @@ class LongRun:
     def mean_tokens(self) -> dict[str, float]:
         """Time average of the tokens of each place."""
         space = self.chain.space
-        return {name: float(self.probability @ space.tokens(p)) for p, name in enumerate(space.net.places)}
+        return {
+            name: float(self.probability @ space.tokens(p))
+            for p, name in enumerate(space.net.places)
+        }
 
     @cached_property
     def occupancy(self) -> dict[str, float]:
-        """Share of time in which each place is marked: the utilisation of a resource is 1 minus that of its free place."""
+        """Share of time in which each place is marked: the utilisation of a resource is 1 minus
+        that of its free place."""
         space = self.chain.space
-        return {name: float(self.probability @ (space.tokens(p) > 0)) for p, name in enumerate(space.net.places)}
+        return {
+            name: float(self.probability @ (space.tokens(p) > 0))
+            for p, name in enumerate(space.net.places)
+        }
 
     @cached_property
     def utilisation(self) -> dict[str, float]:
-        """Mean number of servers at work of each timed transition (its load; below 1 with a single server)."""
+        """Mean number of servers at work of each timed transition (its load; below 1 with a single
+        server)."""
         rates = self.chain.gspn.rate
         return {
-            name: self.throughput[name] / r for name, r in zip(self.throughput, rates, strict=True) if r is not None
+            name: self.throughput[name] / r
+            for name, r in zip(self.throughput, rates, strict=True)
+            if r is not None
         }
 
-    def reward(self, state: Values | None = None, impulse: Mapping[str, float] | None = None) -> float:
-        """Mean reward per second: `state[i]` per second in marking i, plus so much at each firing of a transition."""
+    def reward(
+        self, state: Values | None = None, impulse: Mapping[str, float] | None = None
+    ) -> float:
+        """Mean reward per second: `state[i]` per second in marking i, plus so much at each firing
+        of a transition."""
         total = float(self.probability @ state) if state is not None else 0.0
         return total + sum(gain * self.throughput[name] for name, gain in (impulse or {}).items())
 
 
 def long_run(chain: Chain) -> LongRun:
-    """Stationary behaviour. An absorbing (dead) marking that is reached counts as a place to stay for ever."""
+    """Stationary behaviour. An absorbing (dead) marking that is reached counts as a place to stay
+    for ever."""
     graph = chain.graph
     visits = np.zeros(chain.n)
     time = np.zeros(chain.n)
@@ -90,7 +107,12 @@ def _embedded(chain: Chain, members: Index) -> Values:
     number = np.full(chain.n, -1, dtype=np.int64)
     number[members] = np.arange(len(members))
     edges = np.flatnonzero(number[chain.source] >= 0)
-    return stationary(len(members), number[chain.source[edges]], number[chain.target[edges]], chain.probability[edges])
+    return stationary(
+        len(members),
+        number[chain.source[edges]],
+        number[chain.target[edges]],
+        chain.probability[edges],
+    )
 
 
 def _absorption(chain: Chain) -> dict[int, float]:
@@ -110,7 +132,8 @@ def _absorption(chain: Chain) -> dict[int, float]:
 
 
 def visits_before(chain: Chain, transient: Any, start: Values | None = None) -> Values:
-    """Expected visits to each transient marking (adjoint solve): v = start + v A, by default from the initial marking."""
+    """Expected visits to each transient marking (adjoint solve): v = start + v A, by default from
+    the initial marking."""
     order = np.argsort(chain.target, kind="stable")
     backward = Graph(chain.n, chain.target[order], chain.source[order])
     begin = np.zeros(chain.n)
@@ -133,7 +156,8 @@ class Generator:
 
     @classmethod
     def of(cls, chain: Chain) -> Generator:
-        """Eliminate the vanishing markings: flows through them are followed level by level, cycles solved for."""
+        """Eliminate the vanishing markings: flows through them are followed level by level, cycles
+        solved for."""
         from scipy.sparse import csr_array, eye_array
 
         tangible = chain.tangible
@@ -145,7 +169,9 @@ class Generator:
         start = (jump.T @ start)[tangible] if chain.vanishing[0] else start[tangible]
         timed = np.flatnonzero(~chain.vanishing[chain.source])
         shape = (len(tangible), chain.n)
-        rates = csr_array((chain.amount[timed], (number[chain.source[timed]], chain.target[timed])), shape=shape)
+        rates = csr_array(
+            (chain.amount[timed], (number[chain.source[timed]], chain.target[timed])), shape=shape
+        )
         flows = rates[:, tangible] if not chain.vanishing.any() else (rates @ jump)[:, tangible]
         total = np.where(chain.vanishing, 0.0, chain.total)[tangible]
         fastest = float(total.max(initial=0.0)) or 1.0
@@ -156,18 +182,29 @@ class Generator:
 
 
 def _jumps(chain: Chain) -> Any:
-    """Probability of entering each tangible marking next, from each marking (identity for tangible ones), sparse (n, n)."""
+    """Probability of entering each tangible marking next, from each marking (identity for tangible
+    ones), sparse (n, n)."""
     from scipy.sparse import csr_array, eye_array
 
     eye = csr_array(eye_array(chain.n, format="csr"))
     if not chain.vanishing.any():
         return eye
     edges = np.flatnonzero(chain.vanishing[chain.source])
-    step = csr_array((chain.probability[edges], (chain.source[edges], chain.target[edges])), shape=(chain.n, chain.n))
+    step = csr_array(
+        (chain.probability[edges], (chain.source[edges], chain.target[edges])),
+        shape=(chain.n, chain.n),
+    )
     step = _without_cycles(chain, step)
-    keep = csr_array((np.where(chain.vanishing, 0.0, 1.0), (np.arange(chain.n),) * 2), shape=(chain.n, chain.n))
+    keep = csr_array(
+        (np.where(chain.vanishing, 0.0, 1.0), (np.arange(chain.n),) * 2), shape=(chain.n, chain.n)
+    )
     keep.eliminate_zeros()
-    out, front = keep, csr_array((chain.vanishing.astype(float), (np.arange(chain.n),) * 2), shape=(chain.n, chain.n))
+    out, front = (
+        keep,
+        csr_array(
+            (chain.vanishing.astype(float), (np.arange(chain.n),) * 2), shape=(chain.n, chain.n)
+        ),
+    )
     front.eliminate_zeros()
     while front.nnz:
         front = front @ step
@@ -179,7 +216,8 @@ def _jumps(chain: Chain) -> Any:
 
 
 def _without_cycles(chain: Chain, step: Any) -> Any:
-    """The steps out of vanishing markings with every cycle among them replaced by its exits (LU of each component)."""
+    """The steps out of vanishing markings with every cycle among them replaced by its exits (LU of
+    each component)."""
     from scipy.sparse import csr_array
 
     inner = np.flatnonzero(chain.vanishing[chain.source] & chain.vanishing[chain.target])
@@ -201,7 +239,8 @@ def _without_cycles(chain: Chain, step: Any) -> Any:
 
 
 def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
-    """(first k, probabilities from there on) of a Poisson law, with less than epsilon left out on both sides."""
+    """(first k, probabilities from there on) of a Poisson law, with less than epsilon left out on
+    both sides."""
     if mean == 0:
         return 0, np.ones(1)
     reach = ceil(sqrt(mean) * sqrt(-2 * log(epsilon)) + 10 - log(epsilon))
@@ -218,7 +257,8 @@ def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
 
 
 def transient(chain: Chain, times: list[float], *, generator: Generator | None = None) -> Values:
-    """Probabilities of the tangible markings at the given times (s), by uniformisation: shape (times, n); 0 if vanishing."""
+    """Probabilities of the tangible markings at the given times (s), by uniformisation: shape
+    (times, n); 0 if vanishing."""
     made = generator or Generator.of(chain)
     laws = [poisson_weights(made.rate * t) for t in times]
     out = np.zeros((len(times), chain.n))

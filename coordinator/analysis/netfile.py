@@ -1,7 +1,7 @@
 """What a foreign net file holds, and the one error that any reader or writer of such files raises.
 
-Nothing is lost in silence: what our nets cannot express is refused (FormatError) if it changes behaviour, and listed in
-`notes` if it does not.
+Nothing is lost in silence: what our nets cannot express is refused (FormatError) if it changes
+behaviour, and listed in `notes` if it does not.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from xml.etree.ElementTree import Element
 
-from coordinator.analysis.gspn import Gspn
-from coordinator.net import Net
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.net import Net
 
 
 class FormatError(ValueError):
-    """A file that cannot be read or a net that cannot be written: names the file, the element and the remedy."""
+    """A file that cannot be read or a net that cannot be written: names the file, the element and
+    the remedy."""
 
     def __init__(self, file: str, element: str, problem: str, remedy: str = "") -> None:
         """Compose the one-line message."""
@@ -26,7 +27,8 @@ class FormatError(ValueError):
 
 @dataclass(frozen=True)
 class NetFile:
-    """A net with everything else that its file says about it. Places and transitions are named by the file's own ids."""
+    """A net with everything else that its file says about it. Places and transitions are named by
+    the file's own ids."""
 
     net: Net
     name: str = ""
@@ -63,7 +65,9 @@ class NetDraft:
         """A place. Raises FormatError if the id is taken."""
         self._fresh(name)
         if tokens < 0:
-            raise FormatError(self.file, f"place {name}", f"{tokens} tokens", "a marking counts from 0")
+            raise FormatError(
+                self.file, f"place {name}", f"{tokens} tokens", "a marking counts from 0"
+            )
         self.places[name] = tokens
         if capacity is not None:
             self.capacity[name] = capacity
@@ -76,10 +80,15 @@ class NetDraft:
 
     def _fresh(self, name: str) -> None:
         if name in self.places or name in self.transitions:
-            raise FormatError(self.file, name, "this id stands there twice", "ids are unique in a file")
+            raise FormatError(
+                self.file, name, "this id stands there twice", "ids are unique in a file"
+            )
 
-    def arc(self, source: str, target: str, weight: int, what: str = "normal", element: str = "arc") -> None:
-        """An arc of kind normal, inhibitor or test. Several normal arcs between two nodes add up."""
+    def arc(
+        self, source: str, target: str, weight: int, what: str = "normal", element: str = "arc"
+    ) -> None:
+        """An arc of kind normal, inhibitor or test. Several normal arcs between two nodes add
+        up."""
         place, transition = (source, target) if source in self.places else (target, source)
         if place not in self.places or transition not in self.transitions:
             remedy = "an arc joins a place and a transition of the file"
@@ -89,7 +98,12 @@ class NetDraft:
         into = source == place
         if what == "inhibitor":
             if not into:
-                raise FormatError(self.file, element, "an inhibitor arc out of a transition", "it leads from a place")
+                raise FormatError(
+                    self.file,
+                    element,
+                    "an inhibitor arc out of a transition",
+                    "it leads from a place",
+                )
             known = self.inhibit[transition].get(place, weight)
             self.inhibit[transition][place] = min(known, weight)
         elif what == "test":
@@ -97,11 +111,14 @@ class NetDraft:
         else:
             table = (self.consume if into else self.produce)[transition]
             if place in table:
-                self.notes.append(f"{element}: parallel arcs between {source} and {target} are added up")
+                self.notes.append(
+                    f"{element}: parallel arcs between {source} and {target} are added up"
+                )
             table[place] = table.get(place, 0) + weight
 
     def _test(self, place: str, transition: str, weight: int) -> None:
-        """A test arc needs its tokens beside none that are consumed: take and give back what is missing."""
+        """A test arc needs its tokens beside none that are consumed: take and give back what is
+        missing."""
         missing = weight - self.consume[transition].get(place, 0)
         if missing > 0:
             for table in (self.consume[transition], self.produce[transition]):
@@ -158,9 +175,13 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
     raise TypeError(type(node).__name__)
 
 
-def whole_number(file: str, element: str, text: str, names: Mapping[str, float] | None = None) -> int:
+def whole_number(
+    file: str, element: str, text: str, names: Mapping[str, float] | None = None
+) -> int:
     """A whole number, also by an expression. Raises FormatError."""
     value = arithmetic(file, element, text, names or {})
     if value != int(value):
-        raise FormatError(file, element, f"{text!r} is no whole number", "tokens and weights are counted")
+        raise FormatError(
+            file, element, f"{text!r} is no whole number", "tokens and weights are counted"
+        )
     return int(value)

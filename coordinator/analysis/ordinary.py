@@ -1,8 +1,10 @@
-"""The ordinary view of a task: its net with the sets that the qualitative verdicts need, and the net closed by a refill.
+"""The ordinary view of a task: its net with the sets that the qualitative verdicts need, and the
+net closed by a refill.
 
-The net is `Task.net` (docs/semantics.md, section 8). A task ends, so liveness and properness are judged on the closed net:
-in exactly the final markings *refill* puts the initial marking back; in the markings of `final_error`, an honest end with
-something out of order, *repair* does so, which stands for a person who mends it and starts again.
+The net is `Task.net` (docs/semantics.md, section 8). A task ends, so liveness and properness are
+judged on the closed net: in exactly the final markings *refill* puts the initial marking back; in
+the markings of `final_error`, an honest end with something out of order, *repair* does so, which
+stands for a person who mends it and starts again.
 """
 
 from __future__ import annotations
@@ -13,11 +15,11 @@ from functools import cached_property
 
 import numpy as np
 
-from coordinator.analysis.robot import Roles
-from coordinator.analysis.space import Space
-from coordinator.conditions import Expression
-from coordinator.net import Arcs, Marking, Net
-from coordinator.task import End, Kind, Task
+from petrobot.coordinator.analysis.robot import Roles
+from petrobot.coordinator.analysis.space import Space
+from petrobot.coordinator.conditions import Expression
+from petrobot.coordinator.net import Arcs, Marking, Net
+from petrobot.coordinator.task import End, Kind, Task
 
 REFILL, REPAIR = "refill", "repair"
 CLOSINGS = 1_000
@@ -26,24 +28,30 @@ CLOSINGS = 1_000
 
 @dataclass(frozen=True)
 class OrdinaryView:
-    """A task as an ordinary net. With `operator`, control places that declare a capacity can be filled and emptied."""
+    """A task as an ordinary net. With `operator`, control places that declare a capacity can be
+    filled and emptied."""
 
     task: Task
     operator: bool = False
 
     @cached_property
     def net(self) -> Net:
-        """The ordinary net, with `put.PLACE` and `take.PLACE` for the operator's hand if asked for."""
+        """The ordinary net, with `put.PLACE` and `take.PLACE` for the operator's hand if asked
+        for."""
         net = self.task.net
         return _with_operator(net, self._open_to_operator) if self.operator else net
 
     @cached_property
     def _open_to_operator(self) -> tuple[int, ...]:
         places = self.task.flat.places.values()
-        return tuple(i for i, p in enumerate(places) if p.kind is Kind.CONTROL and p.capacity is not None)
+        return tuple(
+            i for i, p in enumerate(places) if p.kind is Kind.CONTROL and p.capacity is not None
+        )
 
     def _holds(self, predicate: Expression | None, marking: Marking) -> bool:
-        return predicate is not None and predicate.holds(dict(zip(self.task.net.places, marking, strict=False)))
+        return predicate is not None and predicate.holds(
+            dict(zip(self.task.net.places, marking, strict=False))
+        )
 
     def is_final(self, marking: Marking) -> bool:
         """Whether the task has ended as designed (further entries of the marking are ignored)."""
@@ -64,12 +72,14 @@ class OrdinaryView:
         return tuple(i for i, name in enumerate(self.task.net.places) if name in names)
 
     def is_nominal(self, marking: Marking) -> bool:
-        """G: no place of an error branch is marked. (No run is ever stopping here: the ordinary net has no such state.)"""
+        """G: no place of an error branch is marked. (No run is ever stopping here: the ordinary net
+        has no such state.)"""
         return not any(marking[p] for p in self.error_places)
 
     @cached_property
     def error_exits(self) -> frozenset[str]:
-        """Transitions that take a run which ended with ERROR, or that are said to begin an error branch."""
+        """Transitions that take a run which ended with ERROR, or that are said to begin an error
+        branch."""
         transitions = self.task.flat.transitions.values()
         return frozenset(t.name for t in transitions if any(a.end is End.ERROR for a in t.inputs))
 
@@ -78,14 +88,19 @@ class OrdinaryView:
         """By action place, the transitions that start a run there."""
         flat = self.task.flat
         return {
-            p.name: frozenset(t.name for t in flat.transitions.values() if any(o.place == p.name for o in t.outputs))
+            p.name: frozenset(
+                t.name
+                for t in flat.transitions.values()
+                if any(o.place == p.name for o in t.outputs)
+            )
             for p in flat.places.values()
             if p.kind is Kind.ACTION
         }
 
     @cached_property
     def controllable(self) -> frozenset[str]:
-        """T_c: transitions that begin runs from resources and control places alone, and the operator's hand."""
+        """T_c: transitions that begin runs from resources and control places alone, and the
+        operator's hand."""
         flat = self.task.flat
         starting = frozenset().union(*self.starts.values())
         kinds = {p.name: p.kind for p in flat.places.values()}
@@ -117,19 +132,25 @@ class OrdinaryView:
         )
 
     def closed(self, space: Space) -> Net:
-        """The net closed by refill and repair, from the complete space of the open one. Raises ValueError if it cannot be."""
+        """The net closed by refill and repair, from the complete space of the open one. Raises
+        ValueError if it cannot be."""
         if not space.complete:
-            raise ValueError(f"the closed net needs all final markings; the search stopped: {space.reason}")
+            raise ValueError(
+                f"the closed net needs all final markings; the search stopped: {space.reason}"
+            )
         ends = [
             (kind, space.marking(int(i)))
             for kind, predicate in ((REFILL, self.is_final), (REPAIR, self._only_final_error))
             for i in np.flatnonzero(space.where(predicate))
         ]
         if not ends:
-            raise ValueError("no final marking is reachable, so there is nothing to close the net from")
+            raise ValueError(
+                "no final marking is reachable, so there is nothing to close the net from"
+            )
         if len(ends) > CLOSINGS:
             raise ValueError(
-                f"{len(ends)} final markings are reachable; at most {CLOSINGS} can be closed: narrow `final`"
+                f"{len(ends)} final markings are reachable; at most {CLOSINGS} can be "
+                "closed: narrow `final`"
             )
         return closed_net(self.net, ends)
 
@@ -138,11 +159,16 @@ class OrdinaryView:
 
 
 def closed_net(net: Net, ends: list[tuple[str, Marking]]) -> Net:
-    """The net with one transition (a name and the exact marking it fires in) for each end, leading to the initial marking."""
+    """The net with one transition (a name and the exact marking it fires in) for each end, leading
+    to the initial marking."""
     names = list(_numbered([name for name, _ in ends], set(net.transitions)))
     start: Arcs = tuple((p, n) for p, n in enumerate(net.initial) if n)
     exact = [
-        (tuple((p, n) for p, n in enumerate(end) if n), tuple((p, n + 1) for p, n in enumerate(end))) for _, end in ends
+        (
+            tuple((p, n) for p, n in enumerate(end) if n),
+            tuple((p, n + 1) for p, n in enumerate(end)),
+        )
+        for _, end in ends
     ]
     return replace(
         net,

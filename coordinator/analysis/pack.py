@@ -1,10 +1,12 @@
-"""Markings packed into machine words: one field and one guard bit a place, so that a firing rule is a few mask tests.
+"""Markings packed into machine words: one field and one guard bit a place, so that a firing rule is
+a few mask tests.
 
-A field of `width` value bits holds the tokens of a place; the guard bit just above it is 0 in every stored marking. With
-all guards G set, `(M | G) - s` leaves the guard of place p set exactly when M(p) >= s(p), and no field borrows from the
-next one. So one subtraction tests all consumed weights (guards must stay) and all inhibitors (guards must go) of a
-transition. Capacities become inhibitors: M(p) + out - in <= c is M(p) < c - out + in + 1. A guard that is set after a
-firing is a token count that outgrew its field: the caller widens the field and goes on.
+A field of `width` value bits holds the tokens of a place; the guard bit just above it is 0 in every
+stored marking. With all guards G set, `(M | G) - s` leaves the guard of place p set exactly when
+M(p) >= s(p), and no field borrows from the next one. So one subtraction tests all consumed weights
+(guards must stay) and all inhibitors (guards must go) of a transition. Capacities become
+inhibitors: M(p) + out - in <= c is M(p) < c - out + in + 1. A guard that is set after a firing is a
+token count that outgrew its field: the caller widens the field and goes on.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.net import Marking, Net
+from petrobot.coordinator.net import Marking, Net
 
 WORD = 64
 WIDEST = WORD - 1
@@ -31,7 +33,8 @@ class TooManyTokens(ValueError):  # noqa: N818 - a fact about the net, named as 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the field of each place lies: `width` value bits from bit `shift` of word `word` on, the guard bit above."""
+    """Where the field of each place lies: `width` value bits from bit `shift` of word `word` on,
+    the guard bit above."""
 
     width: tuple[int, ...]
     word: tuple[int, ...]
@@ -40,11 +43,14 @@ class Layout:
 
     @classmethod
     def of_widths(cls, width: Sequence[int]) -> Layout:
-        """Fields in place order; one that does not fit in what is left of a word starts the next word."""
+        """Fields in place order; one that does not fit in what is left of a word starts the next
+        word."""
         word, shift, at, used = [], [], 0, 0
         for bits in width:
             if bits > WIDEST:
-                raise TooManyTokens(f"a place needs {bits} bits for its tokens; at most {WIDEST} can be counted")
+                raise TooManyTokens(
+                    f"a place needs {bits} bits for its tokens; at most {WIDEST} can be counted"
+                )
             if used + bits + 1 > WORD:
                 at, used = at + 1, 0
             word.append(at)
@@ -53,10 +59,14 @@ class Layout:
         return cls(tuple(width), tuple(word), tuple(shift), at + 1)
 
     @classmethod
-    def for_net(cls, net: Net, bounds: Sequence[int | None] | None = None, least: int = 1) -> Layout:
-        """A layout that holds the initial marking, the given bounds (None: unknown) and every single effect.
+    def for_net(
+        cls, net: Net, bounds: Sequence[int | None] | None = None, least: int = 1
+    ) -> Layout:
+        """A layout that holds the initial marking, the given bounds (None: unknown) and every
+        single effect.
 
-        `least` is the width given to a place without a bound. Bounds need not be right: an overflow is always noticed.
+        `least` is the width given to a place without a bound. Bounds need not be right: an overflow
+        is always noticed.
         """
         width = []
         for p, (start, effect) in enumerate(zip(net.initial, _largest_effect(net), strict=True)):
@@ -68,7 +78,9 @@ class Layout:
     def widened(self, places: Sequence[int]) -> Layout:
         """The layout with twice the value bits for each of the places."""
         grown = set(places)
-        return Layout.of_widths([min(2 * w, WIDEST) if p in grown else w for p, w in enumerate(self.width)])
+        return Layout.of_widths(
+            [min(2 * w, WIDEST) if p in grown else w for p, w in enumerate(self.width)]
+        )
 
     @cached_property
     def offsets(self) -> tuple[int, ...]:
@@ -78,7 +90,9 @@ class Layout:
     @cached_property
     def guards(self) -> int:
         """All guard bits, as one integer."""
-        return sum(1 << (offset + width) for offset, width in zip(self.offsets, self.width, strict=True))
+        return sum(
+            1 << (offset + width) for offset, width in zip(self.offsets, self.width, strict=True)
+        )
 
     @cached_property
     def guard_words(self) -> Words:
@@ -91,12 +105,16 @@ class Layout:
 
     def unpack(self, packed: int) -> Marking:
         """The marking behind one integer."""
-        return tuple((packed >> o) & ((1 << w) - 1) for o, w in zip(self.offsets, self.width, strict=True))
+        return tuple(
+            (packed >> o) & ((1 << w) - 1) for o, w in zip(self.offsets, self.width, strict=True)
+        )
 
     def split(self, packed: int) -> Words:
         """One integer (taken modulo 2**(64 * words)) as words, shape (words,), lowest first."""
         size = WORD // 8 * self.words
-        return np.frombuffer((packed % (1 << (8 * size))).to_bytes(size, "little"), dtype="<u8").astype(np.uint64)
+        return np.frombuffer(
+            (packed % (1 << (8 * size))).to_bytes(size, "little"), dtype="<u8"
+        ).astype(np.uint64)
 
     def split_many(self, packed: Sequence[int]) -> Words:
         """Integers as rows of words, shape (n, words)."""
@@ -112,7 +130,9 @@ class Layout:
     def tokens(self, words: Words, place: int) -> Tokens:
         """Tokens of one place in each marking; words has shape (n, words), the result (n,)."""
         mask = np.uint64((1 << self.width[place]) - 1)
-        return ((words[:, self.word[place]] >> np.uint64(self.shift[place])) & mask).astype(np.int64)
+        return ((words[:, self.word[place]] >> np.uint64(self.shift[place])) & mask).astype(
+            np.int64
+        )
 
     def unpack_many(self, words: Words) -> Tokens:
         """Markings of shape (n, places) behind rows of words of shape (n, words)."""
@@ -125,12 +145,18 @@ class Layout:
         """Rows of words of this layout in another one, whose fields must be wide enough."""
         out = np.zeros((len(words), other.words), dtype=np.uint64)
         for p in range(len(self.width)):
-            out[:, other.word[p]] |= self.tokens(words, p).astype(np.uint64) << np.uint64(other.shift[p])
+            out[:, other.word[p]] |= self.tokens(words, p).astype(np.uint64) << np.uint64(
+                other.shift[p]
+            )
         return out
 
     def overflown(self, packed: int) -> list[int]:
         """Places whose guard bit is set."""
-        return [p for p, (o, w) in enumerate(zip(self.offsets, self.width, strict=True)) if packed >> (o + w) & 1]
+        return [
+            p
+            for p, (o, w) in enumerate(zip(self.offsets, self.width, strict=True))
+            if packed >> (o + w) & 1
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +172,8 @@ class Test:
 
 @dataclass(frozen=True)
 class Rules:
-    """The transitions of a net compiled for a layout; `able` are those that this layout's token counts can ever enable."""
+    """The transitions of a net compiled for a layout; `able` are those that this layout's token
+    counts can ever enable."""
 
     net: Net
     layout: Layout
@@ -183,7 +210,9 @@ class Rules:
             [
                 (w, sub[w], guard[w], want[w])
                 for test in tests
-                for sub, guard, want in [tuple(map(self.layout.split, (test.sub, test.guard, test.want)))]
+                for sub, guard, want in [
+                    tuple(map(self.layout.split, (test.sub, test.guard, test.want)))
+                ]
                 for w in range(self.layout.words)
                 if guard[w]
             ]
@@ -194,7 +223,8 @@ class Rules:
     def word_delta(self) -> Words:
         """What a firing adds modulo 2**64 to each word, shape (transitions, words).
 
-        A field never borrows from the next in a firing that its tests allow, so words may be added one by one.
+        A field never borrows from the next in a firing that its tests allow, so words may be added
+        one by one.
         """
         rows = [[0] * self.layout.words for _ in self.delta]
         for t, row in enumerate(rows):
@@ -205,7 +235,8 @@ class Rules:
 
 
 def effect(net: Net, t: int) -> dict[int, int]:
-    """The change of tokens by place that one firing of transition t makes (zero changes left out)."""
+    """The change of tokens by place that one firing of transition t makes (zero changes left
+    out)."""
     change = dict(net.produce[t])
     for p, w in net.consume[t]:
         change[p] = change.get(p, 0) - w
@@ -213,7 +244,8 @@ def effect(net: Net, t: int) -> dict[int, int]:
 
 
 def thresholds(net: Net, t: int) -> dict[int, int]:
-    """Places that must hold fewer tokens than a threshold for t to fire: inhibitors and capacities in one table."""
+    """Places that must hold fewer tokens than a threshold for t to fire: inhibitors and capacities
+    in one table."""
     below = dict(net.inhibit[t])
     consumed = dict(net.consume[t])
     for p, w in net.produce[t]:
@@ -230,12 +262,16 @@ def touched(net: Net, t: int) -> frozenset[int]:
 
 
 def dependents(net: Net) -> list[list[int]]:
-    """For each transition, the transitions whose concession its firing can change, in transition order."""
+    """For each transition, the transitions whose concession its firing can change, in transition
+    order."""
     watchers: dict[int, set[int]] = {}
     for t in range(len(net.transitions)):
         for p in touched(net, t):
             watchers.setdefault(p, set()).add(t)
-    return [sorted(set().union(*(watchers.get(p, set()) for p in effect(net, t)))) for t in range(len(net.transitions))]
+    return [
+        sorted(set().union(*(watchers.get(p, set()) for p in effect(net, t))))
+        for t in range(len(net.transitions))
+    ]
 
 
 def _largest_effect(net: Net) -> list[int]:
@@ -250,7 +286,9 @@ def _compile(net: Net, layout: Layout, t: int) -> tuple[Test, ...] | None:
     """The mask tests of a transition; None if no token count of the layout can enable it."""
     need, below = dict(net.consume[t]), thresholds(net, t)
     below = {p: k for p, k in below.items() if k < 1 << layout.width[p]}
-    if any(k <= 0 for k in below.values()) or any(w >= 1 << layout.width[p] for p, w in need.items()):
+    if any(k <= 0 for k in below.values()) or any(
+        w >= 1 << layout.width[p] for p, w in need.items()
+    ):
         return None
     both = {p: below.pop(p) for p in need.keys() & below.keys()}
     tests = [_test(layout, need, below), _test(layout, {}, both)]

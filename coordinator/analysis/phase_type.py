@@ -1,9 +1,10 @@
 """Durations as phases: Erlang mixtures and hyper-exponential laws fitted to a mean and a variance.
 
-cv^2 <= 1: a mixture of Erlang laws of k - 1 and k stages with one rate, which meets both moments exactly for any
-1 / k <= cv^2 <= 1 / (k - 1). cv^2 > 1: two exponentials with balanced means. Source: H. C. Tijms, Stochastic Models: An
-Algorithmic Approach, Wiley 1994, section A.4. Where the wanted stages exceed a limit, the mean is kept and the variance
-is too large; the error at the 90 % quantile says what that costs.
+cv^2 <= 1: a mixture of Erlang laws of k - 1 and k stages with one rate, which meets both moments
+exactly for any 1 / k <= cv^2 <= 1 / (k - 1). cv^2 > 1: two exponentials with balanced means.
+Source: H. C. Tijms, Stochastic Models: An Algorithmic Approach, Wiley 1994, section A.4. Where the
+wanted stages exceed a limit, the mean is kept and the variance is too large; the error at the 90 %
+quantile says what that costs.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Branch:
 
 @dataclass(frozen=True, slots=True)
 class PhaseType:
-    """A duration: `shift` (s) and then one of the branches. A Markov chain can only hold laws with shift 0."""
+    """A duration: `shift` (s) and then one of the branches. A Markov chain can only hold laws with
+    shift 0."""
 
     branches: tuple[Branch, ...]
     shift: float = 0.0
@@ -49,7 +51,10 @@ class PhaseType:
         """P(T <= time)."""
         if time <= self.shift:
             return 0.0
-        return sum(b.probability * _erlang_cdf(b.stages, b.rate * (time - self.shift)) for b in self.branches)
+        return sum(
+            b.probability * _erlang_cdf(b.stages, b.rate * (time - self.shift))
+            for b in self.branches
+        )
 
     def quantile(self, q: float) -> float:
         """The time (s) by which a share q of the durations is over, 0 < q < 1."""
@@ -69,7 +74,8 @@ class PhaseType:
 
 
 def _erlang_cdf(stages: int, x: float) -> float:
-    """P(a Poisson variable of mean x is at least `stages`), summed from the side of the smaller terms."""
+    """P(a Poisson variable of mean x is at least `stages`), summed from the side of the smaller
+    terms."""
     if x <= 0:
         return 0.0
     if x < 600:
@@ -84,13 +90,17 @@ def _erlang_cdf(stages: int, x: float) -> float:
 
 
 def fit(mean: float, variance: float, *, stages: int = STAGES, shift: float = 0.0) -> PhaseType:
-    """The law with this mean (s) and variance (s^2), at most `stages` phases in a row behind a fixed `shift` (s).
+    """The law with this mean (s) and variance (s^2), at most `stages` phases in a row behind a
+    fixed `shift` (s).
 
-    A variance of 0 asks for a fixed duration: as many stages as allowed, or the shift alone if it is the whole mean.
+    A variance of 0 asks for a fixed duration: as many stages as allowed, or the shift alone if it
+    is the whole mean.
     """
     rest = mean - shift
     if not rest > 0 or variance < 0 or shift < 0:
-        raise ValueError(f"no law has the mean {mean} s, variance {variance} s^2 and shift {shift} s")
+        raise ValueError(
+            f"no law has the mean {mean} s, variance {variance} s^2 and shift {shift} s"
+        )
     cv2 = variance / rest**2
     if cv2 > 1:
         p = 0.5 * (1 + sqrt((cv2 - 1) / (cv2 + 1)))
@@ -103,10 +113,14 @@ def fit(mean: float, variance: float, *, stages: int = STAGES, shift: float = 0.
     return PhaseType((Branch(p, wanted - 1, rate), Branch(1 - p, wanted, rate)), shift)
 
 
-def fit_samples(durations: Sequence[float], *, stages: int = STAGES, shifted: bool = False) -> tuple[PhaseType, float]:
-    """The law fitted to measured durations (s) by mean and variance, and its relative error at the 90 % quantile.
+def fit_samples(
+    durations: Sequence[float], *, stages: int = STAGES, shifted: bool = False
+) -> tuple[PhaseType, float]:
+    """The law fitted to measured durations (s) by mean and variance, and its relative error at the
+    90 % quantile.
 
-    With `shifted` the shortest duration is taken as a fixed shift, less one mean gap so that it is not hit exactly.
+    With `shifted` the shortest duration is taken as a fixed shift, less one mean gap so that it is
+    not hit exactly.
     """
     sample = np.asarray(durations, dtype=float)
     if len(sample) < 2 or sample.min() <= 0:
@@ -119,7 +133,8 @@ def fit_samples(durations: Sequence[float], *, stages: int = STAGES, shifted: bo
 
 
 def gamma_quantile(mean: float, variance: float, q: float = 0.9) -> float:
-    """The quantile (s) of the gamma law with this mean and variance: what a declared mean and cv are compared with."""
+    """The quantile (s) of the gamma law with this mean and variance: what a declared mean and cv
+    are compared with."""
     if variance == 0:
         return mean
     from scipy.special import gammaincinv

@@ -1,4 +1,5 @@
-"""A reachability graph as SVG: columns by distance from the initial marking, dead and final markings and a witness marked."""
+"""A reachability graph as SVG: columns by distance from the initial marking, dead and final
+markings and a witness marked."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from html import escape
 
 import numpy as np
 
-from coordinator.analysis.graph import Mask
-from coordinator.analysis.space import Space
+from petrobot.coordinator.analysis.graph import Mask
+from petrobot.coordinator.analysis.space import Space
 
 MARKINGS = 400
 """Markings drawn at most; a picture of more says nothing."""
@@ -23,13 +24,23 @@ STYLE = """
 """
 
 
-def graph_svg(space: Space, *, witness: Sequence[str] = (), final: Mask | None = None, markings: int = MARKINGS) -> str:
-    """The SVG text of a space with at most `markings` markings drawn (the nearest to the initial one, and the witness).
+def graph_svg(
+    space: Space,
+    *,
+    witness: Sequence[str] = (),
+    final: Mask | None = None,
+    markings: int = MARKINGS,
+) -> str:
+    """The SVG text of a space with at most `markings` markings drawn (the nearest to the initial
+    one, and the witness).
 
-    `witness` is a firing sequence from the initial marking, `final` says which markings are designed ends.
+    `witness` is a firing sequence from the initial marking, `final` says which markings are
+    designed ends.
     """
     steps = _steps(space, witness)
-    shown = sorted({*range(min(len(space), markings)), *(i for i, _, _ in steps), *(j for _, _, j in steps)})
+    shown = sorted(
+        {*range(min(len(space), markings)), *(i for i, _, _ in steps), *(j for _, _, j in steps)}
+    )
     depth = _depths(space, shown)
     at: dict[int, tuple[int, int]] = {}
     filled: dict[int, int] = {}
@@ -37,7 +48,10 @@ def graph_svg(space: Space, *, witness: Sequence[str] = (), final: Mask | None =
         row = filled.get(depth[i], 0)
         filled[depth[i]] = row + 1
         at[i] = (20 + depth[i] * COLUMN, 20 + row * ROW)
-    width, height = max(x for x, _ in at.values()) + WIDE + 20, max(y for _, y in at.values()) + HIGH + 40
+    width, height = (
+        max(x for x, _ in at.values()) + WIDE + 20,
+        max(y for _, y in at.values()) + HIGH + 40,
+    )
     on = {(i, t) for i, t, _ in steps}
     visited = {0} | {j for _, _, j in steps} if steps else set()
     body = [*_edges(space, shown, at, on), *_nodes(space, shown, at, final, visited)]
@@ -45,15 +59,21 @@ def graph_svg(space: Space, *, witness: Sequence[str] = (), final: Mask | None =
         partial = "" if space.complete else f" (partial: {escape(space.reason)})"
         told = f"{len(shown)} of {len(space)} markings shown{partial}"
         body.append(f'<text x="20" y="{height - 10}" class="m">{told}</text>')
-    head = '<marker id="head" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" orient="auto"><path d="M0 0L8 4L0 8z" fill="#8c959f"/></marker>'  # noqa: E501
+    head = (
+        '<marker id="head" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" '
+        'markerHeight="7" orient="auto"><path d="M0 0L8 4L0 8z" fill="#8c959f"/></marker>'
+    )
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img">'
-        f"<title>Reachability graph</title><style>{STYLE}</style><defs>{head}</defs>{''.join(body)}</svg>\n"
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        f'width="{width}" height="{height}" role="img">'
+        "<title>Reachability "
+        f"graph</title><style>{STYLE}</style><defs>{head}</defs>{''.join(body)}</svg>\n"
     )
 
 
 def _steps(space: Space, witness: Sequence[str]) -> list[tuple[int, int, int]]:
-    """(marking, transition, marking) along a firing sequence. Raises ValueError where it leaves the space."""
+    """(marking, transition, marking) along a firing sequence. Raises ValueError where it leaves the
+    space."""
     at, out = 0, []
     for name in witness:
         t = space.net.transition_index[name]
@@ -66,7 +86,8 @@ def _steps(space: Space, witness: Sequence[str]) -> list[tuple[int, int, int]]:
 
 
 def _depths(space: Space, shown: Sequence[int]) -> dict[int, int]:
-    """Distance of the shown markings from the initial one: breadth-first numbers make parents come first."""
+    """Distance of the shown markings from the initial one: breadth-first numbers make parents come
+    first."""
     depth = np.zeros(len(space), dtype=np.int64)
     parent = space.parent_edge
     for i in range(1, max(shown) + 1):
@@ -74,7 +95,9 @@ def _depths(space: Space, shown: Sequence[int]) -> dict[int, int]:
     return {i: int(depth[i]) for i in shown}
 
 
-def _edges(space: Space, shown: Sequence[int], at: dict[int, tuple[int, int]], on: set[tuple[int, int]]) -> list[str]:
+def _edges(
+    space: Space, shown: Sequence[int], at: dict[int, tuple[int, int]], on: set[tuple[int, int]]
+) -> list[str]:
     out = []
     for i in shown:
         for e in range(int(space.row[i]), int(space.row[i + 1])):
@@ -85,18 +108,32 @@ def _edges(space: Space, shown: Sequence[int], at: dict[int, tuple[int, int]], o
             start, end = (x + WIDE, y + HIGH // 2), (u, v + HIGH // 2)
             if u <= x:  # back or sideways: leave and arrive below
                 start, end = (x + WIDE // 2, y + HIGH), (u + WIDE // 2, v + HIGH)
-                path = f"M{start[0]} {start[1]}C{start[0]} {start[1] + 40} {end[0]} {end[1] + 40} {end[0]} {end[1]}"
+                path = (
+                    f"M{start[0]} {start[1]}C{start[0]} {start[1] + 40} {end[0]} "
+                    f"{end[1] + 40} {end[0]} {end[1]}"
+                )
             else:
                 middle = (start[0] + end[0]) // 2
-                path = f"M{start[0]} {start[1]}C{middle} {start[1]} {middle} {end[1]} {end[0]} {end[1]}"
-            x, y, name = (start[0] + end[0]) // 2, (start[1] + end[1]) // 2 - 3, escape(space.net.transitions[t])
+                path = (
+                    f"M{start[0]} {start[1]}C{middle} {start[1]} {middle} {end[1]} "
+                    f"{end[0]} {end[1]}"
+                )
+            x, y, name = (
+                (start[0] + end[0]) // 2,
+                (start[1] + end[1]) // 2 - 3,
+                escape(space.net.transitions[t]),
+            )
             label = f'<text x="{x}" y="{y}">{name}</text>'
             out.append(f'<g class="e{" on" if (i, t) in on else ""}"><path d="{path}"/>{label}</g>')
     return out
 
 
 def _nodes(
-    space: Space, shown: Sequence[int], at: dict[int, tuple[int, int]], final: Mask | None, visited: set[int]
+    space: Space,
+    shown: Sequence[int],
+    at: dict[int, tuple[int, int]],
+    final: Mask | None,
+    visited: set[int],
 ) -> list[str]:
     dead, out = set(space.dead.tolist()), []
     for i in shown:
@@ -106,7 +143,8 @@ def _nodes(
         text = space.net.describe(space.marking(i))
         short = text if len(text) <= 26 else text[:25] + "…"
         out.append(
-            f'<g class="{" ".join(kinds)}"><title>{i}: {escape(text)}</title><rect x="{x}" y="{y}" width="{WIDE}" height="{HIGH}"/>'
+            f'<g class="{" ".join(kinds)}"><title>{i}: {escape(text)}</title><rect x="{x}" '
+            f'y="{y}" width="{WIDE}" height="{HIGH}"/>'
             f'<text x="{x + WIDE // 2}" y="{y + HIGH // 2 + 4}">{escape(short)}</text></g>'
         )
     return out

@@ -1,8 +1,10 @@
-"""PNML in: ISO/IEC 15909-2 place/transition nets with pages and reference nodes, and what tools write beyond the standard.
+"""PNML in: ISO/IEC 15909-2 place/transition nets with pages and reference nodes, and what tools
+write beyond the standard.
 
-Beyond it: inhibitor and test arcs in the notations of the special-arcs extension and ProM (`arctype`), PIPE, TINA, GreatSPN
-and Storm (`type value`), TAPAAL and Romeo (`type` attribute), and as tool-specific data; PIPE's `Default,1`, rates, timed
-flags, servers and priorities; our own tool-specific data. An arc of unknown kind is refused, never taken for a normal one.
+Beyond it: inhibitor and test arcs in the notations of the special-arcs extension and ProM
+(`arctype`), PIPE, TINA, GreatSPN and Storm (`type value`), TAPAAL and Romeo (`type` attribute), and
+as tool-specific data; PIPE's `Default,1`, rates, timed flags, servers and priorities; our own
+tool-specific data. An arc of unknown kind is refused, never taken for a normal one.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from collections.abc import Iterator
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from coordinator.analysis.netfile import FormatError, NetDraft, NetFile, whole_number
+from petrobot.coordinator.analysis.netfile import FormatError, NetDraft, NetFile, whole_number
 
 TOOL = "petrobot"
 NORMAL = {"", "normal", "timed", "place-transition", "transition-place"}
@@ -44,18 +46,25 @@ def children(element: Element, tag: str) -> Iterator[Element]:
 
 
 def nodes(net: Element) -> Iterator[Element]:
-    """The objects of a net and of its pages, however deep. What else holds such tags (final markings, tool-specific data,
-    unfoldings) is none of them.
+    """The objects of a net and of its pages, however deep. What else holds such tags (final
+    markings, tool-specific data, unfoldings) is none of them.
     """
     for child in net:
         if local(child) == "page":
             yield from nodes(child)
-        elif local(child) in ("place", "transition", "arc", "referencePlace", "referenceTransition"):
+        elif local(child) in (
+            "place",
+            "transition",
+            "arc",
+            "referencePlace",
+            "referenceTransition",
+        ):
             yield child
 
 
 def label(element: Element, tag: str) -> str | None:
-    """Text of a label child (`<tag><text>..` or PIPE's `<tag><value>..`), None if there is no such child."""
+    """Text of a label child (`<tag><text>..` or PIPE's `<tag><value>..`), None if there is no such
+    child."""
     for child in children(element, tag):
         for inner in child:
             if local(inner) in ("text", "value"):
@@ -85,14 +94,22 @@ def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
     (net,) = nets
     kind = (net.get("type") or "").strip().lower()
     if kind and not any(kind.rstrip("/").endswith(known) for known in PLACE_TRANSITION):
-        raise FormatError(file, f"net {net.get('id')}", f"a net of type {net.get('type')!r}", "only P/T nets are read")
+        raise FormatError(
+            file,
+            f"net {net.get('id')}",
+            f"a net of type {net.get('type')!r}",
+            "only P/T nets are read",
+        )
     return _Reading(net, file).result(root)
 
 
 def _tree(text: str | bytes, file: str) -> Element:
     if ENTITY.search(text if isinstance(text, str) else text.replace(b"\0", b"").decode("latin-1")):
         raise FormatError(
-            file, "XML", "a PNML file that defines entities", "they can grow without bound: write them out"
+            file,
+            "XML",
+            "a PNML file that defines entities",
+            "they can grow without bound: write them out",
         )
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     try:
@@ -133,7 +150,9 @@ class _Reading:
         name = label(self.element, "name") or self.element.get("id") or ""
         notes = tuple(self.draft.notes)
         gspn = self.draft.gspn(net)
-        return NetFile(gspn.net if gspn else net, name, gspn, self.labels, self.positions, notes, root)
+        return NetFile(
+            gspn.net if gspn else net, name, gspn, self.labels, self.positions, notes, root
+        )
 
     def _nodes(self, tag: str) -> Iterator[Element]:
         return (node for node in nodes(self.element) if local(node) == tag)
@@ -150,7 +169,10 @@ class _Reading:
             self.labels[name] = text
         for graphics in children(node, "graphics"):
             for position in children(graphics, "position"):
-                self.positions[name] = (float(position.get("x", "0")), float(position.get("y", "0")))
+                self.positions[name] = (
+                    float(position.get("x", "0")),
+                    float(position.get("y", "0")),
+                )
 
     def _place(self, node: Element) -> None:
         name = self._id(node)
@@ -171,10 +193,15 @@ class _Reading:
         parts = [part.strip() for part in text.split(",")]
         if len(parts) > 1:
             pairs = list(zip(parts[::2], parts[1::2], strict=False))
-            coloured = [colour for colour, n in pairs if colour.lower() != "default" and n not in ("", "0")]
+            coloured = [
+                colour for colour, n in pairs if colour.lower() != "default" and n not in ("", "0")
+            ]
             if coloured:
                 raise FormatError(
-                    self.file, element, f"tokens of the colour {coloured[0]!r}", "only plain tokens are read"
+                    self.file,
+                    element,
+                    f"tokens of the colour {coloured[0]!r}",
+                    "only plain tokens are read",
                 )
             text = next((n for colour, n in pairs if colour.lower() == "default"), "0")
         return whole_number(self.file, element, text or "0")
@@ -198,22 +225,32 @@ class _Reading:
             self.draft.weights[name] = rate
             return
         self.draft.rates[name] = rate
-        infinite = (label(node, "infiniteServer") or "").lower() == "true" or own.get("servers") == "infinite"
+        infinite = (label(node, "infiniteServer") or "").lower() == "true" or own.get(
+            "servers"
+        ) == "infinite"
         servers = own.get("servers", "1")
-        self.draft.servers[name] = None if infinite else whole_number(self.file, f"servers of {name}", servers)
+        self.draft.servers[name] = (
+            None if infinite else whole_number(self.file, f"servers of {name}", servers)
+        )
         if timed is not None and self.draft.transitions[name]:
-            self.draft.notes.append(f"transition {name}: the priority of a timed transition has no effect in a GSPN")
+            self.draft.notes.append(
+                f"transition {name}: the priority of a timed transition has no effect in a GSPN"
+            )
             self.draft.transitions[name] = 0
 
     def _number(self, element: str, text: str) -> float:
         try:
             return float(text)
         except ValueError as error:
-            raise FormatError(self.file, element, f"{text!r} is no number", "write a rate in 1/s") from error
+            raise FormatError(
+                self.file, element, f"{text!r} is no number", "write a rate in 1/s"
+            ) from error
 
     def _arc(self, node: Element) -> None:
         element = f"arc {node.get('id') or '(no id)'}"
-        source, target = (self._resolved(node.get(end) or "", element) for end in ("source", "target"))
+        source, target = (
+            self._resolved(node.get(end) or "", element) for end in ("source", "target")
+        )
         inscription = label(node, "inscription") or node.get("inscription") or "1"
         kind = arc_kind(node, self.file, element)
         if node.get("type", "").lower() in ("timed", "tapninhibitor") and inscription.strip() in (
@@ -230,7 +267,9 @@ class _Reading:
         while name in self.references:
             name = self.references[name]
             if name in seen:
-                raise FormatError(self.file, element, f"the references around {name!r} go round in a circle")
+                raise FormatError(
+                    self.file, element, f"the references around {name!r} go round in a circle"
+                )
             seen.add(name)
         return name
 
@@ -257,13 +296,16 @@ def arc_kind(node: Element, file: str, element: str) -> str:
 
 
 def _tool_specific_kinds(data: Element) -> Iterator[str]:
-    """Arc kinds told inside tool-specific data: `<inhibitor/>`, `<type>inhibitor</type>`, `type="inhibitor"`."""
+    """Arc kinds told inside tool-specific data: `<inhibitor/>`, `<type>inhibitor</type>`,
+    `type="inhibitor"`."""
     for inner in data.iter():
         name = local(inner).lower()
         if name in INHIBITOR | TEST | {"reset"}:
             yield name
         if name in ("type", "arctype", "kind"):
             yield inner.get("value") or (inner.text or "").strip()
-            yield from ((item.text or "").strip() for item in inner if local(item) in ("text", "value"))
+            yield from (
+                (item.text or "").strip() for item in inner if local(item) in ("text", "value")
+            )
         if inner is not data and name == "arc":
             yield inner.get("type", "")

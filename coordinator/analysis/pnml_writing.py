@@ -1,8 +1,9 @@
-"""PNML out. A net that came from a PNML file goes back into its own tree: pages, graphics, tool-specific data and names stay.
+"""PNML out. A net that came from a PNML file goes back into its own tree: pages, graphics,
+tool-specific data and names stay.
 
-The standard has no inhibitors, capacities, priorities or rates: inhibitor arcs are written as `<type value="inhibitor"/>`,
-which the most tools read, and the rest as our tool-specific data, which every tool may ignore. `losses` lists what a tool
-that reads the standard alone would miss.
+The standard has no inhibitors, capacities, priorities or rates: inhibitor arcs are written as
+`<type value="inhibitor"/>`, which the most tools read, and the rest as our tool-specific data,
+which every tool may ignore. `losses` lists what a tool that reads the standard alone would miss.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from itertools import count
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from coordinator.analysis.netfile import FormatError, NetFile
-from coordinator.analysis.pnml_reading import TOOL, arc_kind, children, local, nodes
+from petrobot.coordinator.analysis.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.pnml_reading import TOOL, arc_kind, children, local, nodes
 
 NAMESPACE = "http://www.pnml.org/version-2009/grammar/pnml"
 TYPE = "http://www.pnml.org/version-2009/grammar/ptnet"
@@ -45,14 +46,20 @@ def write_pnml(model: NetFile) -> str:
     if namespace:
         ElementTree.register_namespace("", namespace)
     ElementTree.indent(root)
-    return "<?xml version='1.0' encoding='UTF-8'?>\n" + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return (
+        "<?xml version='1.0' encoding='UTF-8'?>\n"
+        + ElementTree.tostring(root, encoding="unicode")
+        + "\n"
+    )
 
 
 def _fresh(model: NetFile) -> Element:
     root = Element(f"{{{NAMESPACE}}}pnml")
     net = SubElement(root, f"{{{NAMESPACE}}}net", {"id": "net", "type": TYPE})
     if model.name:
-        SubElement(SubElement(net, f"{{{NAMESPACE}}}name"), f"{{{NAMESPACE}}}text").text = model.name
+        SubElement(
+            SubElement(net, f"{{{NAMESPACE}}}name"), f"{{{NAMESPACE}}}text"
+        ).text = model.name
     SubElement(net, f"{{{NAMESPACE}}}page", {"id": "page"})
     return root
 
@@ -72,15 +79,23 @@ class _Writing:
         self.element = root if local(root) == "net" else next(children(root, "net"))
         self.parents = list(_pages(self.element))
         self.page = self.parents[1] if len(self.parents) > 1 else self.element
-        self.prefix = self.element.tag[: self.element.tag.index("}") + 1] if "}" in self.element.tag else ""
+        self.prefix = (
+            self.element.tag[: self.element.tag.index("}") + 1] if "}" in self.element.tag else ""
+        )
         self.references = {
-            node.get("id"): node.get("ref") for node in nodes(self.element) if local(node).startswith("reference")
+            node.get("id"): node.get("ref")
+            for node in nodes(self.element)
+            if local(node).startswith("reference")
         }
 
     def update(self) -> None:
         """Remove what the net no longer has, set what it has, add what is new."""
         self._drop_missing()
-        known = {node.get("id"): node for node in nodes(self.element) if local(node) in ("place", "transition")}
+        known = {
+            node.get("id"): node
+            for node in nodes(self.element)
+            if local(node) in ("place", "transition")
+        }
         for p, name in enumerate(self.net.places):
             self._place(known.get(name), name, p)
         for t, name in enumerate(self.net.transitions):
@@ -97,8 +112,14 @@ class _Writing:
     def _place(self, node: Element | None, name: str, p: int) -> None:
         node = node if node is not None else self._new("place", name)
         tokens, capacity = self.net.initial[p], self.net.capacity[p]
-        self._set(node, "initialMarking", str(tokens) if tokens or _has(node, "initialMarking") else None)
-        limits = {"capacity": str(capacity)} if capacity is not None and not _has(node, "capacity") else {}
+        self._set(
+            node, "initialMarking", str(tokens) if tokens or _has(node, "initialMarking") else None
+        )
+        limits = (
+            {"capacity": str(capacity)}
+            if capacity is not None and not _has(node, "capacity")
+            else {}
+        )
         self._own(node, limits)
 
     def _transition(self, node: Element | None, name: str, t: int) -> None:
@@ -126,7 +147,8 @@ class _Writing:
         return node
 
     def _set(self, node: Element, tag: str, text: str | None) -> None:
-        """Set a label in the form that it already has in the file (`text` or `value`), else as the standard says."""
+        """Set a label in the form that it already has in the file (`text` or `value`), else as the
+        standard says."""
         if text is None:
             return
         for child in children(node, tag):
@@ -160,15 +182,27 @@ class _Writing:
         wanted, used = self._wanted(), {node.get("id") for node in self.root.iter()}
         for parent in self.parents:
             for node in [child for child in parent if local(child) == "arc"]:
-                arc = (self._resolved(node.get("source")), self._resolved(node.get("target")), arc_kind(node, "", ""))
+                arc = (
+                    self._resolved(node.get("source")),
+                    self._resolved(node.get("target")),
+                    arc_kind(node, "", ""),
+                )
                 weight = wanted.pop(arc, None)
                 if weight is None:
                     parent.remove(node)
                 else:
-                    self._set(node, "inscription", str(weight) if weight > 1 or _has(node, "inscription") else None)
+                    self._set(
+                        node,
+                        "inscription",
+                        str(weight) if weight > 1 or _has(node, "inscription") else None,
+                    )
         fresh = (f"arc{i}" for i in count() if f"arc{i}" not in used)
         for (source, target, kind), weight in wanted.items():
-            node = SubElement(self.page, f"{self.prefix}arc", {"id": next(fresh), "source": source, "target": target})
+            node = SubElement(
+                self.page,
+                f"{self.prefix}arc",
+                {"id": next(fresh), "source": source, "target": target},
+            )
             if weight > 1:
                 self._set(node, "inscription", str(weight))
             if kind == "inhibitor":

@@ -1,4 +1,5 @@
-"""One analysis of a net or a task: every verdict and number together, as JSON and as a table for people."""
+"""One analysis of a net or a task: every verdict and number together, as JSON and as a table for
+people."""
 
 from __future__ import annotations
 
@@ -8,22 +9,28 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.analysis.coverability import Coverability, settle_bounds
-from coordinator.analysis.forecast import Forecast, forecast
-from coordinator.analysis.graph import Mask
-from coordinator.analysis.gspn import Chain, Gspn
-from coordinator.analysis.markov import LongRun, long_run
-from coordinator.analysis.ordinary import OrdinaryView
-from coordinator.analysis.pumping import find_pump
-from coordinator.analysis.qualitative import Qualitative, examine
-from coordinator.analysis.robot import Recovery, RobotVerdicts, all_returned, judge, one_run_each
-from coordinator.analysis.space import INTERRUPTED, EngineName, Limits, Space, explore
-from coordinator.analysis.stochastic import Measured, stochastic_view
-from coordinator.analysis.structural import Structure
-from coordinator.analysis.structure import place_bounds
-from coordinator.analysis.verdict import Verdict
-from coordinator.net import Marking, Net
-from coordinator.task import Kind, Task
+from petrobot.coordinator.analysis.coverability import Coverability, settle_bounds
+from petrobot.coordinator.analysis.forecast import Forecast, forecast
+from petrobot.coordinator.analysis.graph import Mask
+from petrobot.coordinator.analysis.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.markov import LongRun, long_run
+from petrobot.coordinator.analysis.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.pumping import find_pump
+from petrobot.coordinator.analysis.qualitative import Qualitative, examine
+from petrobot.coordinator.analysis.robot import (
+    Recovery,
+    RobotVerdicts,
+    all_returned,
+    judge,
+    one_run_each,
+)
+from petrobot.coordinator.analysis.space import INTERRUPTED, EngineName, Limits, Space, explore
+from petrobot.coordinator.analysis.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.structural import Structure
+from petrobot.coordinator.analysis.structure import place_bounds
+from petrobot.coordinator.analysis.verdict import Verdict
+from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.task import Kind, Task
 
 SHOWN = 20
 """Entries of a list that the text shows."""
@@ -31,7 +38,8 @@ SHOWN = 20
 
 @dataclass(frozen=True)
 class Analysis:
-    """The result of `analyse`. For a task `closed` and `robot` judge the net closed by refill and repair."""
+    """The result of `analyse`. For a task `closed` and `robot` judge the net closed by refill and
+    repair."""
 
     name: str
     net: Net
@@ -51,24 +59,30 @@ class Analysis:
 
     @property
     def progress(self) -> Qualitative:
-        """Where liveness, properness and home markings are judged: the closed net if there is one."""
+        """Where liveness, properness and home markings are judged: the closed net if there is
+        one."""
         return self.closed or self.qualitative
 
     @property
     def ok(self) -> bool:
         """Whether it is known that nothing speaks against running it."""
-        first = self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True
+        first = (
+            self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True
+        )
         single = self.one_run_each is None or self.one_run_each.holds is True
         return first and single and not self.objections
 
     @property
     def objections(self) -> dict[str, Verdict]:
-        """What is known to speak against running it: it grows without bound, gets stuck, starts a run while its place is at
-        work, cannot reach its end, goes on at its end, or ends without a resource. (A transition of no use is no objection.)
+        """What is known to speak against running it: it grows without bound, gets stuck, starts a
+        run while its place is at work, cannot reach its end, goes on at its end, or ends without a
+        resource. (A transition of no use is no objection.)
         """
         named = self.verdicts()
         against: dict[str, Verdict] = {
-            name: named[name] for name in ("bounded", "deadlock_free", "one_run_each", "returned") if name in named
+            name: named[name]
+            for name in ("bounded", "deadlock_free", "one_run_each", "returned")
+            if name in named
         }
         if "sound" in named and named["sound"].witness is not None:
             against["sound"] = named["sound"]
@@ -76,7 +90,11 @@ class Analysis:
 
     def to_json(self, *, structure: bool = True) -> dict[str, Any]:
         """Plain data with the promised keys: verdicts are true, false or null."""
-        q, again, unbounded = self.qualitative, self.progress, self.qualitative.bounded.holds is False
+        q, again, unbounded = (
+            self.qualitative,
+            self.progress,
+            self.qualitative.bounded.holds is False,
+        )
         out: dict[str, Any] = {
             "name": self.name,
             "net": _sizes(self.net),
@@ -92,7 +110,12 @@ class Analysis:
             "safe": q.safe.holds,
             "deadlock": None if q.deadlock_free.holds is None else not q.deadlock_free.holds,
             "deadlocks": [
-                {"marked": list(d.marked), "count": d.count, "emptied": list(d.emptied), **d.witness.to_json()}
+                {
+                    "marked": list(d.marked),
+                    "count": d.count,
+                    "emptied": list(d.emptied),
+                    **d.witness.to_json(),
+                }
                 for d in q.deadlocks
             ],
             "dead_markings": q.dead_markings,
@@ -103,7 +126,9 @@ class Analysis:
             "reversible": again.reversible.holds,
             "home_states": again.home_states,
             "sound": q.sound.holds if q.sound else None,
-            "judged_on_closed_net": ["live", "liveness", "reversible", "home_states"] if self.closed else [],
+            "judged_on_closed_net": ["live", "liveness", "reversible", "home_states"]
+            if self.closed
+            else [],
             "verdicts": {name: verdict.to_json() for name, verdict in self.verdicts().items()},
             "notes": list(self.notes),
         }
@@ -133,8 +158,16 @@ class Analysis:
         if self.forecast is not None:
             f = self.forecast
             goal = {} if f.goal_reliability is None else {"R_goal": f.goal_reliability}
-            shape = {"90 % quantile of the time (s)": f.law().quantile(0.9)} if f.completion_probability > 0 else {}
-            own = {"P_complete": f.completion_probability, **goal, "R_conj": f.conjunctive_reliability}
+            shape = (
+                {"90 % quantile of the time (s)": f.law().quantile(0.9)}
+                if f.completion_probability > 0
+                else {}
+            )
+            own = {
+                "P_complete": f.completion_probability,
+                **goal,
+                "R_conj": f.conjunctive_reliability,
+            }
             return own | {"mean time (s)": f.done.mean} | shape
         if self.run is not None:
             return {f"throughput of {t} (1/s)": x for t, x in self.run.throughput.items()}
@@ -143,7 +176,12 @@ class Analysis:
     def verdicts(self) -> dict[str, Verdict]:
         """All verdicts by name, in robot words where the net is a task."""
         q, again = self.qualitative, self.progress
-        out = {"bounded": q.bounded, "safe": q.safe, "deadlock_free": q.deadlock_free, "quasi_live": q.quasi_live}
+        out = {
+            "bounded": q.bounded,
+            "safe": q.safe,
+            "deadlock_free": q.deadlock_free,
+            "quasi_live": q.quasi_live,
+        }
         out |= {"live": again.live, "proper" if self.closed else "reversible": again.reversible}
         if self.one_run_each is not None:
             out["one_run_each"] = self.one_run_each
@@ -160,7 +198,8 @@ class Analysis:
         q = self.qualitative
         size = _sizes(self.net)
         lines = [
-            f"{self.name}: {size['places']} places, {size['transitions']} transitions, {size['arcs']} arcs; "
+            f"{self.name}: {size['places']} places, {size['transitions']} transitions, "
+            f"{size['arcs']} arcs; "
             f"{len(q.space)} markings, {q.space.edges} edges"
             + ("" if q.space.complete else f" (partial: {q.space.reason})"),
             "",
@@ -174,15 +213,24 @@ class Analysis:
         if self.robot is not None:
             lines += ["", "error exits     possible  sure  further errors  run      way back"]
             lines += [_recovery_line(r) for r in self.robot.recoveries]
-        assumed = dict.fromkeys(v.assumption for v in self.verdicts().values() if v.holds and v.assumption)
-        lines += ["", *(f"These hold for the executed task if {text}." for text in assumed)] if assumed else []
+        assumed = dict.fromkeys(
+            v.assumption for v in self.verdicts().values() if v.holds and v.assumption
+        )
+        lines += (
+            ["", *(f"These hold for the executed task if {text}." for text in assumed)]
+            if assumed
+            else []
+        )
         lines += self._number_lines()
         return "\n".join(lines + [f"note: {note}" for note in self.notes])
 
     def _number_lines(self) -> list[str]:
         if self.run is not None:
             busiest = sorted(self.run.utilisation.items(), key=lambda one: -one[1])[:SHOWN]
-            rows = [f"  {name:24}{self.run.throughput[name]:12.6g} /s {load:10.4g} at work" for name, load in busiest]
+            rows = [
+                f"  {name:24}{self.run.throughput[name]:12.6g} /s {load:10.4g} at work"
+                for name, load in busiest
+            ]
             return ["", f"long run (residual {self.run.residual:.1e} /s):", *rows]
         if self.forecast is None:
             return []
@@ -195,8 +243,10 @@ class Analysis:
         ]
         return [
             "",
-            f"forecast: P_complete {done.probability:.9f}, {goal}R_conj {f.conjunctive_reliability:.6f}",
-            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; back to the nominal flow within "
+            f"forecast: P_complete {done.probability:.9f}, {goal}R_conj "
+            f"{f.conjunctive_reliability:.6f}",
+            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; back "
+            "to the nominal flow within "
             f"{f.recovery_time:.3f} s on average at worst; residual {done.residual:.1e}",
             "worth improving:",
             *rows,
@@ -217,9 +267,10 @@ def analyse(
 ) -> Analysis:
     """All verdicts on a net or task; with `view="gspn"` also the numbers of its stochastic view.
 
-    A GSPN gives its long run from the initial marking; a task its forecast. Numbers that cannot be had (a partial space, a
-    timeless trap) leave a note instead. `limits` hold for each state space that is explored. `ordinary` is the ordinary view
-    of a GSPN if it is not the GSPN's own net: where its rates and priorities were not said by the file of the net itself.
+    A GSPN gives its long run from the initial marking; a task its forecast. Numbers that cannot be
+    had (a partial space, a timeless trap) leave a note instead. `limits` hold for each state space
+    that is explored. `ordinary` is the ordinary view of a GSPN if it is not the GSPN's own net:
+    where its rates and priorities were not said by the file of the net itself.
     """
     if isinstance(model, Task):
         return _analyse_task(model, view, measured, stages, limits, engine)
@@ -230,17 +281,32 @@ def analyse(
     if isinstance(model, Gspn) and view == "gspn" and not notes:
         run = _long_run(model, found.space, limits, engine, notes)
     stopped = bool(notes) and notes[-1] == CUT
-    return Analysis(name or "net", net, found, None, None, Structure(net), run, None, tuple(notes), interrupted=stopped)
+    return Analysis(
+        name or "net",
+        net,
+        found,
+        None,
+        None,
+        Structure(net),
+        run,
+        None,
+        tuple(notes),
+        interrupted=stopped,
+    )
 
 
 LOOK = 10_000
-"""Markings after which a net is asked whether it can grow without end, before it is searched to its limits."""
+"""Markings after which a net is asked whether it can grow without end, before it is searched to its
+limits."""
 ENDLESS = "it has no end: the net is unbounded"
 CUT = "Ctrl-C: a partial answer, what had been found by then"
 
 
-def _search(net: Net, limits: Limits | None, engine: EngineName) -> tuple[Space, Coverability | None]:
-    """The space within the limits; a net that proves to be unbounded is searched no further than LOOK."""
+def _search(
+    net: Net, limits: Limits | None, engine: EngineName
+) -> tuple[Space, Coverability | None]:
+    """The space within the limits; a net that proves to be unbounded is searched no further than
+    LOOK."""
     limits = limits or Limits()
     if limits.states is None or limits.states > LOOK:
         first = explore(net, limits=replace(limits, states=LOOK), engine=engine)
@@ -274,7 +340,9 @@ def _examined(
     return examine(replace(space, complete=False, reason=INTERRUPTED), final=final, in_haste=True)
 
 
-def _long_run(model: Gspn, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]) -> LongRun | None:
+def _long_run(
+    model: Gspn, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]
+) -> LongRun | None:
     try:
         if model.net != space.net:
             space = explore(model.net, limits=limits, engine=engine)
@@ -290,11 +358,18 @@ def _long_run(model: Gspn, space: Space, limits: Limits | None, engine: EngineNa
 
 
 def _analyse_task(
-    task: Task, view: str, measured: Measured | None, stages: int, limits: Limits | None, engine: EngineName
+    task: Task,
+    view: str,
+    measured: Measured | None,
+    stages: int,
+    limits: Limits | None,
+    engine: EngineName,
 ) -> Analysis:
     ordinary, notes = OrdinaryView(task), list[str]()
     found = _examined(ordinary.net, limits, engine, notes, ordinary.is_end)
-    single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
+    single = [
+        p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None
+    ]
     alone, whole = one_run_each(found.space, single), Structure(ordinary.net)
     closed = robot = numbers = back = None
     try:
@@ -310,14 +385,30 @@ def _analyse_task(
         notes.append(CUT)
     stopped = CUT in notes
     return Analysis(
-        task.name, ordinary.net, found, closed, robot, whole, None, numbers, tuple(notes), alone, back, stopped
+        task.name,
+        ordinary.net,
+        found,
+        closed,
+        robot,
+        whole,
+        None,
+        numbers,
+        tuple(notes),
+        alone,
+        back,
+        stopped,
     )
 
 
 def _uneven(space: Space, final: Mask) -> list[str]:
-    """A note on each place whose tokens at the end depend on the way: left over, lost, or counted on purpose."""
+    """A note on each place whose tokens at the end depend on the way: left over, lost, or counted
+    on purpose."""
     ends = np.flatnonzero(final)
-    held = [(name, space.tokens(p)[ends]) for p, name in enumerate(space.net.places)] if len(ends) else []
+    held = (
+        [(name, space.tokens(p)[ends]) for p, name in enumerate(space.net.places)]
+        if len(ends)
+        else []
+    )
     return [
         f"{name} holds {tokens.min()} to {tokens.max()} tokens at the end, depending on the way"
         for name, tokens in held
@@ -326,7 +417,11 @@ def _uneven(space: Space, final: Mask) -> list[str]:
 
 
 def _closed(
-    ordinary: OrdinaryView, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]
+    ordinary: OrdinaryView,
+    space: Space,
+    limits: Limits | None,
+    engine: EngineName,
+    notes: list[str],
 ) -> tuple[Qualitative | None, RobotVerdicts | None]:
     """The closed net's verdicts and the robot's; a note where they cannot be had."""
     try:
@@ -380,7 +475,11 @@ def _verdict_lines(name: str, verdict: Verdict) -> list[str]:
         firings = " ".join(verdict.witness.firings) or "(initial marking)"
         lines.append(
             f"{'':26}by: {firings}"
-            + (f", then again and again: {' '.join(verdict.witness.loop)}" if verdict.witness.loop else "")
+            + (
+                f", then again and again: {' '.join(verdict.witness.loop)}"
+                if verdict.witness.loop
+                else ""
+            )
         )
     return lines
 
@@ -388,7 +487,9 @@ def _verdict_lines(name: str, verdict: Verdict) -> list[str]:
 def _recovery_line(r: Recovery) -> str:
     kappa = "any number" if r.kappa is None else "none" if r.kappa <= 0 else str(r.kappa)
     run = {True: "resumed", False: "lost", None: "-"}[r.resumed]
-    back = " ".join(r.strategy) or ("(at once)" if r.possible.holds and r.kappa != -1 else "(no way)")
+    back = " ".join(r.strategy) or (
+        "(at once)" if r.possible.holds and r.kappa != -1 else "(no way)"
+    )
     return f"  {r.error_exit:14}{_word(r.possible.holds):10}{_word(r.almost_sure.holds):6}{kappa:16}{run:9}{back}"
 
 

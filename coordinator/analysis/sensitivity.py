@@ -1,9 +1,11 @@
-"""What is worth improving: exact derivatives of completion and throughput with respect to each rate and weight.
+"""What is worth improving: exact derivatives of completion and throughput with respect to each rate
+and weight.
 
-With jump probabilities a_e = r_e / q, a change d(log theta) of a transition's rate or weight scales its edges' amounts. For
-x = b + A x this gives dx_0 / d(log theta) = sum over its edges of v_i a_e (x_j - x_i) with v the expected visits before the
-end (one adjoint solve for all parameters; the sojourn's own change is inside, since x_i contains it). For the long run the
-same holds with flows in the place of visits and with the bias g of the Poisson equation g = (f - R) s + A (g + gain).
+With jump probabilities a_e = r_e / q, a change d(log theta) of a transition's rate or weight scales
+its edges' amounts. For x = b + A x this gives dx_0 / d(log theta) = sum over its edges of v_i a_e
+(x_j - x_i) with v the expected visits before the end (one adjoint solve for all parameters; the
+sojourn's own change is inside, since x_i contains it). For the long run the same holds with flows
+in the place of visits and with the bias g of the Poisson equation g = (f - R) s + A (g + gain).
 Source: X.-R. Cao, Stochastic Learning and Optimization, Springer 2007, chapter 2.
 """
 
@@ -14,19 +16,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coordinator.analysis.completion import Completion
-from coordinator.analysis.graph import Index, sum_by
-from coordinator.analysis.gspn import Chain, Values
-from coordinator.analysis.linear import DENSE, SWEEPS, Coarse, NotConverged, triangular
-from coordinator.analysis.markov import LongRun, visits_before
+from petrobot.coordinator.analysis.completion import Completion
+from petrobot.coordinator.analysis.graph import Index, sum_by
+from petrobot.coordinator.analysis.gspn import Chain, Values
+from petrobot.coordinator.analysis.linear import DENSE, SWEEPS, Coarse, NotConverged, triangular
+from petrobot.coordinator.analysis.markov import LongRun, visits_before
 
 
 @dataclass(frozen=True, slots=True)
 class Slope:
-    """How a number answers to one parameter: `derivative` in its own unit, `elasticity` in per cent per per cent.
+    """How a number answers to one parameter: `derivative` in its own unit, `elasticity` in per cent
+    per per cent.
 
-    For immediate transitions of one random switch whose weights are probabilities, `derivative` is per weight; move
-    probability between two branches by taking the difference of their derivatives.
+    For immediate transitions of one random switch whose weights are probabilities, `derivative` is
+    per weight; move probability between two branches by taking the difference of their derivatives.
     """
 
     transition: str
@@ -44,7 +47,9 @@ def slopes_of(chain: Chain, by_edge: Values, whole: float) -> dict[str, Slope]:
     for t, name in enumerate(gspn.net.transitions):
         rate = gspn.rate[t]
         value = rate if rate is not None else gspn.weight[t]
-        out[name] = Slope(name, value, float(logs[t] / value), float(logs[t] / whole) if whole else 0.0)
+        out[name] = Slope(
+            name, value, float(logs[t] / value), float(logs[t] / whole) if whole else 0.0
+        )
     return out
 
 
@@ -60,7 +65,8 @@ def time_slopes(done: Completion) -> dict[str, Slope]:
     chain, h, y = done.chain, done.h, done.y
     flow = _flow(done)
     transient = _transient(done)
-    # y = s h + A y: h itself moves too, weighted with the time spent: a second adjoint solve collects that.
+    # y = s h + A y: h itself moves too, weighted with the time spent: a second adjoint solve
+    # collects that.
     weighted = np.where(transient, _visits(done) * np.where(transient, chain.sojourn, 0.0), 0.0)
     second = visits_before(chain, transient, weighted)
     second_flow = second[chain.source] * chain.probability
@@ -97,12 +103,15 @@ def reward_slopes(
 ) -> dict[str, Slope]:
     """Derivatives of a mean reward per second (see `LongRun.reward`), by transition.
 
-    Raises ValueError where several bottom components are reached: then the mixture's weights would move as well.
+    Raises ValueError where several bottom components are reached: then the mixture's weights would
+    move as well.
     """
     chain = run.chain
     components = np.unique(chain.graph.components[np.flatnonzero(run.probability > 0)])
     if len(components) != 1:
-        raise ValueError("the long run settles in one of several components; ask for derivatives in each")
+        raise ValueError(
+            "the long run settles in one of several components; ask for derivatives in each"
+        )
     members = np.flatnonzero(chain.graph.components == components[0])
     gain = np.zeros(len(chain.gspn.net.transitions))
     for name, amount in (impulse or {}).items():
@@ -113,7 +122,9 @@ def reward_slopes(
     return slopes_of(chain, by_edge, reward)
 
 
-def _bias(chain: Chain, members: Index, reward: float, state: Values | None, gain: Values) -> Values:
+def _bias(
+    chain: Chain, members: Index, reward: float, state: Values | None, gain: Values
+) -> Values:
     """g = (f - R) s + A (g + gain) on one bottom component, with g = 0 at its first member."""
     if not chain.total[members].any():
         return np.zeros(chain.n)  # an absorbing marking: nothing moves, so nothing can be moved
@@ -131,7 +142,8 @@ def _bias(chain: Chain, members: Index, reward: float, state: Values | None, gai
 
 
 def _singular(n: int, rows: Index, columns: Index, value: Values, right: Values) -> Values:
-    """A solution of x = right + A x for a stochastic A and a consistent right side, with x_0 = 0."""
+    """A solution of x = right + A x for a stochastic A and a consistent right side, with x_0 =
+    0."""
     if n <= DENSE:
         matrix = np.eye(n)
         np.subtract.at(matrix, (rows, columns), value)
@@ -150,4 +162,6 @@ def _singular(n: int, rows: Index, columns: Index, value: Values, right: Values)
         if coarse.is_due(k):
             inverse = coarse.inverse(value, pinned=True) if inverse is None else inverse
             x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)
-    raise NotConverged(f"the bias still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps")
+    raise NotConverged(
+        f"the bias still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps"
+    )

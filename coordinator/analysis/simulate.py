@@ -1,7 +1,8 @@
-"""Token game and stochastic simulation, for nets whose chain is too large to solve; results carry confidence intervals.
+"""Token game and stochastic simulation, for nets whose chain is too large to solve; results carry
+confidence intervals.
 
-Many independent replicas are played side by side, a row of numpy operations moving all of them by one firing. The generator
-is passed in; the same generator gives the same result.
+Many independent replicas are played side by side, a row of numpy operations moving all of them by
+one firing. The generator is passed in; the same generator gives the same result.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.graph import Mask
-from coordinator.analysis.gspn import Gspn, Values
-from coordinator.analysis.pack import Tokens, effect, thresholds
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.graph import Mask
+from petrobot.coordinator.analysis.gspn import Gspn, Values
+from petrobot.coordinator.analysis.pack import Tokens, effect, thresholds
+from petrobot.coordinator.net import Marking, Net
 
 Stop = Callable[[Tokens], Mask]
-"""Tokens of shape (places, replicas) to which replicas have reached their goal, shape (replicas,)."""
+"""Tokens of shape (places, replicas) to which replicas have reached their goal, shape
+(replicas,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,11 @@ class Estimate:
         """Wilson interval for a probability."""
         z, p = _z(confidence), hits / n
         middle, half = p + z * z / (2 * n), z * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-        return cls(p, max(0.0, (middle - half) / (1 + z * z / n)), min(1.0, (middle + half) / (1 + z * z / n)))
+        return cls(
+            p,
+            max(0.0, (middle - half) / (1 + z * z / n)),
+            min(1.0, (middle + half) / (1 + z * z / n)),
+        )
 
     def covers(self, value: float) -> bool:
         """Whether the interval holds a value."""
@@ -59,9 +65,11 @@ def _z(confidence: float) -> float:
 
 @dataclass(frozen=True)
 class Simulation:
-    """What was seen. Long-run numbers are per replica over its observed time; completion is None without a goal.
+    """What was seen. Long-run numbers are per replica over its observed time; completion is None
+    without a goal.
 
-    `complete` is False where replicas were cut off by the limit of firings; `firings` counts all of them.
+    `complete` is False where replicas were cut off by the limit of firings; `firings` counts all of
+    them.
     """
 
     replicas: int
@@ -92,12 +100,15 @@ class _Replicas:
                 self.delta[p, t] = change
         self.limits = [sorted(thresholds(net, t).items()) for t in range(len(net.transitions))]
         levels = sorted(set(net.priority), reverse=True)
-        self.levels = [[t for t, own in enumerate(net.priority) if own == level] for level in levels]
+        self.levels = [
+            [t for t, own in enumerate(net.priority) if own == level] for level in levels
+        ]
         self.timed = np.array([r is not None for r in gspn.rate])
         self.tokens = np.repeat(np.array(net.initial, dtype=np.int64)[:, None], count, axis=1)
 
     def amounts(self) -> tuple[Values, Mask]:
-        """Amount of each enabled transition, shape (transitions, replicas), and which replicas are tangible."""
+        """Amount of each enabled transition, shape (transitions, replicas), and which replicas are
+        tangible."""
         count = self.tokens.shape[1]
         amount = np.zeros((len(self.net.transitions), count))
         beaten = np.zeros(count, dtype=np.bool_)
@@ -129,7 +140,9 @@ class _Replicas:
         if servers == 1 or not self.net.consume[t]:
             return np.asarray(able * rate)
         degree = np.min([self.tokens[p] // w for p, w in self.net.consume[t]], axis=0)
-        return np.asarray(able * rate * (degree if servers is None else np.minimum(degree, servers)))
+        return np.asarray(
+            able * rate * (degree if servers is None else np.minimum(degree, servers))
+        )
 
 
 def simulate(
@@ -145,19 +158,24 @@ def simulate(
     progress: Callable[[int, float], None] | None = None,
     engine: Literal["numpy", "numba"] = "numpy",
 ) -> Simulation:
-    """Play replicas from the initial marking until `horizon` (s) or their goal, at most `firings` in total.
+    """Play replicas from the initial marking until `horizon` (s) or their goal, at most `firings`
+    in total.
 
-    The engine "numba" (an extra) needs a horizon and knows no goal; its draws come in another order, so its numbers differ
-    from those of "numpy" within their intervals. Raises ImportError where it is not installed.
+    The engine "numba" (an extra) needs a horizon and knows no goal; its draws come in another
+    order, so its numbers differ from those of "numpy" within their intervals. Raises ImportError
+    where it is not installed.
 
-    Throughput and mean tokens are taken from `warmup` (s) on. Without a horizon a goal is needed, and replicas that are
-    dead before it count as not completed. `progress` is called with (firings, share of replicas still played).
-    Ctrl-C ends the play; the result is then marked as not complete.
+    Throughput and mean tokens are taken from `warmup` (s) on. Without a horizon a goal is needed,
+    and replicas that are dead before it count as not completed. `progress` is called with (firings,
+    share of replicas still played). Ctrl-C ends the play; the result is then marked as not
+    complete.
     """
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
     if engine == "numba":
-        return _compiled(gspn, random, replicas, horizon, warmup, goal, firings, confidence, progress)
+        return _compiled(
+            gspn, random, replicas, horizon, warmup, goal, firings, confidence, progress
+        )
     play = _Play(gspn, random, replicas, horizon, warmup, goal)
     try:
         while len(play.alive) and play.fired < firings:
@@ -181,13 +199,17 @@ def _compiled(
     progress: Callable[[int, float], None] | None,
 ) -> Simulation:
     """Replicas one after the other by the compiled kernel."""
-    from coordinator.analysis.simulate_kernel import Tables, play
-    from services.comm.compiled import plain
+    from petrobot.coordinator.analysis.simulate_kernel import Tables, play
+    from petrobot.services.comm.compiled import plain
 
     if plain(play) is play:
-        raise ImportError("the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'")
+        raise ImportError(
+            "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
+        )
     if goal is not None or not horizon < np.inf:
-        raise ValueError("the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal")
+        raise ValueError(
+            "the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal"
+        )
     tables, initial = Tables.of(gspn), np.array(gspn.net.initial, dtype=np.int64)
     fires = np.zeros((replicas, len(gspn.net.transitions)))
     area = np.zeros((replicas, len(gspn.net.places)))
@@ -205,7 +227,9 @@ def _compiled(
         pass
     seen = observed > 0
     complete = done == replicas and fired < firings
-    return _summed(gspn, fires[seen].T, area[seen].T, observed[seen], fired, replicas, complete, confidence)
+    return _summed(
+        gspn, fires[seen].T, area[seen].T, observed[seen], fired, replicas, complete, confidence
+    )
 
 
 def _summed(
@@ -218,14 +242,18 @@ def _summed(
     complete: bool,
     confidence: float,
 ) -> Simulation:
-    """Estimates from counts of shape (transitions, n), areas (places, n) and observed times (n,)."""
+    """Estimates from counts of shape (transitions, n), areas (places, n) and observed times
+    (n,)."""
     net = gspn.net
     rates = fires / observed if len(observed) else np.full((len(net.transitions), 1), np.nan)
     tokens = area / observed if len(observed) else np.full((len(net.places), 1), np.nan)
     return Simulation(
         replicas,
         fired,
-        {name: Estimate.of(row, confidence) for name, row in zip(net.transitions, rates, strict=True)},
+        {
+            name: Estimate.of(row, confidence)
+            for name, row in zip(net.transitions, rates, strict=True)
+        },
         {name: Estimate.of(row, confidence) for name, row in zip(net.places, tokens, strict=True)},
         None,
         None,
@@ -238,7 +266,13 @@ class _Play:
     """One simulation under way; `alive` are the replicas still played (columns of `state`)."""
 
     def __init__(
-        self, gspn: Gspn, random: np.random.Generator, count: int, horizon: float, warmup: float, goal: Stop | None
+        self,
+        gspn: Gspn,
+        random: np.random.Generator,
+        count: int,
+        horizon: float,
+        warmup: float,
+        goal: Stop | None,
     ) -> None:
         self.random, self.horizon, self.warmup, self.goal = random, horizon, warmup, goal
         self.state = _Replicas(gspn, count)
@@ -299,12 +333,23 @@ class _Play:
         seen = self.observed > 0
         complete = not len(self.alive) and not self.interrupted
         fires, area = self.fires[:, seen], self.area[:, seen]
-        bare = _summed(self.state.gspn, fires, area, self.observed[seen], self.fired, self.count, complete, confidence)
+        bare = _summed(
+            self.state.gspn,
+            fires,
+            area,
+            self.observed[seen],
+            self.fired,
+            self.count,
+            complete,
+            confidence,
+        )
         times = np.sort(self.reached[~np.isnan(self.reached)])
         judged = self.count - len(self.alive)
         return replace(
             bare,
-            completed=Estimate.share(len(times), judged, confidence) if self.goal is not None and judged else None,
+            completed=Estimate.share(len(times), judged, confidence)
+            if self.goal is not None and judged
+            else None,
             time=Estimate.of(times, confidence) if len(times) else None,
             times=times,
         )
@@ -328,7 +373,8 @@ def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
 
 
 def token_game(net: Net, random: np.random.Generator, firings: int) -> tuple[list[str], Marking]:
-    """A random firing sequence, each enabled transition equally likely, and the marking that it ends in."""
+    """A random firing sequence, each enabled transition equally likely, and the marking that it
+    ends in."""
     marking, played = net.initial, []
     for _ in range(firings):
         enabled = net.enabled(marking)

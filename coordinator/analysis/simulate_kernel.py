@@ -1,4 +1,5 @@
-"""The loop of the compiled simulation: one replica after the other, only the transitions that a firing touches are looked at.
+"""The loop of the compiled simulation: one replica after the other, only the transitions that a
+firing touches are looked at.
 
 Plain enough for numba, and the same, only slow, without it (services/comm/compiled.py).
 """
@@ -10,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.gspn import Gspn
-from coordinator.analysis.pack import dependents, effect, thresholds
-from services.comm.compiled import kernel
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.analysis.pack import dependents, effect, thresholds
+from petrobot.services.comm.compiled import kernel
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -34,11 +35,13 @@ class Tables(NamedTuple):
     move_change: Ints
     touch_first: Ints
     touch: Ints
-    """Transitions to look at again after a firing; behind the last transition's entries stand all of them, for the start."""
+    """Transitions to look at again after a firing; behind the last transition's entries stand all
+    of them, for the start."""
     base: Floats
     """Rate of a timed, weight of an immediate transition."""
     servers: Ints
-    """Servers of a timed transition; UNLIMITED; 1 for immediate ones and those that consume nothing."""
+    """Servers of a timed transition; UNLIMITED; 1 for immediate ones and those that consume
+    nothing."""
     priority: Ints
 
     @classmethod
@@ -49,9 +52,14 @@ class Tables(NamedTuple):
         need = [list(net.consume[t]) for t in count]
         bars = [sorted(thresholds(net, t).items()) for t in count]
         moves = [sorted(effect(net, t).items()) for t in count]
-        deps = [[(u, 0) for u in touched] for touched in dependents(net)] + [[(u, 0) for u in count]]
+        deps = [[(u, 0) for u in touched] for touched in dependents(net)] + [
+            [(u, 0) for u in count]
+        ]
         timed = [r is not None for r in gspn.rate]
-        servers = [(UNLIMITED if k is None else k) if on else 1 for k, on in zip(gspn.servers, timed, strict=True)]
+        servers = [
+            (UNLIMITED if k is None else k) if on else 1
+            for k, on in zip(gspn.servers, timed, strict=True)
+        ]
         return cls(
             *_ragged(need),
             *_ragged(bars),
@@ -66,7 +74,11 @@ class Tables(NamedTuple):
 def _ragged(rows: list[list[tuple[int, int]]]) -> tuple[Ints, Ints, Ints]:
     flat = [pair for row in rows for pair in row]
     first = np.cumsum([0, *map(len, rows)], dtype=np.int64)
-    return first, np.array([a for a, _ in flat], dtype=np.int64), np.array([b for _, b in flat], dtype=np.int64)
+    return (
+        first,
+        np.array([a for a, _ in flat], dtype=np.int64),
+        np.array([b for _, b in flat], dtype=np.int64),
+    )
 
 
 @kernel
@@ -88,9 +100,11 @@ def play(
     fires: Floats,
     area: Floats,
 ) -> tuple[int, float]:
-    """One replica until the horizon (s) or its budget of firings; gives (firings, time observed from warmup on).
+    """One replica until the horizon (s) or its budget of firings; gives (firings, time observed
+    from warmup on).
 
-    `fires` and `area` (tokens x s) get what happened from warmup on. One loop without helpers: a compiled call counts references.
+    `fires` and `area` (tokens x s) get what happened from warmup on. One loop without helpers: a
+    compiled call counts references.
     """
     need_first, need_place, need_weight, bar_first, bar_place, bar_threshold = tables[:6]
     move_first, move_place, move_change, touch_first, touch = tables[6:11]

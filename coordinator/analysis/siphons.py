@@ -1,14 +1,15 @@
 """Minimal siphons and traps by branch and bound on bit sets.
 
-A siphon is a set of places that, once empty, stays empty: whatever puts a token in also takes one out. A trap is a set
-that, once marked, stays marked. Arc weights, inhibitors, capacities and priorities do not enter.
+A siphon is a set of places that, once empty, stays empty: whatever puts a token in also takes one
+out. A trap is a set that, once marked, stays marked. Arc weights, inhibitors, capacities and
+priorities do not enter.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from coordinator.net import Marking, Net
+from petrobot.coordinator.net import Marking, Net
 
 EFFORT = 5_000
 """Branches looked at before the enumeration gives up."""
@@ -49,7 +50,8 @@ def largest_trap(net: Net, within: frozenset[int]) -> frozenset[int]:
 
 
 def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
-    """The largest siphon without a token in the marking (may be empty): its places can never be marked again."""
+    """The largest siphon without a token in the marking (may be empty): its places can never be
+    marked again."""
     inside = {p for p, n in enumerate(marking) if not n}
     while True:
         fed = {
@@ -64,11 +66,14 @@ def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
         inside -= fed
 
 
-def controlled_siphons(net: Net, effort: int = EFFORT, found: PlaceSets | None = None) -> bool | None:
-    """Whether every minimal siphon contains a trap marked initially (Commoner's condition); None if effort ran out.
+def controlled_siphons(
+    net: Net, effort: int = EFFORT, found: PlaceSets | None = None
+) -> bool | None:
+    """Whether every minimal siphon contains a trap marked initially (Commoner's condition); None if
+    effort ran out.
 
-    `found` are its minimal siphons if they are at hand. In a net with weight-1 arcs, without inhibitors, capacities and
-    priorities, that rules out a dead marking.
+    `found` are its minimal siphons if they are at hand. In a net with weight-1 arcs, without
+    inhibitors, capacities and priorities, that rules out a dead marking.
     """
     found = found or minimal_siphons(net, effort)
     if any(not any(net.initial[p] for p in largest_trap(net, siphon)) for siphon in found.sets):
@@ -81,10 +86,11 @@ def _masks(net: Net, arcs: str) -> list[int]:
 
 
 def _closed_sets(net: Net, consume: list[int], produce: list[int], effort: int) -> PlaceSets:
-    """Sets S with: whatever produces into S consumes from S. Grown place by place from the smallest member on.
+    """Sets S with: whatever produces into S consumes from S. Grown place by place from the smallest
+    member on.
 
-    A branch adds one of the inputs of a transition that still feeds S freely; inputs tried before stay out, so each
-    minimal set is met once, along the branch that only adds its own members.
+    A branch adds one of the inputs of a transition that still feeds S freely; inputs tried before
+    stay out, so each minimal set is met once, along the branch that only adds its own members.
     """
     found: list[int] = []
     left = effort

@@ -1,8 +1,10 @@
-"""Reachability: all markings of a net in breadth-first order with its edges in compact arrays, within stated limits.
+"""Reachability: all markings of a net in breadth-first order with its edges in compact arrays,
+within stated limits.
 
-Three engines give identical answers, down to the numbering of markings and the order of edges: marking i is expanded
-before marking i + 1, transitions in order, and a new marking gets the next number. So an engine can go on where another
-one stopped: `auto` starts with plain integers, which need no set-up, and hands over to numpy when the net proves large.
+Three engines give identical answers, down to the numbering of markings and the order of edges:
+marking i is expanded before marking i + 1, transitions in order, and a new marking gets the next
+number. So an engine can go on where another one stopped: `auto` starts with plain integers, which
+need no set-up, and hands over to numpy when the net proves large.
 """
 
 from __future__ import annotations
@@ -15,26 +17,28 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.explore import Engine, Explored, Labels, Numbers
-from coordinator.analysis.explore_integers import IntegerEngine
-from coordinator.analysis.pack import Layout, Tokens, TooManyTokens, Words
-from coordinator.analysis.structure import place_bounds, place_semiflows
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.explore import Engine, Explored, Labels, Numbers
+from petrobot.coordinator.analysis.explore_integers import IntegerEngine
+from petrobot.coordinator.analysis.pack import Layout, Tokens, TooManyTokens, Words
+from petrobot.coordinator.analysis.structure import place_bounds, place_semiflows
+from petrobot.coordinator.net import Marking, Net
 
 EngineName = Literal["auto", "integers", "numpy", "numba"]
 
 HANDOVER = 10_000
 """Markings after which `auto` leaves plain integers."""
 NARROW = 8
-"""Value bits that plain integers start with for a place without a known bound: width costs them little."""
+"""Value bits that plain integers start with for a place without a known bound: width costs them
+little."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
     """When a search stops early; None means without limit.
 
-    `memory` is in bytes and counts what the engine itself holds. `seconds` needs a `clock` (s), since nothing here reads
-    a clock of its own. `progress` is called now and then with (markings found, markings expanded).
+    `memory` is in bytes and counts what the engine itself holds. `seconds` needs a `clock` (s),
+    since nothing here reads a clock of its own. `progress` is called now and then with (markings
+    found, markings expanded).
     """
 
     states: int | None = None
@@ -51,11 +55,13 @@ class Limits:
 
 @dataclass(frozen=True)
 class Space:
-    """The reachable markings found, numbered in breadth-first order (0 is the initial one), and their edges.
+    """The reachable markings found, numbered in breadth-first order (0 is the initial one), and
+    their edges.
 
-    Edge e of marking i, `row[i] <= e < row[i + 1]`, fires transition `label[e]` and leads to marking `target[e]`; the
-    edges of a marking stand in transition order (without kept edges `row` still counts them). If the search was cut
-    short, only the first `expanded` markings have their edges, `complete` is False and `reason` says why.
+    Edge e of marking i, `row[i] <= e < row[i + 1]`, fires transition `label[e]` and leads to
+    marking `target[e]`; the edges of a marking stand in transition order (without kept edges `row`
+    still counts them). If the search was cut short, only the first `expanded` markings have their
+    edges, `complete` is False and `reason` says why.
     """
 
     net: Net
@@ -122,7 +128,9 @@ class Space:
     @cached_property
     def bounds(self) -> tuple[int, ...]:
         """The most tokens seen in each place."""
-        return tuple(int(self.layout.tokens(self.words, p).max()) for p in range(len(self.net.places)))
+        return tuple(
+            int(self.layout.tokens(self.words, p).max()) for p in range(len(self.net.places))
+        )
 
     @cached_property
     def most_tokens(self) -> int:
@@ -145,7 +153,8 @@ class Space:
 
     @cached_property
     def parent_edge(self) -> NDArray[np.int64]:
-        """The first edge that leads to each marking: breadth-first numbering makes it one of a shortest path."""
+        """The first edge that leads to each marking: breadth-first numbering makes it one of a
+        shortest path."""
         parent = np.full(len(self), -1, dtype=np.int64)
         parent[self.target[::-1]] = np.arange(len(self.target) - 1, -1, -1)
         return parent
@@ -161,10 +170,11 @@ def explore(
 ) -> Space:
     """The reachable markings of a net from its initial one.
 
-    `bounds` (tokens by place, None: unknown; by default from the P-invariants) only size the fields; they need not be
-    right. With `edges=False` the edges are counted, not kept. Ctrl-C, limits and a place that outgrows 63 bits give the
-    partial space found so far, marked incomplete. Raises TooManyTokens if the initial marking has such a place and
-    ImportError if numba is asked for and not installed.
+    `bounds` (tokens by place, None: unknown; by default from the P-invariants) only size the
+    fields; they need not be right. With `edges=False` the edges are counted, not kept. Ctrl-C,
+    limits and a place that outgrows 63 bits give the partial space found so far, marked incomplete.
+    Raises TooManyTokens if the initial marking has such a place and ImportError if numba is asked
+    for and not installed.
     """
     limits = limits or Limits()
     started = limits.clock() if limits.clock else 0.0
@@ -174,7 +184,11 @@ def explore(
         budget = HANDOVER if engine == "auto" else None
     else:
         layout = Layout.for_net(net, bounds, 2)
-        name, found, budget = engine, _engine(engine, Explored.start(net, layout, edges), bounds), None
+        name, found, budget = (
+            engine,
+            _engine(engine, Explored.start(net, layout, edges), bounds),
+            None,
+        )
     try:
         reason = _run(found, limits, started, budget)
         if reason == _HAND_OVER:
@@ -197,26 +211,36 @@ _HAND_OVER = "hand over"
 
 
 def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> Engine:
-    """An engine of machine words that goes on from what was begun, in a layout as narrow as is known to suffice."""
+    """An engine of machine words that goes on from what was begun, in a layout as narrow as is
+    known to suffice."""
     seen = begun.layout.unpack_many(begun.words).max(axis=0).tolist()
-    known = bounds if bounds is not None else place_bounds(begun.net, place_semiflows(begun.net, 2 * len(seen)))
+    known = (
+        bounds
+        if bounds is not None
+        else place_bounds(begun.net, place_semiflows(begun.net, 2 * len(seen)))
+    )
     guess = [b if b is not None else 2 * top + 1 for b, top in zip(known, seen, strict=True)]
-    begun = begun.relaid(Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)]))
+    begun = begun.relaid(
+        Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)])
+    )
     if name == "numba":
-        from coordinator.analysis.explore_kernel import expand_block
-        from coordinator.analysis.explore_numba import NumbaEngine
-        from services.comm.compiled import plain
+        from petrobot.coordinator.analysis.explore_kernel import expand_block
+        from petrobot.coordinator.analysis.explore_numba import NumbaEngine
+        from petrobot.services.comm.compiled import plain
 
         if plain(expand_block) is expand_block:
-            raise ImportError("the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'")
+            raise ImportError(
+                "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
+            )
         return NumbaEngine(begun)
-    from coordinator.analysis.explore_numpy import NumpyEngine
+    from petrobot.coordinator.analysis.explore_numpy import NumpyEngine
 
     return NumpyEngine(begun)
 
 
 def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> str:
-    """Expand until done; gives the reason why it stopped early, or an empty text. Lets KeyboardInterrupt through."""
+    """Expand until done; gives the reason why it stopped early, or an empty text. Lets
+    KeyboardInterrupt through."""
     cap = min((n for n in (limits.states, budget) if n is not None), default=None)
     try:
         while engine.expand(cap):
@@ -226,7 +250,11 @@ def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> 
                 break
             if limits.memory is not None and engine.nbytes > limits.memory:
                 return f"memory limit of {limits.memory} bytes"
-            if limits.seconds is not None and limits.clock and limits.clock() - started > limits.seconds:
+            if (
+                limits.seconds is not None
+                and limits.clock
+                and limits.clock() - started > limits.seconds
+            ):
                 return f"time limit of {limits.seconds:g} s"
     except TooManyTokens as grown:
         return str(grown)
@@ -243,7 +271,9 @@ def _space(found: Explored, reason: str, engine: str) -> Space:
     row = np.full(len(found.words) + 1, found.row[-1], dtype=np.int64)
     row[: len(found.row)] = found.row
     states = len(found.words)
-    if reason and found.keep_edges:  # an interruption may have left markings whose edges are not yet in
+    if (
+        reason and found.keep_edges
+    ):  # an interruption may have left markings whose edges are not yet in
         states = int(found.target.max(initial=0)) + 1
     return Space(
         found.net,

@@ -1,9 +1,11 @@
-"""The stochastic view of a task: its ordinary net refined by choices, statuses, durations, events and timers (docs/analysis.md).
+"""The stochastic view of a task: its ordinary net refined by choices, statuses, durations, events
+and timers (docs/analysis.md).
 
-Every place and arc of the ordinary net stays, so dropping the added places projects each firing sequence on one of the
-ordinary net. An action place p gets, beside itself, `p.going` (a run goes on), `p.success`, `p.failure` and `p.error` (a run
-has ended and waits to be taken). Preselection: an immediate choice of the alternative (weight pi_a), an immediate choice of
-the status (q_as), then a phase-type delay of that status. Preempting events race with it. A preempted run's phases are
+Every place and arc of the ordinary net stays, so dropping the added places projects each firing
+sequence on one of the ordinary net. An action place p gets, beside itself, `p.going` (a run goes
+on), `p.success`, `p.failure` and `p.error` (a run has ended and waits to be taken). Preselection:
+an immediate choice of the alternative (weight pi_a), an immediate choice of the status (q_as), then
+a phase-type delay of that status. Preempting events race with it. A preempted run's phases are
 flushed at once, and a repeated run draws afresh.
 """
 
@@ -14,30 +16,35 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 
-from coordinator.analysis.gspn import Gspn
-from coordinator.analysis.phase_type import PhaseType, fit, gamma_quantile
-from coordinator.conditions import ConditionFault
-from coordinator.net import Marking, Net
-from coordinator.task import End, Estimate, Input, Kind, Place, Status, Task, Transition
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.analysis.phase_type import PhaseType, fit, gamma_quantile
+from petrobot.coordinator.conditions import ConditionFault
+from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.task import End, Estimate, Input, Kind, Place, Status, Task, Transition
 
 FLUSH, CHOICE = 3_000_000, 2_000_000
-"""Priorities of flushing and choosing; transitions of the task stand around TASK, moved by their own priorities."""
+"""Priorities of flushing and choosing; transitions of the task stand around TASK, moved by their
+own priorities."""
 TASK = 1_000_000
 STAGES = 8
-"""Phases of one duration at most unless told otherwise: several run side by side, so their product counts."""
+"""Phases of one duration at most unless told otherwise: several run side by side, so their product
+counts."""
 
 Weights = dict[str, int]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known from runs; whatever is missing falls back on the task file's declared estimates.
+    """What is known from runs; whatever is missing falls back on the task file's declared
+    estimates.
 
-    `runs[(place or primitive task, action)]` gives share, mean (s) and cv by status; `choice[primitive task][action]` the
-    current probability of each alternative; `waits[event]` the mean wait (s) of a transition for it; `switches[transition]`
-    the relative frequency of a condition among the transitions that compete with it. `preempted[(place, action)]` gives share, mean
-    and cv of the runs that each transition preempted; where all actions of a place have it, the preempting event is one of the
-    causes by which a run ends (its shares and those of `runs` sum to 1), not an independent race.
+    `runs[(place or primitive task, action)]` gives share, mean (s) and cv by status;
+    `choice[primitive task][action]` the current probability of each alternative; `waits[event]` the
+    mean wait (s) of a transition for it; `switches[transition]` the relative frequency of a
+    condition among the transitions that compete with it. `preempted[(place, action)]` gives share,
+    mean and cv of the runs that each transition preempted; where all actions of a place have it,
+    the preempting event is one of the causes by which a run ends (its shares and those of `runs`
+    sum to 1), not an independent race.
     """
 
     runs: Mapping[tuple[str, str], Mapping[Status, Estimate]] = field(default_factory=dict)
@@ -48,10 +55,12 @@ class Measured:
 
 
 def is_cause(transition: Transition) -> bool:
-    """Whether a preemption by this transition is a cause of its own by which a run ends, at a time of its own since it began.
+    """Whether a preemption by this transition is a cause of its own by which a run ends, at a time
+    of its own since it began.
 
-    So it is where an event or a timer takes one run and looks at no other one. A transition that fires as soon as its arcs allow
-    it (another run has ended, a token has come) only cuts the run off: the net says when, and the run would have ended otherwise.
+    So it is where an event or a timer takes one run and looks at no other one. A transition that
+    fires as soon as its arcs allow it (another run has ended, a token has come) only cuts the run
+    off: the net says when, and the run would have ended otherwise.
     """
     runs = [a for a in transition.inputs if a.end is not None]
     waits = bool(transition.events) or transition.after is not None
@@ -59,7 +68,8 @@ def is_cause(transition: Transition) -> bool:
 
 
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing
-    """Neither a measurement nor a declared estimate gives a number that the stochastic view needs."""
+    """Neither a measurement nor a declared estimate gives a number that the stochastic view
+    needs."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +79,15 @@ class StochasticView:
     task: Task
     gspn: Gspn
     origin: Mapping[str, str]
-    """By transition of the GSPN: the task's transition that it is a case of (choices, delays and flushes have none)."""
+    """By transition of the GSPN: the task's transition that it is a case of (choices, delays and
+    flushes have none)."""
     statuses: Mapping[str, tuple[str, str, Status]]
     """By immediate transition that draws a status: (place, action, status)."""
     assumptions: tuple[str, ...]
     """What was assumed because nothing was measured or declared, and approximations made."""
     fit_errors: Mapping[str, float]
-    """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or timer."""
+    """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or
+    timer."""
 
     def projected(self, marking: Marking) -> Marking:
         """The marking of the ordinary net behind a marking of the GSPN."""
@@ -91,9 +103,14 @@ class StochasticView:
 
 
 def stochastic_view(
-    task: Task, measured: Measured | None = None, *, stages: int = STAGES, timer_stages: int = STAGES
+    task: Task,
+    measured: Measured | None = None,
+    *,
+    stages: int = STAGES,
+    timer_stages: int = STAGES,
 ) -> StochasticView:
-    """The GSPN of a task. Raises NoEstimate, and ValueError for what this view cannot express (named, with a remedy)."""
+    """The GSPN of a task. Raises NoEstimate, and ValueError for what this view cannot express
+    (named, with a remedy)."""
     return _Derivation(task.flat, measured or Measured(), stages, timer_stages).result()
 
 
@@ -126,18 +143,32 @@ class _Derivation:
 
     def result(self) -> StochasticView:
         """The finished view."""
-        capacity = {p: c for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True) if c is not None}
-        net = Net.build(self.places, self.arcs, inhibitors=self.inhibit, capacity=capacity, priority=self.priority)
+        capacity = {
+            p: c
+            for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
+            if c is not None
+        }
+        net = Net.build(
+            self.places,
+            self.arcs,
+            inhibitors=self.inhibit,
+            capacity=capacity,
+            priority=self.priority,
+        )
         gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
         assumed = tuple(dict.fromkeys(self.assumptions))
         return StochasticView(self.task, gspn, self.origin, self.statuses, assumed, self.errors)
 
     # Transitions of the GSPN.
 
-    def _immediate(self, name: str, need: Weights, give: Weights, weight: float, priority: int) -> None:
+    def _immediate(
+        self, name: str, need: Weights, give: Weights, weight: float, priority: int
+    ) -> None:
         self.arcs[name], self.weights[name], self.priority[name] = (need, give), weight, priority
 
-    def _timed(self, name: str, need: Weights, give: Weights, rate: float, servers: int | None = None) -> None:
+    def _timed(
+        self, name: str, need: Weights, give: Weights, rate: float, servers: int | None = None
+    ) -> None:
         self.arcs[name], self.rates[name], self.servers[name] = (need, give), rate, servers
 
     # Action places.
@@ -152,7 +183,9 @@ class _Derivation:
         self.possible[name], self.phases[name] = set(), []
         laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
         alternatives = self._alternatives(place)
-        if alternatives and all((name, action) in self.measured.preempted for action in alternatives):
+        if alternatives and all(
+            (name, action) in self.measured.preempted for action in alternatives
+        ):
             self._causes(place, alternatives)
         for action, chosen in alternatives.items():
             self._choice(place, action, chosen)
@@ -162,18 +195,22 @@ class _Derivation:
             if not known:  # it was never seen to end by itself: it goes on until something takes it
                 self.phases[name].append(f"{name}.{action}")
         preempted = any(
-            a.place == name and a.end is End.PREEMPT for t in self.task.transitions.values() for a in t.inputs
+            a.place == name and a.end is End.PREEMPT
+            for t in self.task.transitions.values()
+            for a in t.inputs
         )
         if preempted and place.servers is not None and place.servers > 1:
             raise ValueError(
-                f"places.{name}: which of its {place.servers} runs a preempting transition takes is not kept in a GSPN; "
+                f"places.{name}: which of its {place.servers} runs a preempting transition "
+                "takes is not kept in a GSPN; "
                 "give the place one server for the forecast, or measure"
             )
         if preempted:
             self._flush(name)
 
     def _causes(self, place: Place, actions: Iterable[str]) -> None:
-        """Preemption as a cause by which a run ends: `p.by.t` waits for t to take the run, which goes on until then."""
+        """Preemption as a cause by which a run ends: `p.by.t` waits for t to take the run, which
+        goes on until then."""
         name = place.name
         for t in self.task.transitions.values():
             if is_cause(t) and any(a.place == name for a in t.inputs if a.end is not None):
@@ -194,7 +231,11 @@ class _Derivation:
             self.places |= dict.fromkeys(chain, 0)
             self.phases[name] += chain
             self._immediate(
-                f"{key} {i + 1}", {f"{name}.{action}": 1}, {chain[0]: 1}, estimate.share * branch.probability, CHOICE
+                f"{key} {i + 1}",
+                {f"{name}.{action}": 1},
+                {chain[0]: 1},
+                estimate.share * branch.probability,
+                CHOICE,
             )
             for phase, following in zip(chain, [*chain[1:], end], strict=True):
                 self._timed(phase, {phase: 1}, {following: 1}, branch.rate)
@@ -205,10 +246,13 @@ class _Derivation:
         if known is None:
             if len(primitive.alternatives) > 1:
                 self.assumptions.append(
-                    f"{primitive.name}: its alternatives are equally likely (no selector state given)"
+                    f"{primitive.name}: its alternatives are equally likely (no selector "
+                    "state given)"
                 )
             return {action: 1.0 / len(primitive.alternatives) for action in primitive.alternatives}
-        return {action: known[action] for action in primitive.alternatives if known.get(action, 0.0) > 0}
+        return {
+            action: known[action] for action in primitive.alternatives if known.get(action, 0.0) > 0
+        }
 
     def _estimates(self, place: Place, action: str) -> Mapping[Status, Estimate]:
         primitive = self.task.primitive_task_of(place.name)
@@ -217,10 +261,13 @@ class _Derivation:
                 return self.measured.runs[key]
         if not primitive.estimates:
             raise NoEstimate(
-                f"primitive_tasks.{primitive.name}: no run of {action} was measured and nothing is declared; "
+                f"primitive_tasks.{primitive.name}: no run of {action} was measured and "
+                "nothing is declared; "
                 f"add [primitive_tasks.{primitive.name}.estimates] or give measurements"
             )
-        self.assumptions.append(f"{primitive.name}: declared estimates of the task file, for want of measured runs")
+        self.assumptions.append(
+            f"{primitive.name}: declared estimates of the task file, for want of measured runs"
+        )
         return primitive.estimates
 
     def _choice(self, place: Place, action: str, chosen: float) -> None:
@@ -237,7 +284,8 @@ class _Derivation:
         estimate: Estimate,
         laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]],
     ) -> None:
-        """The draw of a status and the phases of its delay; equal laws of several actions share their phases."""
+        """The draw of a status and the phases of its delay; equal laws of several actions share
+        their phases."""
         name, key = place.name, f"{place.name}.{action}.{status}"
         self.possible[name].add(status)
         law = self._law(key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages)
@@ -247,17 +295,25 @@ class _Derivation:
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
             self.statuses[label] = (name, action, status)
-            self._immediate(label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE)
+            self._immediate(
+                label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE
+            )
 
     def _law(self, key: str, mean: float, variance: float, stages: int) -> PhaseType:
         if not mean > 0:
-            raise NoEstimate(f"{key}: a mean duration of {mean} s for a status that occurs; declare a positive one")
+            raise NoEstimate(
+                f"{key}: a mean duration of {mean} s for a status that occurs; declare a "
+                "positive one"
+            )
         law = fit(mean, variance, stages=stages)
         self.errors[key] = law.error_at_90(gamma_quantile(mean, variance))
         return law
 
-    def _phases(self, place: Place, status: Status, law: PhaseType, number: int) -> list[tuple[str, float]]:
-        """Chains of phases with one rate each; gives the places where a run enters and with which probability."""
+    def _phases(
+        self, place: Place, status: Status, law: PhaseType, number: int
+    ) -> list[tuple[str, float]]:
+        """Chains of phases with one rate each; gives the places where a run enters and with which
+        probability."""
         entries: list[tuple[str, float]] = []
         for j, rate in enumerate(dict.fromkeys(b.rate for b in law.branches)):
             branches = [b for b in law.branches if b.rate == rate]
@@ -269,13 +325,16 @@ class _Derivation:
             for i in range(1, longest):
                 self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate)
             need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
-            give = {f"{place.name}.{status}": 1} | ({f"{place.name}.server": 1} if place.servers is not None else {})
+            give = {f"{place.name}.{status}": 1} | (
+                {f"{place.name}.server": 1} if place.servers is not None else {}
+            )
             self._timed(f"{stem}{longest}", need, give, rate)
             entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
         return entries
 
     def _flush(self, name: str) -> None:
-        """What is left of a preempted run vanishes at once: its phase, and its server comes free."""
+        """What is left of a preempted run vanishes at once: its phase, and its server comes
+        free."""
         served = f"{name}.server" in self.places
         give = {f"{name}.server": 1} if served else {}
         for p in self.phases[name]:
@@ -295,7 +354,8 @@ class _Derivation:
             self._fires(t, name, need, give)
 
     def _cases(self, t: Transition) -> list[tuple[Weights, Weights]]:
-        """What a firing takes and gives, once for each combination of the statuses of the runs that it takes."""
+        """What a firing takes and gives, once for each combination of the statuses of the runs that
+        it takes."""
         net, index = self.task.net, self.task.net.transition_index[t.name]
         base_need = {net.places[p]: w for p, w in net.consume[index]}
         base_give = {net.places[p]: w for p, w in net.produce[index]}
@@ -304,7 +364,9 @@ class _Derivation:
                 for suffix in ("begin", "going"):
                     base_give[f"{output.place}.{suffix}"] = output.weight
         out = []
-        for combination in product(*(self._takings(t, arc) for arc in t.inputs if arc.end is not None)):
+        for combination in product(
+            *(self._takings(t, arc) for arc in t.inputs if arc.end is not None)
+        ):
             taken = [(place, status) for place, status, _, _ in combination if status is not None]
             if not self._may_hold(t, dict(taken)):
                 continue
@@ -316,8 +378,11 @@ class _Derivation:
             out.append((need, give))
         return out
 
-    def _takings(self, t: Transition, arc: Input) -> list[tuple[str, Status | None, Weights, Weights]]:
-        """The ways in which an arc may take its runs: (place, status if all have one, taken, given back)."""
+    def _takings(
+        self, t: Transition, arc: Input
+    ) -> list[tuple[str, Status | None, Weights, Weights]]:
+        """The ways in which an arc may take its runs: (place, status if all have one, taken, given
+        back)."""
         p, w = arc.place, arc.weight
         if arc.end is End.PREEMPT:
             cause = {self.by[p, t.name]: 1} if (p, t.name) in self.by else {}
@@ -325,16 +390,23 @@ class _Derivation:
         if arc.end is End.GOING:
             return [(p, None, {f"{p}.going": w}, {f"{p}.going": w})]
         if arc.end is End.ERROR:
-            return [(p, Status.ERROR, {f"{p}.{Status.ERROR}": w}, {})] if Status.ERROR in self.possible[p] else []
+            return (
+                [(p, Status.ERROR, {f"{p}.{Status.ERROR}": w}, {})]
+                if Status.ERROR in self.possible[p]
+                else []
+            )
         normal = [s for s in (Status.SUCCESS, Status.FAILURE) if s in self.possible[p]]
-        out: list[tuple[str, Status | None, Weights, Weights]] = [(p, s, {f"{p}.{s}": w}, {}) for s in normal]
+        out: list[tuple[str, Status | None, Weights, Weights]] = [
+            (p, s, {f"{p}.{s}": w}, {}) for s in normal
+        ]
         if len(normal) == 2:
             first, second = (f"{p}.{s}" for s in normal)
             out += [(p, None, {first: i, second: w - i}, {}) for i in range(1, w)]
         return out
 
     def _may_hold(self, t: Transition, status: Mapping[str, Status]) -> bool:
-        """Whether the condition can be true for these statuses (judged where it reads nothing else)."""
+        """Whether the condition can be true for these statuses (judged where it reads nothing
+        else)."""
         if t.when is None:
             return True
         values = {f"{place}.status": str(s) for place, s in status.items()}
@@ -364,23 +436,29 @@ class _Derivation:
             return 1.0
         known = self.measured.switches.get(t.name)
         if known is None:
-            self.assumptions.append(f"{t.name}: its condition is as often true as those that compete with it")
+            self.assumptions.append(
+                f"{t.name}: its condition is as often true as those that compete with it"
+            )
         return 1.0 if known is None else known
 
     def _wait(self, t: Transition) -> float:
-        """Mean time (s) until all events of a transition have come: the mean of the latest of exponentials."""
+        """Mean time (s) until all events of a transition have come: the mean of the latest of
+        exponentials."""
         means = []
         for event in t.events:
             mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
             if mean is None:
                 raise NoEstimate(
-                    f"events.{event}: no wait was measured and no mean_wait is declared; add mean_wait = SECONDS"
+                    f"events.{event}: no wait was measured and no mean_wait is declared; add "
+                    "mean_wait = SECONDS"
                 )
             if event not in self.measured.waits:
                 self.assumptions.append(f"{event}: declared mean wait of the task file")
             means.append(mean)
         if len(means) > 1:
-            self.assumptions.append(f"{t.name}: the wait for all its events is taken as one exponential")
+            self.assumptions.append(
+                f"{t.name}: the wait for all its events is taken as one exponential"
+            )
         whole = 0.0
         for chosen in range(1, 1 << len(means)):
             rate = sum(1 / m for i, m in enumerate(means) if chosen >> i & 1)
@@ -388,7 +466,8 @@ class _Derivation:
         return whole
 
     def _timer(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
-        """A fixed delay as Erlang phases counted in a place of its own, set back as soon as the transition is disabled."""
+        """A fixed delay as Erlang phases counted in a place of its own, set back as soon as the
+        transition is disabled."""
         assert t.after is not None
         law = self._law(f"{t.name}.after", t.after, 0.0, self.timer_stages)
         (branch,) = law.branches

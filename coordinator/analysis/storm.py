@@ -1,4 +1,5 @@
-"""A chain for Storm: the explicit DRN format of a CTMC over tangible markings, labelled by the places that are marked.
+"""A chain for Storm: the explicit DRN format of a CTMC over tangible markings, labelled by the
+places that are marked.
 
 Source: Storm's documentation of its explicit input, DRN (direct encoding).
 """
@@ -7,22 +8,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from coordinator.analysis.gspn import Chain
-from coordinator.analysis.markov import Generator
-from coordinator.analysis.netfile import FormatError
+from petrobot.coordinator.analysis.gspn import Chain
+from petrobot.coordinator.analysis.markov import Generator
+from petrobot.coordinator.analysis.netfile import FormatError
 
 
 def write_drn(chain: Chain) -> str:
     """The DRN text of a chain whose initial marking is tangible. Raises FormatError otherwise.
 
-    Labels are `init`, `deadlock`, and the name of each marked place with everything but letters, digits and _ replaced.
+    Labels are `init`, `deadlock`, and the name of each marked place with everything but letters,
+    digits and _ replaced.
     """
     if chain.vanishing[0]:
         remedy = "give the first transition a rate: a CTMC begins in one marking that lasts"
         raise FormatError("drn", "init", "the initial marking vanishes at once", remedy)
     made = Generator.of(chain)
     rates = (made.matrix.T * made.rate).tocsr()
-    marked = np.stack([chain.space.tokens(p)[made.tangible] > 0 for p in range(len(chain.space.net.places))])
+    marked = np.stack(
+        [chain.space.tokens(p)[made.tangible] > 0 for p in range(len(chain.space.net.places))]
+    )
     names = [_identifier(name) for name in chain.space.net.places]
     lines = [
         "// A GSPN's chain over its tangible markings, rates in 1/s",
@@ -32,11 +36,19 @@ def write_drn(chain: Chain) -> str:
         "@reward_models",
         "",
     ]
-    lines += ["@nr_states", str(len(made.tangible)), "@nr_choices", str(len(made.tangible)), "@model"]
+    lines += [
+        "@nr_states",
+        str(len(made.tangible)),
+        "@nr_choices",
+        str(len(made.tangible)),
+        "@model",
+    ]
     for i, n in enumerate(made.tangible.tolist()):
         first, last = rates.indptr[i], rates.indptr[i + 1]
         out = [
-            (int(j), float(r)) for j, r in zip(rates.indices[first:last], rates.data[first:last], strict=True) if j != i
+            (int(j), float(r))
+            for j, r in zip(rates.indices[first:last], rates.data[first:last], strict=True)
+            if j != i
         ]
         out = [(j, r) for j, r in sorted(out) if r > 0]
         total = sum(r for _, r in out)

@@ -1,4 +1,5 @@
-"""What the arcs of a net alone say, as plain data: invariants, siphons and traps, conflicts, conservativeness."""
+"""What the arcs of a net alone say, as plain data: invariants, siphons and traps, conflicts,
+conservativeness."""
 
 from __future__ import annotations
 
@@ -6,8 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from coordinator.analysis.siphons import PlaceSets, controlled_siphons, minimal_siphons, minimal_traps
-from coordinator.analysis.structure import (
+from petrobot.coordinator.analysis.siphons import (
+    PlaceSets,
+    controlled_siphons,
+    minimal_siphons,
+    minimal_traps,
+)
+from petrobot.coordinator.analysis.structure import (
     Semiflows,
     conflict_sets,
     exclusive_places,
@@ -16,7 +22,7 @@ from coordinator.analysis.structure import (
     place_semiflows,
     transition_semiflows,
 )
-from coordinator.net import Net
+from petrobot.coordinator.net import Net
 
 
 @dataclass(frozen=True)
@@ -50,8 +56,13 @@ class Structure:
         places, transitions = self.net.places, self.net.transitions
         function = lyapunov(self.net)
         return {
-            "p_invariants": [{places[p]: n for p, n in sorted(y.items())} for y in self.place_flows.vectors],
-            "t_invariants": [{transitions[t]: n for t, n in sorted(x.items())} for x in self.transition_flows.vectors],
+            "p_invariants": [
+                {places[p]: n for p, n in sorted(y.items())} for y in self.place_flows.vectors
+            ],
+            "t_invariants": [
+                {transitions[t]: n for t, n in sorted(x.items())}
+                for x in self.transition_flows.vectors
+            ],
             "invariants_complete": self.place_flows.complete and self.transition_flows.complete,
             "siphons": [sorted(places[p] for p in s) for s in self.siphons.sets],
             "traps": [sorted(places[p] for p in s) for s in self.traps.sets],
@@ -60,7 +71,11 @@ class Structure:
             "structurally_bounded": function is not None,
             "conservative": function is not None and function.conserved,
             "strictly_conservative": is_strictly_conservative(self.net),
-            "lyapunov": {places[p]: n for p, n in sorted(function.weights.items())} if function else None,
+            "lyapunov": {places[p]: n for p, n in sorted(function.weights.items())}
+            if function
+            else None,
             "conflicts": [[transitions[t] for t in group] for group in conflict_sets(self.net)],
-            "exclusive_places": sorted([places[p], places[q]] for p, q in exclusive_places(self.net, self.place_flows)),
+            "exclusive_places": sorted(
+                [places[p], places[q]] for p, q in exclusive_places(self.net, self.place_flows)
+            ),
         }

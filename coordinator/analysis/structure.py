@@ -1,9 +1,11 @@
-"""What a net's arcs alone prove: invariants, bounds, conservativeness, conflicts; exact integer certificates.
+"""What a net's arcs alone prove: invariants, bounds, conservativeness, conflicts; exact integer
+certificates.
 
-All of it reads the incidence matrix C = Post - Pre. An inhibitor, a capacity or a priority only removes behaviour, so what
-holds here for every firing sequence (bounds, P-invariants, exclusion) holds in the restricted net as well; T-invariants,
-siphons and traps are those of the net without them. Source of the notions: T. Murata, Petri nets: properties, analysis
-and applications, Proc. IEEE 77 (1989), sections V to VII.
+All of it reads the incidence matrix C = Post - Pre. An inhibitor, a capacity or a priority only
+removes behaviour, so what holds here for every firing sequence (bounds, P-invariants, exclusion)
+holds in the restricted net as well; T-invariants, siphons and traps are those of the net without
+them. Source of the notions: T. Murata, Petri nets: properties, analysis and applications, Proc.
+IEEE 77 (1989), sections V to VII.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ from math import gcd
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.pack import effect
-from coordinator.net import Net
+from petrobot.coordinator.analysis.pack import effect
+from petrobot.coordinator.net import Net
 
 EFFORT = 2_000
 """Rows that the enumeration of semiflows may hold at a time."""
@@ -65,7 +67,8 @@ def transition_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
 
 
 def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
-    """Minimal-support non-negative combinations of the rows that give zero (Farkas' algorithm, as by Colom & Silva)."""
+    """Minimal-support non-negative combinations of the rows that give zero (Farkas' algorithm, as
+    by Colom & Silva)."""
     live = [({i: 1}, dict(row)) for i, row in enumerate(rows)]
     while True:
         columns = _signs(live)
@@ -81,7 +84,8 @@ def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
 
 
 def _signs(live: list[tuple[Vector, Vector]]) -> dict[int, list[int]]:
-    """For each column that is not yet zero everywhere: how many rows are positive and negative there."""
+    """For each column that is not yet zero everywhere: how many rows are positive and negative
+    there."""
     signs: dict[int, list[int]] = {}
     for _, rest in live:
         for column, value in rest.items():
@@ -90,7 +94,8 @@ def _signs(live: list[tuple[Vector, Vector]]) -> dict[int, list[int]]:
 
 
 def _annul(live: list[tuple[Vector, Vector]], column: int) -> list[tuple[Vector, Vector]]:
-    """Replace the rows that are not zero in the column by their combinations that are; keep minimal supports."""
+    """Replace the rows that are not zero in the column by their combinations that are; keep minimal
+    supports."""
     kept = [row for row in live if column not in row[1]]
     plus = [row for row in live if row[1].get(column, 0) > 0]
     minus = [row for row in live if row[1].get(column, 0) < 0]
@@ -100,7 +105,9 @@ def _annul(live: list[tuple[Vector, Vector]], column: int) -> list[tuple[Vector,
             u, v = -b[1][column], a[1][column]
             y, rest = _combined(a[0], u, b[0], v), _combined(a[1], u, b[1], v)
             shared = gcd(*y.values(), *rest.values())
-            fresh.append(({i: n // shared for i, n in y.items()}, {i: n // shared for i, n in rest.items()}))
+            fresh.append(
+                ({i: n // shared for i, n in y.items()}, {i: n // shared for i, n in rest.items()})
+            )
     return _minimal_supports(kept, fresh) if fresh else kept
 
 
@@ -114,17 +121,25 @@ def _combined(a: Vector, u: int, b: Vector, v: int) -> Vector:
 def _minimal_supports(
     kept: list[tuple[Vector, Vector]], fresh: list[tuple[Vector, Vector]]
 ) -> list[tuple[Vector, Vector]]:
-    """Those rows whose support contains no other one (of equal ones one stays); the kept ones are minimal already."""
+    """Those rows whose support contains no other one (of equal ones one stays); the kept ones are
+    minimal already."""
     old = [(sum(1 << i for i in row[0]), row) for row in kept]
     new: list[tuple[int, tuple[Vector, Vector]]] = []
-    for mask, row in sorted(((sum(1 << i for i in row[0]), row) for row in fresh), key=lambda one: one[0].bit_count()):
-        if not any(mask & other == other for other, _ in new) and not any(mask & other == other for other, _ in old):
+    for mask, row in sorted(
+        ((sum(1 << i for i in row[0]), row) for row in fresh), key=lambda one: one[0].bit_count()
+    ):
+        if not any(mask & other == other for other, _ in new) and not any(
+            mask & other == other for other, _ in old
+        ):
             new.append((mask, row))
-    return [row for mask, row in old if not any(mask & other == other for other, _ in new)] + [row for _, row in new]
+    return [row for mask, row in old if not any(mask & other == other for other, _ in new)] + [
+        row for _, row in new
+    ]
 
 
 def invariant_basis(rows: Sequence[Vector]) -> list[Vector]:
-    """An integer basis of all combinations (signs allowed) of the rows that give zero: sparse elimination."""
+    """An integer basis of all combinations (signs allowed) of the rows that give zero: sparse
+    elimination."""
     work = [(dict(row), {i: 1}) for i, row in enumerate(rows)]
     basis, pivots = [], list[tuple[int, Vector, Vector]]()
     for rest, y in work:
@@ -142,11 +157,16 @@ def invariant_basis(rows: Sequence[Vector]) -> list[Vector]:
 
 
 def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
-    """The most tokens each place can hold by P-semiflows and capacities; None where these prove nothing.
+    """The most tokens each place can hold by P-semiflows and capacities; None where these prove
+    nothing.
 
-    y^T M = y^T M0 in every reachable M gives M(p) <= y^T M0 / y(p). Sound with inhibitors and priorities.
+    y^T M = y^T M0 in every reachable M gives M(p) <= y^T M0 / y(p). Sound with inhibitors and
+    priorities.
     """
-    bounds = [limit if limit is None else max(limit, n) for limit, n in zip(net.capacity, net.initial, strict=True)]
+    bounds = [
+        limit if limit is None else max(limit, n)
+        for limit, n in zip(net.capacity, net.initial, strict=True)
+    ]
     for y in (flows or place_semiflows(net)).vectors:
         total = sum(weight * net.initial[p] for p, weight in y.items())
         for p, weight in y.items():
@@ -156,9 +176,11 @@ def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
 
 
 def linear_bound(net: Net, place: int) -> int | None:
-    """The most tokens of a place over all M = M0 + C x >= 0, x >= 0 (state equation as a linear program); None: none.
+    """The most tokens of a place over all M = M0 + C x >= 0, x >= 0 (state equation as a linear
+    program); None: none.
 
-    The exact value may be smaller, never larger. Capacities are taken in; inhibitors and priorities are relaxed.
+    The exact value may be smaller, never larger. Capacities are taken in; inhibitors and priorities
+    are relaxed.
     """
     from scipy.optimize import linprog
 
@@ -173,7 +195,8 @@ def linear_bound(net: Net, place: int) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class Lyapunov:
-    """A linear Lyapunov function y.M of a net: y > 0 (by place), y^T C <= 0, so y.M never grows (checked in integers)."""
+    """A linear Lyapunov function y.M of a net: y > 0 (by place), y^T C <= 0, so y.M never grows
+    (checked in integers)."""
 
     weights: Vector
     conserved: bool
@@ -185,10 +208,12 @@ class Lyapunov:
 
 
 def lyapunov(net: Net) -> Lyapunov | None:
-    """A positive integer y with y^T C <= 0, which makes the net bounded from every initial marking; None if none exists.
+    """A positive integer y with y^T C <= 0, which makes the net bounded from every initial marking;
+    None if none exists.
 
-    The sum of all P-semiflows where they cover the places, else of the minimal y >= 0 with y^T C <= 0 where their enumeration
-    stays small, else a linear program whose solution is made rational and checked exactly.
+    The sum of all P-semiflows where they cover the places, else of the minimal y >= 0 with y^T C <=
+    0 where their enumeration stays small, else a linear program whose solution is made rational and
+    checked exactly.
     """
     flows = place_semiflows(net)
     if flows.covers(len(net.places)):
@@ -205,22 +230,32 @@ def lyapunov(net: Net) -> Lyapunov | None:
     if falling.complete:
         places = len(net.places)
         sums = {p: sum(y.get(p, 0) for y in falling.vectors) for p in range(places)}
-        return _exact(net, np.array([float(sums[p]) for p in range(places)])) if all(sums.values()) else None
+        return (
+            _exact(net, np.array([float(sums[p]) for p in range(places)]))
+            if all(sums.values())
+            else None
+        )
     from scipy.optimize import linprog
 
     C = incidence(net).astype(float)
     n = len(net.places)
-    found = linprog(np.ones(n), A_ub=C.T, b_ub=np.zeros(C.shape[1]), bounds=[(1, None)] * n, method="highs")
+    found = linprog(
+        np.ones(n), A_ub=C.T, b_ub=np.zeros(C.shape[1]), bounds=[(1, None)] * n, method="highs"
+    )
     return _exact(net, found.x) if found.status == 0 else None
 
 
 def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
-    """Integer weights near a multiple of y that satisfy y^T C <= 0 exactly, if a small denominator does."""
+    """Integer weights near a multiple of y that satisfy y^T C <= 0 exactly, if a small denominator
+    does."""
     for largest in (1, 12, 1000, 10**6):
         near = [Fraction(float(v)).limit_denominator(largest) for v in y]
         scale = int(np.lcm.reduce([f.denominator for f in near])) if near else 1
         weights = {p: int(f * scale) for p, f in enumerate(near)}
-        drift = [sum(weights[p] * c for p, c in effect(net, t).items()) for t in range(len(net.transitions))]
+        drift = [
+            sum(weights[p] * c for p, c in effect(net, t).items())
+            for t in range(len(net.transitions))
+        ]
         if all(w > 0 for w in weights.values()) and all(d <= 0 for d in drift):
             return Lyapunov(weights, not any(drift))
     return None
@@ -232,7 +267,8 @@ def is_strictly_conservative(net: Net) -> bool:
 
 
 def conflict_sets(net: Net) -> list[tuple[int, ...]]:
-    """Groups of transitions that share an input place, directly or through others (of more than one member)."""
+    """Groups of transitions that share an input place, directly or through others (of more than one
+    member)."""
     group = list(range(len(net.transitions)))
 
     def root(t: int) -> int:
@@ -257,5 +293,7 @@ def exclusive_places(net: Net, flows: Semiflows) -> set[tuple[int, int]]:
     for y in flows.vectors:
         total = sum(weight * net.initial[p] for p, weight in y.items())
         support = sorted(y)
-        pairs.update((p, q) for i, p in enumerate(support) for q in support[i + 1 :] if y[p] + y[q] > total)
+        pairs.update(
+            (p, q) for i, p in enumerate(support) for q in support[i + 1 :] if y[p] + y[q] > total
+        )
     return pairs

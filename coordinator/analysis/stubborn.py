@@ -1,8 +1,9 @@
 """A fast hunt for deadlocks: at each marking only a stubborn set of transitions is followed.
 
-Every dead marking of the net is also reached through stubborn sets, mostly along far fewer markings. Source: A. Valmari,
-Stubborn sets for reduced state space generation (1991). Whether one transition can disable another is judged by arcs alone:
-it takes what the other needs, or gives what the other's inhibitor or capacity forbids.
+Every dead marking of the net is also reached through stubborn sets, mostly along far fewer
+markings. Source: A. Valmari, Stubborn sets for reduced state space generation (1991). Whether one
+transition can disable another is judged by arcs alone: it takes what the other needs, or gives what
+the other's inhibitor or capacity forbids.
 """
 
 from __future__ import annotations
@@ -10,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from coordinator.analysis.pack import effect, thresholds
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.pack import effect, thresholds
+from petrobot.coordinator.net import Marking, Net
 
 EFFORT = 100_000
 """Markings looked at before giving up."""
@@ -19,7 +20,8 @@ EFFORT = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Hunt:
-    """`firings` lead to a dead marking that is not final; None with `complete` proves that there is none."""
+    """`firings` lead to a dead marking that is not final; None with `complete` proves that there is
+    none."""
 
     firings: tuple[str, ...] | None
     states: int
@@ -51,10 +53,13 @@ class _Relations:
         return cls(tuple(tuple(sorted(c)) for c in conflicts), raising, lowering, limits)
 
 
-def hunt_deadlock(net: Net, *, final: Callable[[Marking], bool] | None = None, effort: int = EFFORT) -> Hunt:
+def hunt_deadlock(
+    net: Net, *, final: Callable[[Marking], bool] | None = None, effort: int = EFFORT
+) -> Hunt:
     """Look for a dead marking that is not final, depth first through stubborn sets.
 
-    Nets with priorities are searched in full, since there a lower transition depends on every higher one.
+    Nets with priorities are searched in full, since there a lower transition depends on every
+    higher one.
     """
     relations = _Relations.of(net) if len(set(net.priority)) <= 1 else None
     seen = {net.initial}
@@ -99,7 +104,8 @@ def _stubborn(net: Net, relations: _Relations, marking: Marking, enabled: list[i
 def _closure(
     net: Net, relations: _Relations, marking: Marking, able: frozenset[int], seed: int, worst: int
 ) -> list[int] | None:
-    """Enabled members of a stubborn set that holds the seed; None as soon as there are `worst` of them."""
+    """Enabled members of a stubborn set that holds the seed; None as soon as there are `worst` of
+    them."""
     inside, waiting, members = {seed}, [seed], []
     while waiting:
         t = waiting.pop()
@@ -117,7 +123,9 @@ def _closure(
     return members
 
 
-def _reason(net: Net, relations: _Relations, marking: Marking, t: int, inside: set[int]) -> tuple[int, ...]:
+def _reason(
+    net: Net, relations: _Relations, marking: Marking, t: int, inside: set[int]
+) -> tuple[int, ...]:
     """Transitions of which one must fire before t can be enabled; the choice that adds fewest."""
     choices = [relations.raising[p] for p, w in net.consume[t] if marking[p] < w]
     choices += [relations.lowering[p] for p, k in relations.limits[t].items() if marking[p] >= k]

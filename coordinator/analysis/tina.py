@@ -1,15 +1,16 @@
-"""TINA's textual nets (`.net`): places, transitions, weights `p*2`, test arcs `p?2`, inhibitor arcs `p?-2`, priorities.
+"""TINA's textual nets (`.net`): places, transitions, weights `p*2`, test arcs `p?2`, inhibitor arcs
+`p?-2`, priorities.
 
-A transition's time interval is refused unless it says nothing ([0,w[); labels are kept, notes are listed. Source: manual
-page formats(n) of the TINA toolbox.
+A transition's time interval is refused unless it says nothing ([0,w[); labels are kept, notes are
+listed. Source: manual page formats(n) of the TINA toolbox.
 """
 
 from __future__ import annotations
 
 import re
 
-from coordinator.analysis.netfile import FormatError, NetDraft, NetFile
-from coordinator.net import Net
+from petrobot.coordinator.analysis.netfile import FormatError, NetDraft, NetFile
+from petrobot.coordinator.net import Net
 
 TOKEN = re.compile(r"\{(?:\\.|[^}\\])*\}|->|[^\s{]+")
 PLAIN = re.compile(r"[A-Za-z_'][\w']*\Z")
@@ -48,14 +49,25 @@ class _Reading:
             case "lb":
                 self.labels[_bare(words[1])] = _bare(words[2])
             case "pr":
-                split = words.index(">") if ">" in words else words.index("<") if "<" in words else len(words)
-                first, second = ([_bare(w) for w in part] for part in (words[1:split], words[split + 1 :]))
+                split = (
+                    words.index(">")
+                    if ">" in words
+                    else words.index("<")
+                    if "<" in words
+                    else len(words)
+                )
+                first, second = (
+                    [_bare(w) for w in part] for part in (words[1:split], words[split + 1 :])
+                )
                 self.above.append((first, second) if ">" in words else (second, first))
             case "nt":
                 self.notes.append(f"{at}: a note")
             case other:
                 raise FormatError(
-                    self.file, at, f"a line that begins with {other!r}", "net, tr, pl, lb, pr, nt are known"
+                    self.file,
+                    at,
+                    f"a line that begins with {other!r}",
+                    "net, tr, pl, lb, pr, nt are known",
                 )
 
     def _transition(self, words: list[str], at: str) -> None:
@@ -68,10 +80,17 @@ class _Reading:
             self.labels[name], rest = _bare(rest[1]), rest[2:]
         if rest and rest[0][0] in "[]":
             if rest[0] not in ("[0,w[", "[0,inf["):
-                raise FormatError(self.file, at, f"a time interval {rest[0]}", "only untimed nets are read: remove it")
+                raise FormatError(
+                    self.file,
+                    at,
+                    f"a time interval {rest[0]}",
+                    "only untimed nets are read: remove it",
+                )
             rest = rest[1:]
         if "->" not in rest:
-            raise FormatError(self.file, at, "no -> in a transition", "write tr NAME INPUTS -> OUTPUTS")
+            raise FormatError(
+                self.file, at, "no -> in a transition", "write tr NAME INPUTS -> OUTPUTS"
+            )
         arrow = rest.index("->")
         for word in _joined(rest[:arrow]):
             self._arc(word, name, at, True)
@@ -84,7 +103,9 @@ class _Reading:
         if suffix:
             found = ARC.match(suffix)
             if found is None or found["kind"][0] == "!" or (found["kind"] != "*" and not into):
-                raise FormatError(self.file, at, f"an arc {word!r}", "arcs are p, p*2, p?2 and p?-2")
+                raise FormatError(
+                    self.file, at, f"an arc {word!r}", "arcs are p, p*2, p?2 and p?-2"
+                )
             kind = {"*": "normal", "?": "test", "?-": "inhibitor"}[found["kind"]]
             weight = _number(found["weight"])
         self.tokens.setdefault(place, 0)
@@ -99,7 +120,9 @@ class _Reading:
             self.labels[name], rest = _bare(rest[1]), rest[2:]
         for word in rest:
             if not re.fullmatch(r"\(\d+[KMGT]?\)", word):
-                raise FormatError(self.file, at, f"{word!r} behind a place", "write pl NAME (TOKENS)")
+                raise FormatError(
+                    self.file, at, f"{word!r} behind a place", "write pl NAME (TOKENS)"
+                )
             self.tokens[name] += _number(word[1:-1])
 
     def result(self) -> NetFile:
@@ -117,7 +140,8 @@ class _Reading:
         return NetFile(draft.net(), self.name, None, labels, {}, (*draft.notes, *self.notes))
 
     def _priorities(self) -> dict[str, int]:
-        """Levels for the pairwise relation; refused where levels would add pairs that the file does not say."""
+        """Levels for the pairwise relation; refused where levels would add pairs that the file does
+        not say."""
         pairs = {(high, low) for highs, lows in self.above for high in highs for low in lows}
         if not pairs:
             return {}
@@ -146,7 +170,9 @@ def _joined(words: list[str]) -> list[str]:
 def _split(word: str) -> tuple[str, str]:
     """(place, suffix that says kind and weight)."""
     end = (
-        word.rindex("}") + 1 if word.startswith("{") else next((i for i, c in enumerate(word) if c in "*?!"), len(word))
+        word.rindex("}") + 1
+        if word.startswith("{")
+        else next((i for i, c in enumerate(word) if c in "*?!"), len(word))
     )
     return _bare(word[:end]), word[end:]
 
@@ -176,7 +202,7 @@ def losses(model: NetFile) -> list[str]:
 
 def write_tina(model: NetFile) -> str:
     """The TINA text of a net; capacities become inhibitor arcs with the same effect."""
-    from coordinator.analysis.pack import thresholds
+    from petrobot.coordinator.analysis.pack import thresholds
 
     net = model.net
     lines = [f"net {_quoted(model.name or 'net')}"]
@@ -184,7 +210,9 @@ def write_tina(model: NetFile) -> str:
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
         below = sorted(thresholds(net, t).items())
         if any(k < 1 for _, k in below):
-            raise FormatError("net", f"transition {name}", "its capacity can never be kept", "raise the capacity")
+            raise FormatError(
+                "net", f"transition {name}", "its capacity can never be kept", "raise the capacity"
+            )
         need = [_quoted(net.places[p]) + (f"*{w}" if w > 1 else "") for p, w in net.consume[t]]
         need += [f"{_quoted(net.places[p])}?-{k}" for p, k in below]
         give = [_quoted(net.places[p]) + (f"*{w}" if w > 1 else "") for p, w in net.produce[t]]
@@ -196,7 +224,11 @@ def write_tina(model: NetFile) -> str:
     levels = sorted(set(net.priority))
     for low, high in ((low, high) for i, low in enumerate(levels) for high in levels[i + 1 :]):
         first, second = (
-            " ".join(_quoted(n) for n, own in zip(net.transitions, net.priority, strict=True) if own == level)
+            " ".join(
+                _quoted(n)
+                for n, own in zip(net.transitions, net.priority, strict=True)
+                if own == level
+            )
             for level in (high, low)
         )
         lines.append(f"pr {first} > {second}")

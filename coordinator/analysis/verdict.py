@@ -1,4 +1,5 @@
-"""What every answer of the analysis carries: verdict, reason, witness, assumption, and whether the search was complete."""
+"""What every answer of the analysis carries: verdict, reason, witness, assumption, and whether the
+search was complete."""
 
 from __future__ import annotations
 
@@ -8,10 +9,11 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A firing sequence from the initial marking that shows the verdict; `Net.replay(firings)` repeats it.
+    """A firing sequence from the initial marking that shows the verdict; `Net.replay(firings)`
+    repeats it.
 
-    `loop` may be fired again and again after `firings` (a pump, or a cycle that is never left); `marking` is the marked
-    places after `firings`.
+    `loop` may be fired again and again after `firings` (a pump, or a cycle that is never left);
+    `marking` is the marked places after `firings`.
     """
 
     firings: tuple[str, ...]
@@ -28,8 +30,9 @@ class Witness:
 class Verdict:
     """`holds` is True, False or None (unknown); `reason` says why in words for people.
 
-    `assumption` is what it takes for the verdict on the ordinary net to hold for the executed task (empty: nothing more);
-    `complete` whether all reachable markings stand behind it (a False verdict with a witness needs no complete search).
+    `assumption` is what it takes for the verdict on the ordinary net to hold for the executed task
+    (empty: nothing more); `complete` whether all reachable markings stand behind it (a False
+    verdict with a witness needs no complete search).
     """
 
     holds: bool | None

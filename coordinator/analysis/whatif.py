@@ -1,10 +1,13 @@
-"""What if: a place's tokens, an action's times and shares, or a transition's rate changed without editing the file.
+"""What if: a place's tokens, an action's times and shares, or a transition's rate changed without
+editing the file.
 
 A change is written SUBJECT=NUMBER:
 
     runs=10                                tokens of a resource or control place
-    locate_ball.error.share=0.05           a status of every action of a primitive task (`share`, `mean` in s, `cv`);
-    locate_ball.locate_hough.success.mean=0.4    of one of its actions. The other shares keep their proportions.
+    locate_ball.error.share=0.05           a status of every action of a primitive task (`share`,
+                                           `mean` in s, `cv`);
+    locate_ball.locate_hough.success.mean=0.4    of one of its actions. The other shares keep their
+                                                 proportions.
     serve.rate=2.5, serve.weight=3         a transition of a net with rates
 """
 
@@ -13,14 +16,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from coordinator.analysis.gspn import Gspn
-from coordinator.analysis.netfile import FormatError
-from coordinator.analysis.stochastic import Measured
-from coordinator.net import Net
-from coordinator.task import Estimate, Kind, Status, Task
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.analysis.netfile import FormatError
+from petrobot.coordinator.analysis.stochastic import Measured
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Estimate, Kind, Status, Task
 
 FIELDS = ("share", "mean", "cv")
-FORM = "write PLACE=N, PRIMITIVE.STATUS.share=X (or .mean, .cv), PRIMITIVE.ACTION.STATUS.mean=X or TRANSITION.rate=X"
+FORM = (
+    "write PLACE=N, PRIMITIVE.STATUS.share=X (or .mean, .cv), "
+    "PRIMITIVE.ACTION.STATUS.mean=X or TRANSITION.rate=X"
+)
 
 Runs = dict[tuple[str, str], Mapping[Status, Estimate]]
 
@@ -61,7 +67,8 @@ def read_change(text: str) -> Change:
 
 
 def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tuple[Task, Measured]:
-    """The task with other tokens, and what is known of its runs with other estimates. Raises FormatError."""
+    """The task with other tokens, and what is known of its runs with other estimates. Raises
+    FormatError."""
     runs: Runs = dict(measured.runs)
     for change in changes:
         if len(change.subject) == 1:
@@ -89,15 +96,21 @@ def _other_estimate(task: Task, runs: Runs, change: Change) -> None:
     actions = primitive.alternatives if len(subject) == 1 else (subject[1],)
     for action in actions:
         if action not in primitive.alternatives:
-            raise change.fault(f"{action} is no alternative of {primitive.name}", " ".join(primitive.alternatives))
+            raise change.fault(
+                f"{action} is no alternative of {primitive.name}", " ".join(primitive.alternatives)
+            )
         known = runs.get((primitive.name, action), primitive.estimates)
         runs[primitive.name, action] = _altered(known, Status(word), key, change)
 
 
-def _altered(known: Mapping[Status, Estimate], status: Status, key: str, change: Change) -> Mapping[Status, Estimate]:
+def _altered(
+    known: Mapping[Status, Estimate], status: Status, key: str, change: Change
+) -> Mapping[Status, Estimate]:
     value = change.value
     if value < 0 or (key == "share" and value > 1) or (key == "mean" and value == 0):
-        raise change.fault("out of range", "shares lie between 0 and 1, means above 0, cv is not negative")
+        raise change.fault(
+            "out of range", "shares lie between 0 and 1, means above 0, cv is not negative"
+        )
     if status not in known:
         if key != "share":
             raise change.fault(f"nothing is known of runs that end with {status}")

@@ -1,4 +1,5 @@
-"""One block of a campaign: a mission run in a lock-step cell of its own, from plain data to plain data."""
+"""One block of a campaign: a mission run in a lock-step cell of its own, from plain data to plain
+data."""
 
 from __future__ import annotations
 
@@ -11,20 +12,26 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.campaign.plan import Block, CampaignError, Plan, digest
-from coordinator.campaign.throws import CostOf, ThrowLog
-from coordinator.engine.instructions import RunRecorded
-from coordinator.launch import SCRIPTED, Setting, load_object, lockstep_mission, lockstep_party
-from coordinator.learning.estimate import COUNT
-from coordinator.mission.lockstep_party import CoordinatorParty
-from coordinator.mission.mission import Mission, MissionError
-from coordinator.task import Task
-from coordinator.taskfile import TaskFileError
-from coordinator.taskfile import load as load_task
-from services.comm.cell import Cell, CellError, Delays
-from services.comm.directory import Directory, DirectoryError
-from services.comm.directory import load as load_directory
-from services.comm.party import TICK, Party
+from petrobot.coordinator.campaign.plan import Block, CampaignError, Plan, digest
+from petrobot.coordinator.campaign.throws import CostOf, ThrowLog
+from petrobot.coordinator.engine.instructions import RunRecorded
+from petrobot.coordinator.launch import (
+    SCRIPTED,
+    Setting,
+    load_object,
+    lockstep_mission,
+    lockstep_party,
+)
+from petrobot.coordinator.learning.estimate import COUNT
+from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
+from petrobot.coordinator.mission.mission import Mission, MissionError
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import TaskFileError
+from petrobot.coordinator.taskfile import load as load_task
+from petrobot.services.comm.cell import Cell, CellError, Delays
+from petrobot.services.comm.directory import Directory, DirectoryError
+from petrobot.services.comm.directory import load as load_directory
+from petrobot.services.comm.party import TICK, Party
 
 Weights = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
@@ -44,11 +51,14 @@ class Bench:
 
     @classmethod
     def of(cls, plan: Plan) -> Bench:
-        """Read the plan's files. Raises CampaignError, also when they are not those that the campaign began with."""
+        """Read the plan's files. Raises CampaignError, also when they are not those that the
+        campaign began with."""
         for key, said in plan.digests.items():
             path = str(getattr(plan, key))
             if path and digest(path) != said:
-                raise CampaignError(f"{path} has changed since the campaign began; start it anew in another folder")
+                raise CampaignError(
+                    f"{path} has changed since the campaign began; start it anew in another folder"
+                )
         try:
             return cls(plan, load_task(Path(plan.task)), load_directory(Path(plan.services)))
         except (OSError, TaskFileError, DirectoryError) as fault:
@@ -56,7 +66,8 @@ class Bench:
 
 
 class BlockSelector:
-    """Draws each choice from probabilities that were fixed before the block, keyed by mission seed, throw and occurrence."""
+    """Draws each choice from probabilities that were fixed before the block, keyed by mission seed,
+    throw and occurrence."""
 
     def __init__(self, seed: int, weights: Sequence[Weights]) -> None:
         self._seed, self._weights = seed, weights
@@ -65,12 +76,18 @@ class BlockSelector:
         """Index of the throw that goes on, from 0."""
 
     def choose(
-        self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
+        self,
+        task: str,
+        run: str,
+        alternatives: tuple[str, ...],
+        variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
         """One alternative and why."""
         k = max(0, min(self.throw(), len(self._weights) - 1))
         given = self._weights[k].get(task, {}) if self._weights else {}
-        offered = [(action, given[action]) for action in alternatives if given.get(action, 0.0) > 0.0]
+        offered = [
+            (action, given[action]) for action in alternatives if given.get(action, 0.0) > 0.0
+        ]
         if not offered:
             return alternatives[0], "first of the task file"
         occurrence = self._counts[k, task] = self._counts.get((k, task), -1) + 1
@@ -84,10 +101,11 @@ class BlockSelector:
 
 
 def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
-    """Run a block. `weights`: for each of its throws, the probabilities of each primitive task's actions.
+    """Run a block. `weights`: for each of its throws, the probabilities of each primitive task's
+    actions.
 
-    Gives `throws` (see Throw.to_plain), `score` (one map for each throw), `plots`, `mission_s`, `cpu_s`, `wall_s`, `rss_mb`.
-    Raises CampaignError.
+    Gives `throws` (see Throw.to_plain), `score` (one map for each throw), `plots`, `mission_s`,
+    `cpu_s`, `wall_s`, `rss_mb`. Raises CampaignError.
     """
     cpu, wall = time.process_time(), time.perf_counter()
     selector = BlockSelector(block.seed, weights)
@@ -100,9 +118,13 @@ def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[st
         cell = Cell([coordinator, *parties], Delays(bench.directory.delays()))
         limit = round(LONGEST_THROW * block.count / TICK)
         if not cell.run(lambda: coordinator.over, limit):
-            raise CampaignError(f"seed {block.seed}: not over after {limit * TICK:.0f} s of simulated time")
+            raise CampaignError(
+                f"seed {block.seed}: not over after {limit * TICK:.0f} s of simulated time"
+            )
     except (CellError, MissionError) as fault:
-        raise CampaignError(f"seed {block.seed}, regime {block.regime or 'of the task file'}: {fault}") from fault
+        raise CampaignError(
+            f"seed {block.seed}, regime {block.regime or 'of the task file'}: {fault}"
+        ) from fault
     finally:
         for party in parties:
             close = getattr(party, "close", None)
@@ -135,14 +157,17 @@ def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission,
     setting = Setting(bench.task, {**plan.parameters, **regime}, block.count, block.seed, selector)
     substitutes = load_object(SCRIPTED)(plan.mock) if plan.mock else None
     try:
-        parties = [lockstep_party(directory, node, substitutes) for node in directory.nodes.values()]
+        parties = [
+            lockstep_party(directory, node, substitutes) for node in directory.nodes.values()
+        ]
     except (DirectoryError, ImportError, ValueError, OSError) as fault:
         raise CampaignError(f"{plan.services}: {fault}") from fault
     return lockstep_mission(directory, setting), parties
 
 
 def costs(task: Task, directory: Directory) -> CostOf:
-    """The declared cost measure of each primitive task. In lock step computing costs what services.toml declares."""
+    """The declared cost measure of each primitive task. In lock step computing costs what
+    services.toml declares."""
 
     def cost(record: RunRecorded, values: Mapping[str, Any]) -> float | None:
         measure = task.primitive_tasks[record.primitive_task].cost
@@ -160,8 +185,9 @@ def costs(task: Task, directory: Directory) -> CostOf:
 def scores(score: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
     """The task's own results for each throw, as `table.column` by the score's lists of rows.
 
-    A row belongs to the throw that its `run` says (its `n` if it has none). If no list has such rows and there is only one
-    throw, the plain values of the score are its results, as `score.name`.
+    A row belongs to the throw that its `run` says (its `n` if it has none). If no list has such
+    rows and there is only one throw, the plain values of the score are its results, as
+    `score.name`.
     """
     out: list[dict[str, Any]] = [{} for _ in range(count)]
     tables = {name: rows for name, rows in score.items() if _is_table(rows)}
@@ -169,11 +195,15 @@ def scores(score: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
         for row in rows:
             k = row["run"] if "run" in row else row.get("n")
             if isinstance(k, int) and 1 <= k <= count and f"{name}.n" not in out[k - 1]:
-                out[k - 1] |= {f"{name}.{key}": value for key, value in row.items() if key != "run"} | {
-                    f"{name}.n": row.get("n")
-                }
+                out[k - 1] |= {
+                    f"{name}.{key}": value for key, value in row.items() if key != "run"
+                } | {f"{name}.n": row.get("n")}
     if not tables and count == 1:
-        out[0] = {f"score.{k}": v for k, v in score.items() if isinstance(v, bool | int | float | str | None)}
+        out[0] = {
+            f"score.{k}": v
+            for k, v in score.items()
+            if isinstance(v, bool | int | float | str | None)
+        }
     return out
 
 

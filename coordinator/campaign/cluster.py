@@ -1,4 +1,5 @@
-"""Campaigns on many machines: blocks as tasks of dask.distributed, which does those of a lost worker again elsewhere."""
+"""Campaigns on many machines: blocks as tasks of dask.distributed, which does those of a lost
+worker again elsewhere."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from coordinator.campaign.plan import CampaignError, Plan
-from coordinator.campaign.worker import answer
+from petrobot.coordinator.campaign.plan import CampaignError, Plan
+from petrobot.coordinator.campaign.worker import answer
 
 PATIENCE = 30.0
 """s in which a first worker has to be there."""
@@ -21,13 +22,17 @@ def dask_distributed() -> Any:
     try:
         return importlib.import_module("distributed")
     except ImportError as fault:
-        raise CampaignError("--cluster needs dask.distributed: pip install 'petrobot[cluster]'") from fault
+        raise CampaignError(
+            "--cluster needs dask.distributed: pip install 'petrobot[cluster]'"
+        ) from fault
 
 
 class ClusterPool:
-    """The workers of a dask scheduler; each has petrobot installed and the campaign's files at the same paths.
+    """The workers of a dask scheduler; each has petrobot installed and the campaign's files at the
+    same paths.
 
-    Use as an async context. Raises CampaignError when dask.distributed is missing or the scheduler does not answer.
+    Use as an async context. Raises CampaignError when dask.distributed is missing or the scheduler
+    does not answer.
     """
 
     def __init__(self, plan: Plan, address: str) -> None:
@@ -42,16 +47,21 @@ class ClusterPool:
         try:
             self._client = await distributed.Client(self._address, asynchronous=True, timeout=10)
         except (OSError, TimeoutError, ValueError) as fault:
-            raise CampaignError(f"--cluster {self._address}: no scheduler answers: {fault}") from fault
+            raise CampaignError(
+                f"--cluster {self._address}: no scheduler answers: {fault}"
+            ) from fault
         await self.workers(1, PATIENCE)
         return self
 
     async def workers(self, least: int, patience: float) -> None:
-        """Wait until so many workers are there, and count them. Raises CampaignError after `patience` s."""
+        """Wait until so many workers are there, and count them. Raises CampaignError after
+        `patience` s."""
         try:
             await self._client.wait_for_workers(least, timeout=patience)
         except TimeoutError as fault:
-            raise CampaignError(f"--cluster {self._address}: fewer than {least} workers in {patience:g} s") from fault
+            raise CampaignError(
+                f"--cluster {self._address}: fewer than {least} workers in {patience:g} s"
+            ) from fault
         self.count = sum((await self._client.nthreads()).values())
 
     async def __aexit__(self, *_: object) -> None:
@@ -63,4 +73,6 @@ class ClusterPool:
         try:
             return dict(await future)
         except dask_distributed().KilledWorker as fault:
-            raise CampaignError(f"block {order['block']['index']} (seed {order['block']['seed']}): {fault}") from fault
+            raise CampaignError(
+                f"block {order['block']['index']} (seed {order['block']['seed']}): {fault}"
+            ) from fault

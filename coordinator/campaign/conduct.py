@@ -1,4 +1,5 @@
-"""Conducts a campaign: blocks out to a pool of workers, rows into the table in order, what is learned batch by batch."""
+"""Conducts a campaign: blocks out to a pool of workers, rows into the table in order, what is
+learned batch by batch."""
 
 from __future__ import annotations
 
@@ -12,9 +13,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
-from coordinator.campaign.block import PLOTS, Bench
-from coordinator.campaign.observed import write_estimates
-from coordinator.campaign.plan import (
+from petrobot.coordinator.campaign.block import PLOTS, Bench
+from petrobot.coordinator.campaign.observed import write_estimates
+from petrobot.coordinator.campaign.plan import (
     MANIFEST,
     TABLE,
     Block,
@@ -25,16 +26,17 @@ from coordinator.campaign.plan import (
     read_manifest,
     write_manifest,
 )
-from coordinator.campaign.policies import Policy, policy_of
-from coordinator.campaign.rows import Row, rows_of
-from coordinator.campaign.spent import note_block, note_sessions, sessions
-from coordinator.campaign.summary import Summary, result_of
-from coordinator.campaign.table import Table
-from services.comm.json_text import json_text
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.campaign.policies import Policy, policy_of
+from petrobot.coordinator.campaign.rows import Row, rows_of
+from petrobot.coordinator.campaign.spent import note_block, note_sessions, sessions
+from petrobot.coordinator.campaign.summary import Summary, result_of
+from petrobot.coordinator.campaign.table import Table
+from petrobot.services.comm.json_text import json_text
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 AHEAD = 3
-"""Blocks handed out beyond those that the workers are busy with, so that none waits while a slow one is awaited."""
+"""Blocks handed out beyond those that the workers are busy with, so that none waits while a slow
+one is awaited."""
 
 
 class Pool(Protocol):
@@ -65,15 +67,20 @@ Watch = Callable[[Progress], None]
 
 
 def open_folder(folder: Path, plan: Plan) -> None:
-    """Make the folder of a campaign, or see that what it holds is the same campaign. Raises CampaignError."""
+    """Make the folder of a campaign, or see that what it holds is the same campaign. Raises
+    CampaignError."""
     try:
         make_folder(folder)
     except OSError as fault:
-        raise CampaignError(f"{folder}: {fault.strerror or fault}; give --out a folder that can be written") from fault
+        raise CampaignError(
+            f"{folder}: {fault.strerror or fault}; give --out a folder that can be written"
+        ) from fault
     if (folder / TABLE).exists() or (folder / MANIFEST).exists():
         other = differences(read_manifest(folder), plan)
         if other:
-            raise CampaignError(f"{folder} holds another campaign: {', '.join(other)} differ; give another --out")
+            raise CampaignError(
+                f"{folder} holds another campaign: {', '.join(other)} differ; give another --out"
+            )
     else:
         write_manifest(folder, plan)
 
@@ -101,7 +108,8 @@ class Campaign:
         return self.table.recover(blocks) == len(blocks)
 
     async def run(self, pool: Pool) -> None:
-        """Do what is left. Interrupted at any point, the next `run` in the same folder goes on. Raises CampaignError."""
+        """Do what is left. Interrupted at any point, the next `run` in the same folder goes on.
+        Raises CampaignError."""
         blocks = self.plan.blocks
         done = self.table.recover(blocks)
         if done == len(blocks) and not self.policy.learns:
@@ -131,13 +139,18 @@ class Campaign:
             self.policy.update([*known, *fresh])
 
     def result(self) -> dict[str, Any]:
-        """The result so far, as the command line writes it; the estimates file is written beside the table."""
+        """The result so far, as the command line writes it; the estimates file is written beside
+        the table."""
         name = identity(self.plan)
         summary = Summary.of(self.bench.task, self.table.rows(), name, self.plan.options)
-        write_estimates(self.folder, summary.estimates, self.policy.selectors(), name, summary.asked())
+        write_estimates(
+            self.folder, summary.estimates, self.policy.selectors(), name, summary.asked()
+        )
         return result_of(self.folder, self.plan, summary, self.policy.state())
 
-    async def _results(self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]) -> AsyncIterator[list[Row]]:
+    async def _results(
+        self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]
+    ) -> AsyncIterator[list[Row]]:
         """The rows of blocks in order; each block's are in the table before they are given."""
         going: deque[tuple[Block, asyncio.Task[dict[str, Any]]]] = deque()
         try:

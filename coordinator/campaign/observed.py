@@ -1,4 +1,5 @@
-"""Rows of a campaign's table as estimates and learners take them, and the estimates file made of them."""
+"""Rows of a campaign's table as estimates and learners take them, and the estimates file made of
+them."""
 
 from __future__ import annotations
 
@@ -6,16 +7,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.campaign.plan import CampaignError
-from coordinator.campaign.rows import Row
-from coordinator.campaign.throws import RunEntry
-from coordinator.experience.estimates_file import EstimatesError, EstimatesFile
-from coordinator.experience.estimates_tables import CAMPAIGN
-from coordinator.learning.estimate import Key, Observation, Tally
-from coordinator.learning.learning import Estimates
-from coordinator.learning.objective import Question
-from coordinator.learning.passage import Flow, PassageKey
-from coordinator.task import Executed, Status, Task
+from petrobot.coordinator.campaign.plan import CampaignError
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.throws import RunEntry
+from petrobot.coordinator.experience.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.experience.estimates_tables import CAMPAIGN
+from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.passage import Flow, PassageKey
+from petrobot.coordinator.task import Executed, Status, Task
 
 ESTIMATES = "estimates.db"
 
@@ -31,7 +32,8 @@ def regime_of(context: str) -> str:
 
 
 def observation(task: Task, run: RunEntry) -> Observation:
-    """A run that was preempted and counts none, or had not ended, is censored. CPU time is what services.toml declares."""
+    """A run that was preempted and counts none, or had not ended, is censored. CPU time is what
+    services.toml declares."""
     measure = task.primitive_task_of(run.place).cost
     preempted = run.cancelled and bool(run.taken)
     return Observation(
@@ -54,7 +56,9 @@ def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
     for run in row.throw.runs:
         key = Key(task.primitive_task_of(run.place).name, run.action, context)
         name = f"{salt}/{row.regime}/{row.seed}/{row.k}"
-        estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(observation(task, run), name)
+        estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(
+            observation(task, run), name
+        )
     waits: dict[str, list[float]] = {}
     for transition, seconds in row.throw.waits:
         waits.setdefault(transition, []).append(seconds)
@@ -84,13 +88,15 @@ def write_estimates(
 ) -> Path:
     """Write the campaign's runs into its estimates file, under an origin of the campaign's own.
 
-    So merging it twice counts nothing twice, and what others have learned into the file stays. `asked`: by what the actions of
-    each primitive task are judged. Raises CampaignError.
+    So merging it twice counts nothing twice, and what others have learned into the file stays.
+    `asked`: by what the actions of each primitive task are judged. Raises CampaignError.
     """
     path = folder / ESTIMATES
     try:
         origin = CAMPAIGN + campaign
         EstimatesFile(path, origin).put_closed(origin, estimates, selectors, asked or {})
     except EstimatesError as fault:
-        raise CampaignError(f"{fault}. If it is removed, the same command makes it again from the table") from fault
+        raise CampaignError(
+            f"{fault}. If it is removed, the same command makes it again from the table"
+        ) from fault
     return path

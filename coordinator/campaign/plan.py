@@ -1,7 +1,9 @@
-"""What a campaign is given, and how it is cut into blocks: the same blocks and seeds whoever does them, however many do.
+"""What a campaign is given, and how it is cut into blocks: the same blocks and seeds whoever does
+them, however many do.
 
-A block is one mission run with a few throws in a cell of its own. Throw i of a regime has number `k` in the mission run with
-seed `seed * SEEDS + block`: so `petrobot run TASK --mode lockstep --seed (that) --runs (the block's)` repeats it alone.
+A block is one mission run with a few throws in a cell of its own. Throw i of a regime has number
+`k` in the mission run with seed `seed * SEEDS + block`: so `petrobot run TASK --mode lockstep
+--seed (that) --runs (the block's)` repeats it alone.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from services.comm.json_text import json_text
-from services.comm.whole_file import write_whole
+from petrobot.services.comm.json_text import json_text
+from petrobot.services.comm.whole_file import write_whole
 
 SEEDS = 1_000_000
 """Mission seeds of one campaign seed."""
@@ -29,7 +31,8 @@ class CampaignError(Exception):
 
 @dataclass(frozen=True)
 class Plan:
-    """A campaign. Paths are kept as given; digests tell whether what they name has changed since."""
+    """A campaign. Paths are kept as given; digests tell whether what they name has changed
+    since."""
 
     task: str
     """Path of the task file."""
@@ -62,7 +65,9 @@ class Plan:
     def from_plain(cls, data: Mapping[str, Any]) -> Plan:
         """Back from `to_plain`. Raises CampaignError for another schema."""
         if data.get("schema") != SCHEMA:
-            raise CampaignError(f"{MANIFEST}: schema {data.get('schema')!r}, this petrobot writes {SCHEMA}")
+            raise CampaignError(
+                f"{MANIFEST}: schema {data.get('schema')!r}, this petrobot writes {SCHEMA}"
+            )
         given = {key: value for key, value in data.items() if key != "schema"}
         return cls(**{**given, "regimes": tuple(given["regimes"])})
 
@@ -70,7 +75,8 @@ class Plan:
     def blocks(self) -> list[Block]:
         """All blocks in the order of the table: the regimes take turns."""
         counts = [
-            self.runs // len(self.regimes) + (r < self.runs % len(self.regimes)) for r in range(len(self.regimes))
+            self.runs // len(self.regimes) + (r < self.runs % len(self.regimes))
+            for r in range(len(self.regimes))
         ]
         whole: list[tuple[int, int, str, int]] = []
         for r, regime in enumerate(self.regimes):
@@ -78,13 +84,24 @@ class Plan:
                 whole.append((number, r, regime, min(self.block, counts[r] - number * self.block)))
         out, first = [], 0
         for index, (number, _, regime, count) in enumerate(sorted(whole)):
-            out.append(Block(index, number, regime, first, number * self.block, count, self.seed * SEEDS + number))
+            out.append(
+                Block(
+                    index,
+                    number,
+                    regime,
+                    first,
+                    number * self.block,
+                    count,
+                    self.seed * SEEDS + number,
+                )
+            )
             first += count
         return out
 
     @property
     def batches(self) -> Iterator[list[Block]]:
-        """Blocks whose choices are drawn from one state: `batch` throws or a little more, all of them if nothing is learned."""
+        """Blocks whose choices are drawn from one state: `batch` throws or a little more, all of
+        them if nothing is learned."""
         blocks, batch = self.blocks, []
         for block in blocks:
             batch.append(block)
@@ -139,12 +156,16 @@ def read_manifest(folder: Path) -> Plan:
         return Plan.from_plain(data)
     except (FileNotFoundError, NotADirectoryError) as fault:
         remedy = "give a folder that `petrobot campaign --out FOLDER` wrote"
-        raise CampaignError(f"{folder} holds no campaign: {MANIFEST} is missing; {remedy}") from fault
+        raise CampaignError(
+            f"{folder} holds no campaign: {MANIFEST} is missing; {remedy}"
+        ) from fault
     except OSError as fault:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
     except (KeyError, ValueError, TypeError, AttributeError) as fault:
         said = f"the key {fault} is missing" if isinstance(fault, KeyError) else str(fault)
-        raise CampaignError(f"{path}: {said}; it is empty, torn or no plan: {_remedy(folder)}") from fault
+        raise CampaignError(
+            f"{path}: {said}; it is empty, torn or no plan: {_remedy(folder)}"
+        ) from fault
 
 
 def _remedy(folder: Path) -> str:
@@ -160,12 +181,15 @@ def _remedy(folder: Path) -> str:
 def differences(old: Plan, new: Plan) -> list[str]:
     """Keys in which two plans differ, but for paths whose files are the same."""
     before, after = old.to_plain(), new.to_plain()
-    same_file = {key for key in ("task", "services", "mock") if old.digests.get(key) == new.digests.get(key)}
+    same_file = {
+        key for key in ("task", "services", "mock") if old.digests.get(key) == new.digests.get(key)
+    }
     return [key for key in before if key not in same_file and before[key] != after.get(key)]
 
 
 def identity(plan: Plan) -> str:
-    """A short name of what a campaign runs, the same wherever its files lie: throws of equal identity are the same throws."""
+    """A short name of what a campaign runs, the same wherever its files lie: throws of equal
+    identity are the same throws."""
     data = plan.to_plain()
     for key in ("task", "services", "mock"):
         data[key] = plan.digests.get(key, "")

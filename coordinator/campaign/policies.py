@@ -1,7 +1,8 @@
-"""Who chooses actions in a campaign: for each throw, the probabilities of each primitive task's actions.
+"""Who chooses actions in a campaign: for each throw, the probabilities of each primitive task's
+actions.
 
-A policy is asked before a batch and told all rows of the batch after it, in the order of the table; so what is chosen depends
-on neither the number of workers nor on who was faster.
+A policy is asked before a batch and told all rows of the batch after it, in the order of the table;
+so what is chosen depends on neither the number of workers nor on who was faster.
 """
 
 from __future__ import annotations
@@ -13,16 +14,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coordinator.campaign.block import Weights
-from coordinator.campaign.observed import context_of, observation, regime_of
-from coordinator.campaign.plan import Block, CampaignError, Plan
-from coordinator.campaign.rows import Row
-from coordinator.learning.learning import Learning
-from coordinator.learning.objective import Question
-from coordinator.learning.records import Choice, End
-from coordinator.learning.selectors import RULES
-from coordinator.task import Task
-from services.comm.directory import Directory
+from petrobot.coordinator.campaign.block import Weights
+from petrobot.coordinator.campaign.observed import context_of, observation, regime_of
+from petrobot.coordinator.campaign.plan import Block, CampaignError, Plan
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Choice, End
+from petrobot.coordinator.learning.selectors import RULES
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.directory import Directory
 
 
 class Policy(Protocol):
@@ -66,7 +67,9 @@ class Fixed:
         chosen: Mapping[str, str],
         by_regime: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        self._weights: Weights = {t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()}
+        self._weights: Weights = {
+            t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()
+        }
         self._by_regime = {
             regime: {**self._weights, **{t: {a: 1.0} for t, a in more.items() if t not in chosen}}
             for regime, more in (by_regime or {}).items()
@@ -89,15 +92,21 @@ class Fixed:
 
 
 class RoundRobin:
-    """All combinations of alternatives in turn (of those not chosen by hand), from throw to throw of a regime."""
+    """All combinations of alternatives in turn (of those not chosen by hand), from throw to throw
+    of a regime."""
 
     learns = False
 
-    def __init__(self, alternatives: Mapping[str, Sequence[str]], chosen: Mapping[str, str]) -> None:
-        self._alternatives = {t: ([chosen[t]] if t in chosen else list(a)) for t, a in alternatives.items()}
+    def __init__(
+        self, alternatives: Mapping[str, Sequence[str]], chosen: Mapping[str, str]
+    ) -> None:
+        self._alternatives = {
+            t: ([chosen[t]] if t in chosen else list(a)) for t, a in alternatives.items()
+        }
 
     def combination(self, index: int) -> dict[str, str]:
-        """Combination number `index` (counted on and on): the first primitive task changes with each throw."""
+        """Combination number `index` (counted on and on): the first primitive task changes with
+        each throw."""
         out = {}
         for task, actions in self._alternatives.items():
             index, which = divmod(index, len(actions))
@@ -122,12 +131,14 @@ class RoundRobin:
 
 
 class Random(RoundRobin):
-    """Every alternative with the same probability, drawn anew at each choice: what estimates and forecasts train on."""
+    """Every alternative with the same probability, drawn anew at each choice: what estimates and
+    forecasts train on."""
 
     def weights(self, block: Block) -> list[Weights]:
         """The same for every throw."""
         even: Weights = {
-            task: dict.fromkeys(actions, 1.0 / len(actions)) for task, actions in self._alternatives.items()
+            task: dict.fromkeys(actions, 1.0 / len(actions))
+            for task, actions in self._alternatives.items()
         }
         return [even] * block.count
 
@@ -135,7 +146,8 @@ class Random(RoundRobin):
 class Learned:
     """A learner for each primitive task with alternatives and each regime (docs/learning.md).
 
-    One choice for each throw and primitive task: a run that is repeated within its throw takes the same action again.
+    One choice for each throw and primitive task: a run that is repeated within its throw takes the
+    same action again.
     """
 
     learns = True
@@ -152,10 +164,13 @@ class Learned:
         self._learning = Learning(task, selector, question)
         self._before: dict[str, Any] | None = None
         """The selectors' states before the batch that is being given out."""
-        self._fixed: Weights = {t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()}
+        self._fixed: Weights = {
+            t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()
+        }
 
     def weights(self, block: Block) -> list[Weights]:
-        """A choice for each throw. Each is counted as a trial for the others of its batch, until the batch is known."""
+        """A choice for each throw. Each is counted as a trial for the others of its batch, until
+        the batch is known."""
         if self._before is None:
             self._before = self._learning.state()
         return [{**self._fixed, **self._choices(block, k)} for k in range(block.count)]
@@ -185,9 +200,12 @@ class Learned:
                 self._learning.apply(End(name, run.action, context, observation(self._task, run)))
 
     def state(self) -> dict[str, Any]:
-        """By regime and primitive task: learned probabilities, J from the learner's sums, and the best action."""
+        """By regime and primitive task: learned probabilities, J from the learner's sums, and the
+        best action."""
         contexts = sorted({c for s in self._learning.selectors.values() for c in s.learners})
-        return {regime_of(c): {n: self._of(n, c) for n in self._learning.selectors} for c in contexts}
+        return {
+            regime_of(c): {n: self._of(n, c) for n in self._learning.selectors} for c in contexts
+        }
 
     def selectors(self) -> dict[str, dict[str, Any]]:
         """The learners' states: `petrobot run --learn` goes on from them."""
@@ -196,11 +214,22 @@ class Learned:
     def _of(self, name: str, context: str) -> dict[str, Any]:
         selector = self._learning.selectors[name]
         p = selector.learned(context)
-        j = {a: (round(v, 6) if np.isfinite(v) else None) for a, v in selector.objective(context).items()}
-        return {"best": max(p, key=lambda a: p[a]), "p": {a: round(v, 6) for a, v in p.items()}, "J": j}
+        j = {
+            a: (round(v, 6) if np.isfinite(v) else None)
+            for a, v in selector.objective(context).items()
+        }
+        return {
+            "best": max(p, key=lambda a: p[a]),
+            "p": {a: round(v, 6) for a, v in p.items()},
+            "J": j,
+        }
 
 
-PLAIN: Mapping[str, type[Fixed] | type[RoundRobin]] = {"fixed": Fixed, "round_robin": RoundRobin, "random": Random}
+PLAIN: Mapping[str, type[Fixed] | type[RoundRobin]] = {
+    "fixed": Fixed,
+    "round_robin": RoundRobin,
+    "random": Random,
+}
 
 
 def learns(selector: str) -> bool:
@@ -209,14 +238,19 @@ def learns(selector: str) -> bool:
 
 
 def check_chosen(task: Task, directory: Directory, chosen: Mapping[str, str]) -> None:
-    """Raises CampaignError for a primitive task or an action that is not known, or that no node offers."""
+    """Raises CampaignError for a primitive task or an action that is not known, or that no node
+    offers."""
     for name, action in chosen.items():
         primitive = task.primitive_tasks.get(name)
         if primitive is None or action not in primitive.alternatives:
             known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
-            raise CampaignError(f"--choose {name}={action}: not known to {task.name}; choose among {known}")
+            raise CampaignError(
+                f"--choose {name}={action}: not known to {task.name}; choose among {known}"
+            )
         if action not in directory.actions:
-            raise CampaignError(f"--choose {name}={action}: {directory.source} places no action {action}")
+            raise CampaignError(
+                f"--choose {name}={action}: {directory.source} places no action {action}"
+            )
 
 
 def policy_of(plan: Plan, task: Task, directory: Directory) -> Policy:
@@ -238,20 +272,32 @@ def policy_of(plan: Plan, task: Task, directory: Directory) -> Policy:
 
 
 def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
-    """By regime: the best action of each primitive task that a learning campaign has come to. Raises CampaignError."""
+    """By regime: the best action of each primitive task that a learning campaign has come to.
+    Raises CampaignError."""
     path = folder / "result.json"
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
     except OSError as fault:
-        remedy = "give the folder of a campaign that has ended, as `petrobot campaign --out FOLDER` leaves it"
-        raise CampaignError(f"{path}: no finished campaign: {fault.strerror or fault}; {remedy}") from fault
+        remedy = (
+            "give the folder of a campaign that has ended, as `petrobot campaign --out "
+            "FOLDER` leaves it"
+        )
+        raise CampaignError(
+            f"{path}: no finished campaign: {fault.strerror or fault}; {remedy}"
+        ) from fault
     except ValueError as fault:
         raise CampaignError(f"{path}: no finished campaign: it is no JSON ({fault})") from fault
     try:
         if result["selector"] in PLAIN:
             raise CampaignError(
-                f"{folder}: the selector {result['selector']} has learned nothing; give one that learns"
+                f"{folder}: the selector {result['selector']} has learned nothing; give one "
+                "that learns"
             )
-        return {regime: {t: known["best"] for t, known in tasks.items()} for regime, tasks in result["policy"].items()}
+        return {
+            regime: {t: known["best"] for t, known in tasks.items()}
+            for regime, tasks in result["policy"].items()
+        }
     except (KeyError, TypeError, AttributeError) as fault:
-        raise CampaignError(f"{path}: no result of a campaign: selector and policy are missing") from fault
+        raise CampaignError(
+            f"{path}: no result of a campaign: selector and policy are missing"
+        ) from fault

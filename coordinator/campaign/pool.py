@@ -1,4 +1,5 @@
-"""Local worker processes of a campaign: a lost one is replaced and its block done again, an old one retires."""
+"""Local worker processes of a campaign: a lost one is replaced and its block done again, an old one
+retires."""
 
 from __future__ import annotations
 
@@ -12,16 +13,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.campaign.plan import CampaignError, Plan
-from coordinator.supervisor import LAST_WORDS, output_pipe
-from services.comm.parentage import until_ended
+from petrobot.coordinator.campaign.plan import CampaignError, Plan
+from petrobot.coordinator.supervisor import LAST_WORDS, output_pipe
+from petrobot.services.comm.parentage import until_ended
 
 RETIRES_AFTER = 200
-"""Blocks after which a worker is replaced, so that what a user's action or a native library may leak does not add up."""
+"""Blocks after which a worker is replaced, so that what a user's action or a native library may
+leak does not add up."""
 TRIES = 3
 """Workers that a block may take with it before it counts as the block's fault."""
 LONGEST_LINE = 1 << 26
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+ONE_THREAD = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
 """Workers share the cores among themselves; threads of libraries would only get in their way."""
 
 
@@ -33,7 +37,10 @@ class _Worker:
     """One process and the way to it."""
 
     def __init__(
-        self, process: asyncio.subprocess.Process, said: asyncio.StreamReader, closing: contextlib.AsyncExitStack
+        self,
+        process: asyncio.subprocess.Process,
+        said: asyncio.StreamReader,
+        closing: contextlib.AsyncExitStack,
     ) -> None:
         self.process = process
         self.done = 0
@@ -43,8 +50,12 @@ class _Worker:
     @classmethod
     async def start(cls, plan: str, log: Path) -> _Worker:
         """Launch a process and tell it the plan; what it says beside its answers goes to `log`."""
-        command = (sys.executable, "-m", "coordinator.campaign.worker", str(os.getpid()))
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), **ONE_THREAD}
+        command = (sys.executable, "-m", "petrobot.coordinator.campaign.worker", str(os.getpid()))
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+            **ONE_THREAD,
+        }
         async with contextlib.AsyncExitStack() as closing:
             end, said = await closing.enter_async_context(output_pipe(LONGEST_LINE))
             with log.open("ab") as words:
@@ -71,7 +82,8 @@ class _Worker:
         return json.loads(line)  # type: ignore[no-any-return]
 
     async def _line(self) -> bytes:
-        """What it says next; what there is of it when the process ends. What it has left running may hold the pipe open."""
+        """What it says next; what there is of it when the process ends. What it has left running
+        may hold the pipe open."""
         reading = asyncio.create_task(self._said.readline())
         ended = asyncio.create_task(until_ended(self.process.pid))
         try:
@@ -134,7 +146,9 @@ class LocalPool:
                 except WorkerLost:
                     self.lost += 1
         what = f"block {order['block']['index']} (seed {order['block']['seed']})"
-        raise CampaignError(f"{what} ended {TRIES} workers; the last words of each are in {self._log}")
+        raise CampaignError(
+            f"{what} ended {TRIES} workers; the last words of each are in {self._log}"
+        )
 
     async def _once(self, text: str) -> dict[str, Any]:
         if self._idle:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TextIO
 
-from coordinator.campaign.conduct import Progress
+from petrobot.coordinator.campaign.conduct import Progress
 
 WIDTH = 30
 BEFORE = 0.2
@@ -19,13 +19,17 @@ def clock(seconds: float) -> str:
 
 
 def line(progress: Progress) -> str:
-    """The line: a bar, how many throws are done, how many met their goal in this session, time gone and to go."""
+    """The line: a bar, how many throws are done, how many met their goal in this session, time gone
+    and to go."""
     full = round(WIDTH * progress.done / max(1, progress.of))
     fresh = progress.done - progress.already
     left = progress.seconds / fresh * (progress.of - progress.done) if fresh else 0.0
     met = f"{progress.goals / fresh:.1%} met" if fresh else ""
     bar = "#" * full + "." * (WIDTH - full)
-    return f"[{bar}] {progress.done}/{progress.of}  {met}  {clock(progress.seconds)} gone, {clock(left)} to go"
+    return (
+        f"[{bar}] {progress.done}/{progress.of}  {met}  {clock(progress.seconds)} gone, "
+        f"{clock(left)} to go"
+    )
 
 
 class ProgressLine:
@@ -39,7 +43,9 @@ class ProgressLine:
 
     def __call__(self, progress: Progress) -> None:
         """Show it, unless the last update was a moment ago and this is not the end."""
-        if not self.wanted or (progress.seconds - self._shown < BEFORE and progress.done < progress.of):
+        if not self.wanted or (
+            progress.seconds - self._shown < BEFORE and progress.done < progress.of
+        ):
             return
         self._shown = progress.seconds
         text = line(progress)

@@ -1,4 +1,5 @@
-"""One row of a campaign's table: what the columns are, and a throw as a row and back. Columns come from task and score."""
+"""One row of a campaign's table: what the columns are, and a throw as a row and back. Columns come
+from task and score."""
 
 from __future__ import annotations
 
@@ -7,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from coordinator.campaign.plan import Block
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.task import Kind, Task
-from services.comm.json_text import json_text
+from petrobot.coordinator.campaign.plan import Block
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.task import Kind, Task
+from petrobot.services.comm.json_text import json_text
 
 GENERAL = (
     "n",
@@ -27,11 +28,13 @@ GENERAL = (
     "at",
     "mission_s",
 )
-"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the throw took; `at`: s since the mission began."""
+"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the throw took; `at`: s
+since the mission began."""
 BY_PLACE = ("status", "cause", "seconds", "cost")
 """Of the throw's first run in a place; all runs stand in the column `runs`."""
 LAST = ("more", "runs", "waits", "fired")
-"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run; Throw.waits, Throw.fired."""
+"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run;
+Throw.waits, Throw.fired."""
 
 Cell = str | int | float | None
 
@@ -70,9 +73,15 @@ def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
 
 
 def columns(task: Task, rows: Sequence[Row]) -> list[str]:
-    """The table's columns: the general ones, those of the task file, and those of the task's score in these first rows."""
+    """The table's columns: the general ones, those of the task file, and those of the task's score
+    in these first rows."""
     chosen = [f"chosen.{name}" for name in task.primitive_tasks]
-    places = [f"{p.name}.{part}" for p in task.flat.places.values() if p.kind is Kind.ACTION for part in BY_PLACE]
+    places = [
+        f"{p.name}.{part}"
+        for p in task.flat.places.values()
+        if p.kind is Kind.ACTION
+        for part in BY_PLACE
+    ]
     own = list(dict.fromkeys(key for row in rows for key in row.score))
     return [*GENERAL, *chosen, *places, *own, *LAST]
 
@@ -96,7 +105,9 @@ def _general(row: Row) -> dict[str, Any]:
         "waits": _json([list(w) for w in throw.waits]),
         "fired": _json(throw.fired),
     }
-    own |= {name: getattr(throw, name) for name in ("status", "cause", "completed", "goals", "time")}
+    own |= {
+        name: getattr(throw, name) for name in ("status", "cause", "completed", "goals", "time")
+    }
     return {**base, **own, "runs": _json([run.to_plain() for run in throw.runs])}
 
 

@@ -1,4 +1,5 @@
-"""What a campaign took, beside its table: a row for each block (times.csv) and one for each session (sessions.csv)."""
+"""What a campaign took, beside its table: a row for each block (times.csv) and one for each session
+(sessions.csv)."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coordinator.campaign.plan import Block
-from services.comm.whole_file import write_whole
+from petrobot.coordinator.campaign.plan import Block
+from petrobot.services.comm.whole_file import write_whole
 
 TIMES = "times.csv"
 TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
@@ -18,8 +19,12 @@ SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 
 
 def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
-    """Append what a block took: process id, CPU time, wall time and simulated time (s), memory (MB)."""
-    took = [block.index, *(result[name] for name in ("pid", "cpu_s", "wall_s", "mission_s", "rss_mb"))]
+    """Append what a block took: process id, CPU time, wall time and simulated time (s), memory
+    (MB)."""
+    took = [
+        block.index,
+        *(result[name] for name in ("pid", "cpu_s", "wall_s", "mission_s", "rss_mb")),
+    ]
     _append(folder / TIMES, TIME_COLUMNS, [took])
 
 
@@ -30,7 +35,8 @@ def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
 
 
 def times(folder: Path) -> list[dict[str, str]]:
-    """What the blocks took, in the order they ended; a block that was done again stands there twice."""
+    """What the blocks took, in the order they ended; a block that was done again stands there
+    twice."""
     return _read(folder / TIMES)
 
 

@@ -1,4 +1,5 @@
-"""What a campaign's table says in numbers: shares with intervals, times, choices, estimates and J of every action."""
+"""What a campaign's table says in numbers: shares with intervals, times, choices, estimates and J
+of every action."""
 
 from __future__ import annotations
 
@@ -10,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.campaign.observed import ESTIMATES, add_row, context_of, regime_of
-from coordinator.campaign.plan import TABLE, Plan
-from coordinator.campaign.rows import Row
-from coordinator.campaign.spent import sessions, times
-from coordinator.learning.estimate import Key, Tally
-from coordinator.learning.intervals import wilson
-from coordinator.learning.learning import Estimates
-from coordinator.learning.objective import Comparison, Question, compare
-from coordinator.task import PrimitiveTask, Task
+from petrobot.coordinator.campaign.observed import ESTIMATES, add_row, context_of, regime_of
+from petrobot.coordinator.campaign.plan import TABLE, Plan
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.spent import sessions, times
+from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.intervals import wilson
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import Comparison, Question, compare
+from petrobot.coordinator.task import PrimitiveTask, Task
 
 
 @dataclass
@@ -67,31 +68,43 @@ def _share(part: int, whole: int) -> float | None:
     return round(part / whole, 6) if whole else None
 
 
-def question_of(primitive: PrimitiveTask, options: Mapping[str, Any], declared: bool = True) -> Question:
+def question_of(
+    primitive: PrimitiveTask, options: Mapping[str, Any], declared: bool = True
+) -> Question:
     """What is asked of a primitive task's actions: target and rho as a plan's options give them.
 
-    Without a target in the options it is the one that the task file declares, unless `declared` is off.
+    Without a target in the options it is the one that the task file declares, unless `declared` is
+    off.
     """
     target = options.get("target", primitive.target_reliability if declared else None)
     return Question(primitive.cost, target, options.get("rho"))
 
 
 def comparisons(
-    task: Task, tallies: Mapping[Key, Tally], regime: str | None = None, options: Mapping[str, Any] | None = None
+    task: Task,
+    tallies: Mapping[Key, Tally],
+    regime: str | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> dict[str, Comparison]:
-    """By primitive task: all its alternatives with runs judged together, over all regimes as scenarios or in one.
+    """By primitive task: all its alternatives with runs judged together, over all regimes as
+    scenarios or in one.
 
-    `options`: those of the campaign's plan. In one regime a target counts only if it was given (as in `Learning.comparison`).
+    `options`: those of the campaign's plan. In one regime a target counts only if it was given (as
+    in `Learning.comparison`).
     """
     out = {}
     for primitive in task.primitive_tasks.values():
         by_action: dict[str, dict[str, Tally]] = {}
         for key, tally in tallies.items():
-            if key.primitive_task == primitive.name and (regime is None or key.context == context_of(regime)):
+            if key.primitive_task == primitive.name and (
+                regime is None or key.context == context_of(regime)
+            ):
                 by_action.setdefault(key.action, {})[key.context] = tally
         if by_action:
             ordered = {a: by_action[a] for a in primitive.alternatives if a in by_action}
-            out[primitive.name] = compare(ordered, question_of(primitive, options or {}, regime is None))
+            out[primitive.name] = compare(
+                ordered, question_of(primitive, options or {}, regime is None)
+            )
     return out
 
 
@@ -110,8 +123,15 @@ class Summary:
     mission_s: dict[int, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, task: Task, rows: Iterable[Row], salt: str = "", options: Mapping[str, Any] | None = None) -> Summary:
-        """Of a table's rows. `salt` names the campaign in the estimates; `options` are its plan's."""
+    def of(
+        cls,
+        task: Task,
+        rows: Iterable[Row],
+        salt: str = "",
+        options: Mapping[str, Any] | None = None,
+    ) -> Summary:
+        """Of a table's rows. `salt` names the campaign in the estimates; `options` are its
+        plan's."""
         made = cls(task, salt=salt, options=options or {})
         for row in rows:
             made.add(row)
@@ -133,18 +153,22 @@ class Summary:
         return {p.name: question_of(p, self.options) for p in self.task.primitive_tasks.values()}
 
     def comparisons(self) -> dict[str, Comparison]:
-        """The actions of each primitive task judged over all regimes, as the campaign's options ask."""
+        """The actions of each primitive task judged over all regimes, as the campaign's options
+        ask."""
         return comparisons(self.task, self.estimates.tallies, options=self.options)
 
     def _judged(self, name: str, found: Comparison) -> dict[str, Any]:
-        """What J of a primitive task was made with: measure, target, rho, regimes, who meets the target where."""
+        """What J of a primitive task was made with: measure, target, rho, regimes, who meets the
+        target where."""
         asked = question_of(self.task.primitive_tasks[name], self.options)
         return {
             "cost": asked.measure,
             "target": asked.target,
             "rho": round(found.rho, 9),
             "regimes": [regime_of(s) for s in found.scenarios],
-            "meet_target": {f.action: [regime_of(s) for s in f.scenarios] for f in found.figures if f.admissible},
+            "meet_target": {
+                f.action: [regime_of(s) for s in f.scenarios] for f in found.figures if f.admissible
+            },
             "uncosted": list(found.uncosted),
         }
 
@@ -153,9 +177,18 @@ class Summary:
         has_goal, found = bool(self.task.goal_transitions), self.comparisons()
         return {
             **self.whole.to_plain(has_goal),
-            "by_regime": {name: counts.to_plain(has_goal) for name, counts in self.by_regime.items()},
-            "chosen": {t: dict(sorted(self.chosen[t].items())) for t in self.task.primitive_tasks if t in self.chosen},
-            "J": {name: {f.action: _finite(f.j) for f in judged.figures} for name, judged in found.items()},
+            "by_regime": {
+                name: counts.to_plain(has_goal) for name, counts in self.by_regime.items()
+            },
+            "chosen": {
+                t: dict(sorted(self.chosen[t].items()))
+                for t in self.task.primitive_tasks
+                if t in self.chosen
+            },
+            "J": {
+                name: {f.action: _finite(f.j) for f in judged.figures}
+                for name, judged in found.items()
+            },
             "judged": {name: self._judged(name, judged) for name, judged in found.items()},
             "sim_s": round(sum(self.mission_s.values()), 6),
         }

@@ -1,4 +1,5 @@
-"""A campaign's table on disk: one CSV file that only ever grows by whole blocks, in order, so an interrupted one goes on."""
+"""A campaign's table on disk: one CSV file that only ever grows by whole blocks, in order, so an
+interrupted one goes on."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from coordinator.campaign.plan import TABLE as TABLE
-from coordinator.campaign.plan import Block, CampaignError
-from coordinator.campaign.rows import Row, cells, columns, read_row
-from coordinator.task import Task
-from services.comm.whole_file import sync_folder
+from petrobot.coordinator.campaign.plan import TABLE as TABLE
+from petrobot.coordinator.campaign.plan import Block, CampaignError
+from petrobot.coordinator.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.whole_file import sync_folder
 
 PARQUET = "table.parquet"
 
@@ -28,7 +29,8 @@ class Table:
         self._columns: list[str] | None = None
 
     def recover(self, blocks: Sequence[Block]) -> int:
-        """Cut off what an interruption left of a block; gives how many blocks are complete. Raises CampaignError."""
+        """Cut off what an interruption left of a block; gives how many blocks are complete. Raises
+        CampaignError."""
         if not self.path.exists():
             return 0
         ends = _record_ends(self.path)
@@ -80,7 +82,9 @@ def read_table(path: Path) -> Iterator[Row]:
                 try:
                     yield read_row(record)
                 except (KeyError, ValueError, TypeError) as fault:
-                    raise CampaignError(f"{path}: line {number} is no row of a campaign: {fault!r}") from fault
+                    raise CampaignError(
+                        f"{path}: line {number} is no row of a campaign: {fault!r}"
+                    ) from fault
     except OSError as fault:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
 

@@ -1,7 +1,8 @@
-"""What one throw was: one token out of the runs place and all that came of it, as plain data; and who writes it down.
+"""What one throw was: one token out of the runs place and all that came of it, as plain data; and
+who writes it down.
 
-A *throw* here is one run of a task, whatever the task does (design: "mission run" is a whole execution, which may hold
-several). A task without a runs place has one throw in each mission run.
+A *throw* here is one run of a task, whatever the task does (design: "mission run" is a whole
+execution, which may hold several). A task without a runs place has one throw in each mission run.
 """
 
 from __future__ import annotations
@@ -10,12 +11,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from coordinator.engine import State
-from coordinator.engine.instructions import Corrected, Finished, Fired, Instruction, RunRecorded, StartRun
-from coordinator.engine.stimuli import RunEnded, Stimulus
-from coordinator.net import Marking
-from coordinator.task import End, Executed, Kind, Status, Task
-from services.comm.notice import Progress
+from petrobot.coordinator.engine import State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Finished,
+    Fired,
+    Instruction,
+    RunRecorded,
+    StartRun,
+)
+from petrobot.coordinator.engine.stimuli import RunEnded, Stimulus
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import End, Executed, Kind, Status, Task
+from petrobot.services.comm.notice import Progress
 
 DIGITS = 6
 """Decimals of every time and cost in the table (us)."""
@@ -36,9 +44,11 @@ class RunEntry:
     begun: float
     """When its token came into the place, since the throw's begin."""
     took: float = 0.0
-    """From there until the coordinator knew its end, or a preempting transition took the token: with all waiting."""
+    """From there until the coordinator knew its end, or a preempting transition took the token:
+    with all waiting."""
     status: str = ""
-    """success, failure, error; empty for a censored run (it was preempted and counts none, or had not ended)."""
+    """success, failure, error; empty for a censored run (it was preempted and counts none, or had
+    not ended)."""
     cause: str = ""
     text: str = ""
     seconds: float = 0.0
@@ -80,7 +90,8 @@ class Throw:
     cause: str = ""
     runs: list[RunEntry] = field(default_factory=list)
     waits: list[tuple[str, float]] = field(default_factory=list)
-    """(transition, s) for each firing of a transition that waited for an event or a timer, from when it could have fired."""
+    """(transition, s) for each firing of a transition that waited for an event or a timer, from
+    when it could have fired."""
 
     fired: dict[str, int] = field(default_factory=dict)
     """How often each transition fired."""
@@ -92,14 +103,25 @@ class Throw:
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data for the way from a worker to the campaign."""
-        plain = {name: getattr(self, name) for name in self.__slots__ if name not in ("runs", "waits")}
-        return plain | {"runs": [run.to_plain() for run in self.runs], "waits": [list(wait) for wait in self.waits]}
+        plain = {
+            name: getattr(self, name) for name in self.__slots__ if name not in ("runs", "waits")
+        }
+        return plain | {
+            "runs": [run.to_plain() for run in self.runs],
+            "waits": [list(wait) for wait in self.waits],
+        }
 
     @classmethod
     def from_plain(cls, data: Mapping[str, Any]) -> Throw:
         """Back from `to_plain`."""
         runs = [RunEntry.from_plain(run) for run in data["runs"]]
-        return cls(**{**data, "runs": runs, "waits": [(str(name), float(wait)) for name, wait in data["waits"]]})
+        return cls(
+            **{
+                **data,
+                "runs": runs,
+                "waits": [(str(name), float(wait)) for name, wait in data["waits"]],
+            }
+        )
 
 
 class ThrowLog:
@@ -114,7 +136,8 @@ class ThrowLog:
         self._waiting = {
             t.name: [(a.place, a.end) for a in t.inputs]
             for t in flat.transitions.values()
-            if (t.events or t.after is not None) and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
+            if (t.events or t.after is not None)
+            and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
         }
         self.throws: list[Throw] = []
         self._since = dict.fromkeys(self._net.places, 0.0)
@@ -127,7 +150,7 @@ class ThrowLog:
         """Why the mission run ended before its last throw was completed, if it did."""
         self._origin: float | None = None
 
-    # --- an observer -------------------------------------------------------------------------------------------------
+    # --- an observer --------------------------------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """The first one begins the time axis; results are kept until their runs are recorded."""
@@ -158,7 +181,7 @@ class ThrowLog:
     def settled(self, now: float, state: State) -> None:
         """Nothing to keep."""
 
-    # --- what happened -----------------------------------------------------------------------------------------------
+    # --- what happened ------------------------------------------------------------------------
 
     def _begin(self, now: float) -> None:
         if self.throws:
@@ -167,7 +190,10 @@ class ThrowLog:
         self.throws.append(Throw(len(self.throws) + 1, round(now - self._origin, DIGITS)))
 
     def _fired(self, now: float, fired: Fired) -> None:
-        if self._runs_place is not None and fired.after[self._runs_place] < fired.before[self._runs_place]:
+        if (
+            self._runs_place is not None
+            and fired.after[self._runs_place] < fired.before[self._runs_place]
+        ):
             self._begin(now)
         for run in fired.runs:
             if run in self._entries:
@@ -180,7 +206,9 @@ class ThrowLog:
         throw.goals += fired.transition in self._goals
         throw.fired[fired.transition] = throw.fired.get(fired.transition, 0) + 1
         if fired.transition in self._waiting:
-            since = max((self._since[place] for place, _ in self._waiting[fired.transition]), default=now)
+            since = max(
+                (self._since[place] for place, _ in self._waiting[fired.transition]), default=now
+            )
             throw.waits.append((fired.transition, round(now - since, DIGITS)))
         for name, before, after in zip(self._net.places, fired.before, fired.after, strict=True):
             if after > before:
@@ -194,7 +222,10 @@ class ThrowLog:
         if self._runs_place is None:
             return False
         own = self._runs_place
-        return marking[:own] == self._net.initial[:own] and marking[own + 1 :] == self._net.initial[own + 1 :]
+        return (
+            marking[:own] == self._net.initial[:own]
+            and marking[own + 1 :] == self._net.initial[own + 1 :]
+        )
 
     def _span(self, now: float, throw: Throw) -> float:
         assert self._origin is not None
@@ -217,11 +248,16 @@ class ThrowLog:
     def _recorded(self, now: float, record: RunRecorded) -> None:
         known = self._entries.get(record.run)
         if known is None:  # it ended without ever having been sent to a node
-            self._entry(now, StartRun(record.run, record.place, record.primitive_task, record.action, {}, 0.0))
+            self._entry(
+                now,
+                StartRun(record.run, record.place, record.primitive_task, record.action, {}, 0.0),
+            )
             known = self._entries.get(record.run)
             if known is None:
                 return
-        if record.run in self._going:  # else a preemption has taken its token, and the place may hold a later one
+        if (
+            record.run in self._going
+        ):  # else a preemption has taken its token, and the place may hold a later one
             self._since[record.place] = now
         self._ended(now, record.run)
         throw, entry = known
@@ -238,13 +274,16 @@ class ThrowLog:
             throw.status, throw.cause = entry.status, entry.cause
 
     def _corrected(self, corrected: Corrected) -> None:
-        """The verdict on a run replaces its status, and the throw is what its runs really came to."""
+        """The verdict on a run replaces its status, and the throw is what its runs really came
+        to."""
         throw, entry = self._entries[corrected.run]
         entry.status, entry.text = corrected.status.value, corrected.text or entry.text
         entry.cause = corrected.cause if corrected.status is not Status.SUCCESS else ""
         worst = max(self._ends[throw.k], key=lambda one: _RANK[one.status])
         bad = _RANK[worst.status] > _RANK[Status.SUCCESS.value]
-        throw.status, throw.cause = (worst.status, worst.cause) if bad else (Status.SUCCESS.value, "")
+        throw.status, throw.cause = (
+            (worst.status, worst.cause) if bad else (Status.SUCCESS.value, "")
+        )
         if throw is self.throws[-1]:
             self._give_up(throw)
 

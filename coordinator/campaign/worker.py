@@ -1,7 +1,9 @@
-"""A campaign's worker process: blocks in on standard input, results out on standard output, one JSON text a line.
+"""A campaign's worker process: blocks in on standard input, results out on standard output, one
+JSON text a line.
 
-Its argument is its parent's process id: it ends with it, also in the middle of a block or of an action that hangs. The first line
-is the plan. Whatever else writes to standard output (drivers do) goes to standard error.
+Its argument is its parent's process id: it ends with it, also in the middle of a block or of an
+action that hangs. The first line is the plan. Whatever else writes to standard output (drivers do)
+goes to standard error.
 """
 
 from __future__ import annotations
@@ -14,9 +16,9 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, TextIO
 
-from coordinator.campaign.block import Bench, run_block
-from coordinator.campaign.plan import Block, CampaignError, Plan
-from services.comm.parentage import die_with
+from petrobot.coordinator.campaign.block import Bench, run_block
+from petrobot.coordinator.campaign.plan import Block, CampaignError, Plan
+from petrobot.services.comm.parentage import die_with
 
 
 @lru_cache(maxsize=1)
@@ -25,22 +27,28 @@ def _bench(plan: str) -> Bench:
 
 
 def answer(plan: str, order: Mapping[str, Any]) -> dict[str, Any]:
-    """Run the block that `order` holds (`block`, `weights`); `plan` as JSON. A fault of the campaign's comes as `fault`."""
+    """Run the block that `order` holds (`block`, `weights`); `plan` as JSON. A fault of the
+    campaign's comes as `fault`."""
     try:
-        return run_block(_bench(plan), Block(**order["block"]), order["weights"]) | {"pid": os.getpid()}
+        return run_block(_bench(plan), Block(**order["block"]), order["weights"]) | {
+            "pid": os.getpid()
+        }
     except CampaignError as fault:
         return {"index": order["block"]["index"], "fault": str(fault)}
 
 
 def serve(orders: Iterator[str], answers: TextIO) -> None:
-    """Answer each order until there is none; the first line is the plan. Nothing of a block is there when the next one begins."""
+    """Answer each order until there is none; the first line is the plan. Nothing of a block is
+    there when the next one begins."""
     plan, settled = next(orders, ""), False
     for line in orders:
         print(json.dumps(answer(plan, json.loads(line))), file=answers, flush=True)
-        # A mission refers to itself in circles: left to the collector's own time, several pile up and break the heap into pieces
+        # A mission refers to itself in circles: left to the collector's own time, several pile up
+        # and break the heap into pieces
         gc.collect()
         if not settled:
-            # what the first block has loaded stays: the collector need not look through it in every later one (2 ms, not 200)
+            # what the first block has loaded stays: the collector need not look through it in every
+            # later one (2 ms, not 200)
             settled = True
             gc.freeze()
 

@@ -1,18 +1,19 @@
-"""Static check of a task: fast, without its state space. What the state space holds is for the analysis."""
+"""Static check of a task: fast, without its state space. What the state space holds is for the
+analysis."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
-from coordinator.check.branches import uncovered_exits
-from coordinator.check.conflicts import conflicts
-from coordinator.check.events import event_faults, external_waits
-from coordinator.check.findings import Finding, Report
-from coordinator.check.flow import never_marked, odd_ends, timeless_cycles, unused
-from coordinator.check.offers import translating_others, unoffered
-from coordinator.conditions.wording import Severity
-from coordinator.task import Task
-from coordinator.task.consistency import faults
+from petrobot.coordinator.check.branches import uncovered_exits
+from petrobot.coordinator.check.conflicts import conflicts
+from petrobot.coordinator.check.events import event_faults, external_waits
+from petrobot.coordinator.check.findings import Finding, Report
+from petrobot.coordinator.check.flow import never_marked, odd_ends, timeless_cycles, unused
+from petrobot.coordinator.check.offers import translating_others, unoffered
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.consistency import faults
 
 __all__ = ["Finding", "Report", "Severity", "check"]
 
@@ -38,12 +39,14 @@ def check(
 ) -> Report:
     """Everything that can be said of the task without exploring it.
 
-    `offers`: the node of each action that is offered; `translates`: the primitive task that each of them is said to
-    translate; `source`: the location file that says so.
+    `offers`: the node of each action that is offered; `translates`: the primitive task that each of
+    them is said to translate; `source`: the location file that says so.
     """
     broken = faults(task)
     if broken:
-        return Report(tuple(Finding(Severity.ERROR, "inconsistent", f.key, f.text, f.remedy) for f in broken))
+        return Report(
+            tuple(Finding(Severity.ERROR, "inconsistent", f.key, f.text, f.remedy) for f in broken)
+        )
     found = [finding for part in _CHECKS for finding in part(task.flat)]
     if offers is not None:
         found += unoffered(task, offers, source)

@@ -1,9 +1,11 @@
-"""Conflicts found on the structure: which pairs of transitions can compete for a token, and what settles them.
+"""Conflicts found on the structure: which pairs of transitions can compete for a token, and what
+settles them.
 
-Two transitions compete when one stimulus, or what had come before it, can make both fireable for the same token. So what
-can come *last* before each can fire is compared: a pulse can only come last; a latched event that is dropped when
-nothing waits comes after the tokens; a timer runs only once the arcs are satisfied. If nothing can come last for both,
-they never become fireable together and arrival order decides.
+Two transitions compete when one stimulus, or what had come before it, can make both fireable for
+the same token. So what can come *last* before each can fire is compared: a pulse can only come
+last; a latched event that is dropped when nothing waits comes after the tokens; a timer runs only
+once the arcs are satisfied. If nothing can come last for both, they never become fireable together
+and arrival order decides.
 """
 
 from __future__ import annotations
@@ -11,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import combinations
 
-from coordinator.check.exclusion import never_together, semiflows
-from coordinator.check.findings import Finding
-from coordinator.conditions.regions import Answer, Domain, exclusive
-from coordinator.conditions.wording import Severity
-from coordinator.task import Early, End, Input, Scope, Task, Transition
-from coordinator.task.consistency import condition_domains, is_pulse
+from petrobot.coordinator.check.exclusion import never_together, semiflows
+from petrobot.coordinator.check.findings import Finding
+from petrobot.coordinator.conditions.regions import Answer, Domain, exclusive
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.task import Early, End, Input, Scope, Task, Transition
+from petrobot.coordinator.task.consistency import condition_domains, is_pulse
 
 MARKING = ("marking", "")
 _LIVE_ENDS = (End.PREEMPT, End.GOING)
@@ -30,7 +32,9 @@ def conflicts(task: Task) -> Iterator[Finding]:
         shared = sorted(_shared(task, t, u))
         if not shared or excluded(task, t, u) or excluded(task, u, t):
             continue
-        if not never_together(net, flows, net.transition_index[t.name], net.transition_index[u.name]):
+        if not never_together(
+            net, flows, net.transition_index[t.name], net.transition_index[u.name]
+        ):
             yield from _judge(task, t, u, shared, domains)
 
 
@@ -42,22 +46,38 @@ def _judge(
         return
     key, over = f"transitions.{t.name}", " and ".join(shared)
     if not last_triggers(task, t) & last_triggers(task, u):
-        text = f"{t.name} and {u.name} compete for {over}: whichever becomes fireable first takes it"
+        text = (
+            f"{t.name} and {u.name} compete for {over}: whichever becomes fireable first takes it"
+        )
         yield Finding(Severity.NOTE, "arrival-order", key, text)
         return
-    if t.priority != u.priority or (t.weight is not None and u.weight is not None) or _preempts(t) != _preempts(u):
+    if (
+        t.priority != u.priority
+        or (t.weight is not None and u.weight is not None)
+        or _preempts(t) != _preempts(u)
+    ):
         return
     unsure = (
-        " (it is not known whether their conditions exclude each other)" if verdict.answer is Answer.UNKNOWN else ""
+        " (it is not known whether their conditions exclude each other)"
+        if verdict.answer is Answer.UNKNOWN
+        else ""
     )
-    text = f"{t.name} and {u.name} can become fireable together, compete for {over}, and nothing settles it{unsure}"
+    text = (
+        f"{t.name} and {u.name} can become fireable together, compete for {over}, and "
+        f"nothing settles it{unsure}"
+    )
     remedy = "give exclusive conditions, or different `priority`, or a `weight` to each"
     yield Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy, verdict.witness)
 
 
 def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
     """What both take: places of shared tokens, latched events, raised events."""
-    shared = {a.place for a in t.inputs for b in u.inputs if a.place == b.place and _same_token(task, t, a, u, b)}
+    shared = {
+        a.place
+        for a in t.inputs
+        for b in u.inputs
+        if a.place == b.place and _same_token(task, t, a, u, b)
+    }
     common = [task.events[e] for e in t.events if e in u.events]
     events = {f"the event {e.name}" for e in common if not is_pulse(e)}
     return shared | events | _mutual_bars(t, u) | (_room(task, t) & _room(task, u))
@@ -69,7 +89,9 @@ def _room(task: Task, t: Transition) -> set[str]:
     index = net.transition_index[t.name]
     taken = dict(net.consume[index])
     return {
-        f"room in {net.places[p]}" for p, w in net.produce[index] if net.capacity[p] is not None and w > taken.get(p, 0)
+        f"room in {net.places[p]}"
+        for p, w in net.produce[index]
+        if net.capacity[p] is not None and w > taken.get(p, 0)
     }
 
 
@@ -79,7 +101,9 @@ def _same_token(task: Task, t: Transition, a: Input, u: Transition, b: Input) ->
         return False
     if a.end == b.end:
         return True
-    return (a.end is End.PREEMPT and t.priority > u.priority) or (b.end is End.PREEMPT and u.priority > t.priority)
+    return (a.end is End.PREEMPT and t.priority > u.priority) or (
+        b.end is End.PREEMPT and u.priority > t.priority
+    )
 
 
 def _mutual_bars(t: Transition, u: Transition) -> set[str]:
@@ -90,13 +114,16 @@ def _mutual_bars(t: Transition, u: Transition) -> set[str]:
 
 
 def excluded(task: Task, t: Transition, u: Transition) -> bool:
-    """Whether tokens alone keep the two from being fireable together: one run in two states, or an inhibitor arc."""
+    """Whether tokens alone keep the two from being fireable together: one run in two states, or an
+    inhibitor arc."""
     limits = {i.place: i.threshold for i in t.inhibitors}
     if any(b.weight >= limits[b.place] for b in u.inputs if b.place in limits):
         return True
     for a in t.inputs:
         for b in u.inputs:
-            single = a.place == b.place and a.end is not None and task.places[a.place].servers is None
+            single = (
+                a.place == b.place and a.end is not None and task.places[a.place].servers is None
+            )
             if single and _state(a) != _state(b) and not _same_token(task, t, a, u, b):
                 return True
     return False
@@ -108,7 +135,8 @@ def _state(arc: Input) -> str:
 
 
 def _preempts(t: Transition) -> bool:
-    """As the engine ranks it: a run's end goes before its preemption, unless a weight is declared."""
+    """As the engine ranks it: a run's end goes before its preemption, unless a weight is
+    declared."""
     return t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
 
 
@@ -124,13 +152,18 @@ def last_triggers(task: Task, t: Transition) -> set[Trigger]:
     events = {("event", e) for e in t.events}
     if any(_holds_until_fired(task, e) for e in t.events):
         return events | ends | variables
-    if events and all(task.events[e].scope is Scope.INTERNAL for e in t.events) and len(t.inputs) == 1:
+    if (
+        events
+        and all(task.events[e].scope is Scope.INTERNAL for e in t.events)
+        and len(t.inputs) == 1
+    ):
         return events | ends | variables
     others = {MARKING} if len(t.inputs) > len(ends) or t.inhibitors or not t.inputs else set()
     return events | ends | variables | others
 
 
 def _holds_until_fired(task: Task, event: str) -> bool:
-    """Whether the event's flag can only be set once all tokens of a transition that waits for it are there."""
+    """Whether the event's flag can only be set once all tokens of a transition that waits for it
+    are there."""
     e = task.events[event]
     return e.scope is Scope.EXTERNAL and not is_pulse(e) and e.early is Early.DROP

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from coordinator.check.findings import Finding
-from coordinator.conditions.wording import Severity, listed
-from coordinator.task import End, Event, Kind, Scope, Task, Transition
+from petrobot.coordinator.check.findings import Finding
+from petrobot.coordinator.conditions.wording import Severity, listed
+from petrobot.coordinator.task import End, Event, Kind, Scope, Task, Transition
 
 
 def event_faults(task: Task) -> Iterator[Finding]:
@@ -30,9 +30,14 @@ def external_waits(task: Task) -> Iterator[Finding]:
             waits = {e for t in ways for e in t.events if task.events[e].scope is Scope.EXTERNAL}
             if all(_is_external(task, t) for t in ways):
                 after = f" after its {end} end" if end else ""
-                text = f"only {listed(waits)} can free its token{after}: if it never comes, the task hangs"
+                text = (
+                    f"only {listed(waits)} can free its token{after}: if it never comes, "
+                    "the task hangs"
+                )
                 remedy = "put a transition with `after` beside it"
-                yield Finding(Severity.WARNING, "external-wait", f"places.{place.name}", text, remedy)
+                yield Finding(
+                    Severity.WARNING, "external-wait", f"places.{place.name}", text, remedy
+                )
 
 
 def _is_external(task: Task, t: Transition) -> bool:
@@ -48,12 +53,21 @@ def _unheard(task: Task, t: Transition, event: Event) -> Finding:
     started = [o.place for o in t.outputs if task.places[o.place].kind is Kind.ACTION]
     if any(task.places[p].task == event.by for p in started):
         text = (
-            f"{event.name} is declared internal to {event.by}, but this transition starts {event.by}: it would have to run "
-            "before it is started, and the operator could no longer control by tokens how often it does"
+            f"{event.name} is declared internal to {event.by}, but this transition starts "
+            f"{event.by}: it would have to run "
+            "before it is started, and the operator could no longer control by tokens how "
+            "often it does"
         )
         return Finding(
-            Severity.ERROR, "internal-impossible", key, text, f'declare {event.name} with scope = "external"'
+            Severity.ERROR,
+            "internal-impossible",
+            key,
+            text,
+            f'declare {event.name} with scope = "external"',
         )
-    text = f"{event.name} is raised by {event.by}, but none of its inputs is an action place of that primitive task"
+    text = (
+        f"{event.name} is raised by {event.by}, but none of its inputs is an action place "
+        "of that primitive task"
+    )
     remedy = f"add an input from a place with task = {event.by!r}, or make the event external"
     return Finding(Severity.ERROR, "event-unheard", key, text, remedy)

@@ -1,17 +1,17 @@
 """Pairs of transitions that invariants keep from being enabled together.
 
-A P-semiflow is a vector y >= 0 of integers with y C = 0: y M is the same in every reachable marking. If two transitions
-together need tokens worth more than that, they are never enabled in one marking. Found by Farkas' elimination; where that
-grows beyond `ROWS` the answer is only that nothing is proved. Control places are left out, since the operator may put
-tokens into them.
+A P-semiflow is a vector y >= 0 of integers with y C = 0: y M is the same in every reachable
+marking. If two transitions together need tokens worth more than that, they are never enabled in one
+marking. Found by Farkas' elimination; where that grows beyond `ROWS` the answer is only that
+nothing is proved. Control places are left out, since the operator may put tokens into them.
 """
 
 from __future__ import annotations
 
 from math import gcd
 
-from coordinator.net import Net
-from coordinator.task import Kind, Task
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Kind, Task
 
 ROWS = 2000
 Flow = dict[int, int]
@@ -39,7 +39,8 @@ def never_together(net: Net, flows: tuple[Flow, ...], t: int, u: int) -> bool:
     for p, w in net.consume[u]:
         need[p] = max(w, need.get(p, 0))
     return any(
-        sum(y * need.get(p, 0) for p, y in flow.items()) > sum(y * net.initial[p] for p, y in flow.items())
+        sum(y * need.get(p, 0) for p, y in flow.items())
+        > sum(y * net.initial[p] for p, y in flow.items())
         for flow in flows
     )
 
@@ -54,8 +55,11 @@ def _effects(net: Net, place: int) -> dict[int, int]:
     return effects
 
 
-def _combine(a: tuple[Flow, dict[int, int]], b: tuple[Flow, dict[int, int]], t: int) -> tuple[Flow, dict[int, int]]:
-    """The positive combination of a row that gains and one that loses in which t changes nothing."""
+def _combine(
+    a: tuple[Flow, dict[int, int]], b: tuple[Flow, dict[int, int]], t: int
+) -> tuple[Flow, dict[int, int]]:
+    """The positive combination of a row that gains and one that loses in which t changes
+    nothing."""
     x, y = -b[1][t], a[1][t]
     flow = _sum(a[0], x, b[0], y)
     effect = _sum(a[1], x, b[1], y)

@@ -1,4 +1,5 @@
-"""What a check finds: findings by severity, each with its key, a sentence, a remedy and, where there is one, a witness."""
+"""What a check finds: findings by severity, each with its key, a sentence, a remedy and, where
+there is one, a witness."""
 
 from __future__ import annotations
 
@@ -6,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from coordinator.conditions.wording import Severity
+from petrobot.coordinator.conditions.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is wrong or worth knowing. `code` is a fixed word for programs, `key` the key in the task file."""
+    """One thing that is wrong or worth knowing. `code` is a fixed word for programs, `key` the key
+    in the task file."""
 
     severity: Severity
     code: str

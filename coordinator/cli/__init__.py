@@ -1,4 +1,5 @@
-"""The `petrobot` command: finds the sub-command, runs it, and turns every fault into one clear line and an exit code."""
+"""The `petrobot` command: finds the sub-command, runs it, and turns every fault into one clear line
+and an exit code."""
 
 from __future__ import annotations
 
@@ -17,12 +18,18 @@ exit codes: 0 the task reached its final marking (or the command did its work, a
 
 
 FILE_FAULTS = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free some space, or name a place on another disk"),
+    **dict.fromkeys(
+        (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+        "free some space, or name a place on another disk",
+    ),
     **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), "name a place that you may write to"),
-    **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "name another place"),
+    **dict.fromkeys(
+        (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EEXIST), "name another place"
+    ),
     errno.EIO: "look after the disk",
 }
-"""What to do about a file that cannot be written, by errno(3), where a command has no better words."""
+"""What to do about a file that cannot be written, by errno(3), where a command has no better
+words."""
 
 
 class CommandError(Exception):
@@ -35,7 +42,8 @@ class CommandError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One sub-command; its module is imported only when it is used, so that quick commands stay quick."""
+    """One sub-command; its module is imported only when it is used, so that quick commands stay
+    quick."""
 
     name: str
     summary: str
@@ -98,9 +106,11 @@ def _overview(arguments: Sequence[str]) -> int:
     lines = [f"  {command.name:{width}}{command.summary}" for command in COMMANDS]
     text = "\n".join(
         [
-            "usage: petrobot COMMAND ...   (petrobot COMMAND --help shows its options and an example)",
+            "usage: petrobot COMMAND ...   (petrobot COMMAND --help shows its options and an "
+            "example)",
             "",
-            "coordinates real robots with Petri nets: a task is one net, its actions run on the nodes of services.toml",
+            "coordinates real robots with Petri nets: a task is one net, its actions run on "
+            "the nodes of services.toml",
             "",
             *lines,
             "",
@@ -115,7 +125,7 @@ def _overview(arguments: Sequence[str]) -> int:
 
 
 def _dispatch(command: Command, arguments: Sequence[str]) -> int:
-    module = importlib.import_module(f"coordinator.cli.{command.module or command.name}")
+    module = importlib.import_module(f"petrobot.coordinator.cli.{command.module or command.name}")
     parser = argparse.ArgumentParser(
         prog=f"petrobot {command.name}",
         description=module.__doc__,
@@ -141,7 +151,8 @@ def _dispatch(command: Command, arguments: Sequence[str]) -> int:
 
 
 def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) -> int:
-    """Run a command; keys and files that cannot be used are bad input, whichever command needs them."""
+    """Run a command; keys and files that cannot be used are bad input, whichever command needs
+    them."""
     try:
         return int(run(options))
     except OSError as fault:
@@ -150,7 +161,7 @@ def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) 
         what = f"{fault.filename}: {fault.strerror}" if fault.filename else str(fault.strerror)
         raise CommandError(2, f"{what}; {FILE_FAULTS[fault.errno]}") from fault
     except Exception as fault:
-        from services.comm.security import KeyFileError, KeyNeededError
+        from petrobot.services.comm.security import KeyFileError, KeyNeededError
 
         if isinstance(fault, KeyFileError | KeyNeededError):
             raise CommandError(2, str(fault)) from fault

@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import task_path, write_json
-from services.comm.quantities import number, whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import task_path, write_json
+from petrobot.services.comm.quantities import number, whole
 
 if TYPE_CHECKING:
-    from coordinator.analysis.commands import Outcome
-    from coordinator.analysis.report import Analysis
-    from coordinator.analysis.space import Limits
+    from petrobot.coordinator.analysis.commands import Outcome
+    from petrobot.coordinator.analysis.report import Analysis
+    from petrobot.coordinator.analysis.space import Limits
 
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
 TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
@@ -26,53 +26,79 @@ TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("file", help="a net or task file, or the name of a task that comes with petrobot")
     parser.add_argument(
-        "--view", choices=("ordinary", "gspn"), help="default: gspn for a net with rates, ordinary for all else"
+        "file", help="a net or task file, or the name of a task that comes with petrobot"
+    )
+    parser.add_argument(
+        "--view",
+        choices=("ordinary", "gspn"),
+        help="default: gspn for a net with rates, ordinary for all else",
     )
     parser.add_argument(
         "--rates",
         metavar="FILE",
-        help="rates of transitions (TOML: `[rates]` and `ID = PER_SECOND` below it), or the word unit for 1/s each",
+        help="rates of transitions (TOML: `[rates]` and `ID = PER_SECOND` below it), or the "
+        "word unit for 1/s each",
     )
     parser.add_argument(
-        "--states", type=whole(), default=5_000_000, metavar="N", help="most markings (default: %(default)s)"
+        "--states",
+        type=whole(),
+        default=5_000_000,
+        metavar="N",
+        help="most markings (default: %(default)s)",
     )
     parser.add_argument(
         "--seconds",
         type=number(least=0.0),
         default=60.0,
         metavar="S",
-        help="longest search of a state space, 0 for no limit; what was found by then is told (default: %(default)g)",
+        help="longest search of a state space, 0 for no limit; what was found by then is "
+        "told (default: %(default)g)",
     )
     parser.add_argument(
-        "--memory", type=whole(), default=2048, metavar="MIB", help="most memory (default: %(default)s)"
+        "--memory",
+        type=whole(),
+        default=2048,
+        metavar="MIB",
+        help="most memory (default: %(default)s)",
     )
     parser.add_argument(
         *("--what-if", "-w"),
         action="append",
         default=[],
         metavar="CHANGE",
-        help="judge a change beside the file as it is: runs=10, locate_ball.error.share=0.05, serve.rate=2 (may be repeated)",
+        help="judge a change beside the file as it is: runs=10, "
+        "locate_ball.error.share=0.05, serve.rate=2 (may be repeated)",
     )
     parser.add_argument(
-        "--pictures", metavar="FOLDER", help="draw each refused verdict with the firings that lead there"
+        "--pictures",
+        metavar="FOLDER",
+        help="draw each refused verdict with the firings that lead there",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the answer as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Analyse."""
-    from coordinator.analysis.commands import analyse_command
-    from coordinator.analysis.space import Limits
-    from coordinator.taskfile import load
+    from petrobot.coordinator.analysis.commands import analyse_command
+    from petrobot.coordinator.analysis.space import Limits
+    from petrobot.coordinator.taskfile import load
 
     longest = options.seconds or None
-    limits = Limits(states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic)
+    limits = Limits(
+        states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic
+    )
     path = task_path(options.file)
     with progress_of_search(limits) as watched:
         outcome = analyse_command(
-            path, load, view=options.view, rates=options.rates, limits=watched, changes=options.what_if
+            path,
+            load,
+            view=options.view,
+            rates=options.rates,
+            limits=watched,
+            changes=options.what_if,
         )
     code = give(outcome, options.json)
     if options.pictures and outcome.analysis is not None:
@@ -81,18 +107,22 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _draw(analysis: Analysis, path: Path, folder: Path, *, quiet: bool) -> None:
-    from coordinator.cli.witnesses import draw_witnesses
-    from coordinator.taskfile import load
+    from petrobot.coordinator.cli.witnesses import draw_witnesses
+    from petrobot.coordinator.taskfile import load
 
     made = draw_witnesses(analysis, load(path) if path.suffix == ".toml" else analysis.net, folder)
     if not quiet:
-        print("\n".join(f"drawn: {picture}" for picture in made) or "no picture: nothing was refused with a witness")
+        print(
+            "\n".join(f"drawn: {picture}" for picture in made)
+            or "no picture: nothing was refused with a witness"
+        )
 
 
 @contextmanager
 def progress_of_search(limits: Limits) -> Iterator[Limits]:
-    """The same limits with a line on the terminal that tells how far a long search is; nothing elsewhere."""
-    from coordinator.analysis.commands import limited
+    """The same limits with a line on the terminal that tells how far a long search is; nothing
+    elsewhere."""
+    from petrobot.coordinator.analysis.commands import limited
 
     if not sys.stderr.isatty():
         yield limits
@@ -104,7 +134,8 @@ def progress_of_search(limits: Limits) -> Iterator[Limits]:
         if now - told[0] >= TOLD_EVERY and now - begun >= TOLD_AFTER:
             told[0] = now
             print(
-                f"\r{found} markings found, {expanded} looked at, {now - begun:.0f} s (Ctrl-C: what is known by now)",
+                f"\r{found} markings found, {expanded} looked at, {now - begun:.0f} s "
+                "(Ctrl-C: what is known by now)",
                 end="",
                 file=sys.stderr,
             )
@@ -115,8 +146,9 @@ def progress_of_search(limits: Limits) -> Iterator[Limits]:
 
 
 def give(outcome: Outcome, json_file: str | None) -> int:
-    """Print and write what an analysis command found; gives its exit code. Raises CommandError for bad input."""
-    from coordinator.analysis.commands import BAD_INPUT
+    """Print and write what an analysis command found; gives its exit code. Raises CommandError for
+    bad input."""
+    from petrobot.coordinator.analysis.commands import BAD_INPUT
 
     if json_file:
         write_json(json_file, outcome.data)

@@ -1,20 +1,21 @@
-"""Calibrate a camera from images of a board: lens, and where the camera stands in the base frame."""
+"""Calibrate a camera from images of a board: lens, and where the camera stands in the base
+frame."""
 
 from __future__ import annotations
 
 import argparse
 
-from coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError
 
 EXAMPLE = "petrobot calibrate --views board_images --simulated --output calibration.toml"
-ROOM = "services.vision.calibrate"
-LABORATORY = "sim.board:main"
+ROOM = "petrobot.services.vision.calibrate"
+LABORATORY = "petrobot.sim.board:main"
 """Takes board images with the simulated camera as it truly hangs: `main([folder])`."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options are the calibration's own, and one that makes images first."""
-    from coordinator.launch import load_object
+    from petrobot.coordinator.launch import load_object
 
     load_object(f"{ROOM}:add_arguments")(parser)
     parser.add_argument(
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Take images if asked to; calibrate."""
-    from coordinator.launch import load_object
+    from petrobot.coordinator.launch import load_object
 
     if options.simulated:
         _take(options)
@@ -34,17 +35,21 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _take(options: argparse.Namespace) -> None:
-    from coordinator.launch import load_object
+    from petrobot.coordinator.launch import load_object
 
     folder = options.views
     if options.source:
         raise CommandError(
-            2, f"--simulated takes all images, so none is left for --source {options.source}; leave one out"
+            2,
+            f"--simulated takes all images, so none is left for --source {options.source}; "
+            "leave one out",
         )
     try:
         if folder.exists() and any(folder.iterdir()):
             raise CommandError(
-                2, f"{folder} is not empty; give --simulated a folder that is, so that nothing is overwritten"
+                2,
+                f"{folder} is not empty; give --simulated a folder that is, so that nothing "
+                "is overwritten",
             )
         load_object(LABORATORY)([str(folder)])
     except OSError as fault:

@@ -1,4 +1,5 @@
-"""Run a task many times in parallel lock-step cells, learn if asked to, and leave one table with a row for each run."""
+"""Run a task many times in parallel lock-step cells, learn if asked to, and leave one table with a
+row for each run."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import (
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import (
     add_services_argument,
     cell_path,
     load_directory,
@@ -21,46 +22,87 @@ from coordinator.cli.loading import (
     task_path,
     write_json,
 )
-from services.comm.quantities import number, probability, whole
+from petrobot.services.comm.quantities import number, probability, whole
 
 if TYPE_CHECKING:
-    from coordinator.campaign.conduct import Campaign
-    from coordinator.campaign.plan import Plan
-    from coordinator.task import Task
+    from petrobot.coordinator.campaign.conduct import Campaign
+    from petrobot.coordinator.campaign.plan import Plan
+    from petrobot.coordinator.task import Task
 
-EXAMPLE = "petrobot campaign catch_ball --runs 200 --regime A,B --selector nikolic_fu --workers 2 --json out.json"
+EXAMPLE = (
+    "petrobot campaign catch_ball --runs 200 --regime A,B --selector nikolic_fu "
+    "--workers 2 --json out.json"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("task", nargs="?", help="a task file, or the name of a task that comes with petrobot")
-    parser.add_argument("--runs", type=whole(), default=100, metavar="N", help="in all regimes together (%(default)s)")
     parser.add_argument(
-        "--regime", default="", metavar="A,B", help="regimes that take turns, with the same seeds in each"
+        "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
     )
     parser.add_argument(
-        "--selector", default="fixed", metavar="NAME", help="fixed, round_robin, random, or one that learns"
-    )
-    parser.add_argument("--choose", default="", metavar="TASK=ACTION,...", help="actions chosen by hand")
-    parser.add_argument(
-        "--learned", metavar="CAMPAIGN", type=Path, help="the best actions that this campaign has learned"
-    )
-    parser.add_argument(
-        "--target", type=probability, metavar="R", help="learn and judge by this reliability, not the declared one"
+        "--runs",
+        type=whole(),
+        default=100,
+        metavar="N",
+        help="in all regimes together (%(default)s)",
     )
     parser.add_argument(
-        "--rho", type=number(least=0.0), metavar="X", help="weight of cost in J (1 / largest mean cost)"
+        "--regime",
+        default="",
+        metavar="A,B",
+        help="regimes that take turns, with the same seeds in each",
     )
     parser.add_argument(
-        "--workers", type=whole(), default=os.cpu_count() or 1, metavar="K", help="processes (%(default)s)"
+        "--selector",
+        default="fixed",
+        metavar="NAME",
+        help="fixed, round_robin, random, or one that learns",
     )
     parser.add_argument(
-        "--cluster", metavar="ADDRESS", help="workers of this dask scheduler instead, as tcp://host:8786"
+        "--choose", default="", metavar="TASK=ACTION,...", help="actions chosen by hand"
     )
-    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="of all chance (%(default)s)")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
     parser.add_argument(
-        "--block", type=whole(), metavar="N", help="runs in one cell (as many as the task's runs place holds)"
+        "--learned",
+        metavar="CAMPAIGN",
+        type=Path,
+        help="the best actions that this campaign has learned",
+    )
+    parser.add_argument(
+        "--target",
+        type=probability,
+        metavar="R",
+        help="learn and judge by this reliability, not the declared one",
+    )
+    parser.add_argument(
+        "--rho",
+        type=number(least=0.0),
+        metavar="X",
+        help="weight of cost in J (1 / largest mean cost)",
+    )
+    parser.add_argument(
+        "--workers",
+        type=whole(),
+        default=os.cpu_count() or 1,
+        metavar="K",
+        help="processes (%(default)s)",
+    )
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="workers of this dask scheduler instead, as tcp://host:8786",
+    )
+    parser.add_argument(
+        "--seed", type=whole(0), default=1, metavar="S", help="of all chance (%(default)s)"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
+    )
+    parser.add_argument(
+        "--block",
+        type=whole(),
+        metavar="N",
+        help="runs in one cell (as many as the task's runs place holds)",
     )
     parser.add_argument(
         "--batch",
@@ -69,26 +111,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="runs between two updates of what is learned (%(default)s)",
     )
-    parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
     parser.add_argument(
-        "--out", metavar="FOLDER", type=Path, help="where table and estimates go (campaigns/TASK-SELECTOR-S-ID)"
+        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
     parser.add_argument(
-        "--resume", metavar="FOLDER", type=Path, help="go on with this one; the same as giving its --out again"
+        "--out",
+        metavar="FOLDER",
+        type=Path,
+        help="where table and estimates go (campaigns/TASK-SELECTOR-S-ID)",
     )
-    parser.add_argument("--check", metavar="FORECAST", type=Path, help="compare the result with a registered forecast")
-    parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
+    parser.add_argument(
+        "--resume",
+        metavar="FOLDER",
+        type=Path,
+        help="go on with this one; the same as giving its --out again",
+    )
+    parser.add_argument(
+        "--check",
+        metavar="FORECAST",
+        type=Path,
+        help="compare the result with a registered forecast",
+    )
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Run or resume the campaign; print and write its result."""
-    from coordinator.campaign.conduct import Campaign
-    from coordinator.campaign.lock import held
-    from coordinator.campaign.plan import CampaignError, identity, read_manifest
-    from coordinator.campaign.progress import ProgressLine
-    from coordinator.campaign.table import write_parquet
+    from petrobot.coordinator.campaign.conduct import Campaign
+    from petrobot.coordinator.campaign.lock import held
+    from petrobot.coordinator.campaign.plan import CampaignError, identity, read_manifest
+    from petrobot.coordinator.campaign.progress import ProgressLine
+    from petrobot.coordinator.campaign.table import write_parquet
 
     shown = ProgressLine(sys.stderr)
     shown.wanted = shown.wanted and not options.quiet
@@ -102,14 +159,19 @@ def run(options: argparse.Namespace) -> int:
             options.services = cell_path(options.services, options.task, task)
             _refuse_unfit(task, options)
             plan = _plan(options, task)
-            folder = options.out or Path("campaigns") / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
+            folder = (
+                options.out
+                or Path("campaigns")
+                / f"{task.name}-{plan.selector}-{plan.seed}-{identity(plan)[:6]}"
+            )
         if options.check is not None:
             _refuse_misfit(options.check, plan)  # before the work, not after it
         campaign = Campaign(folder, plan, shown)
         with _written(folder), held(folder):
             if campaign.complete and options.json != "-":
                 print(
-                    f"nothing left to do: {folder} holds all runs; remove it, or give another --out, to run them again"
+                    f"nothing left to do: {folder} holds all runs; remove it, or give "
+                    "another --out, to run them again"
                 )
             try:
                 asyncio.run(_conduct(campaign, options))
@@ -131,19 +193,21 @@ def run(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _written(folder: Path) -> Iterator[None]:
-    """A disk that is full in the middle: what is in the folder is whole blocks, and the campaign can be resumed."""
+    """A disk that is full in the middle: what is in the folder is whole blocks, and the campaign
+    can be resumed."""
     try:
         yield
     except OSError as fault:
         text = (
-            f"{fault.filename or folder}: {fault.strerror or fault}; free some space and resume with --resume {folder}"
+            f"{fault.filename or folder}: {fault.strerror or fault}; free some space and "
+            f"resume with --resume {folder}"
         )
         raise CommandError(2, text) from fault
 
 
 def _refuse_misfit(forecast: Path, plan: Plan) -> None:
-    from coordinator.cli.forecast import fitting
-    from coordinator.forecast.registered import ForecastError, read
+    from petrobot.coordinator.cli.forecast import fitting
+    from petrobot.coordinator.forecast.registered import ForecastError, read
 
     try:
         fitting(forecast, read(forecast), plan)
@@ -152,8 +216,8 @@ def _refuse_misfit(forecast: Path, plan: Plan) -> None:
 
 
 def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
-    from coordinator.cli.forecast import compared
-    from coordinator.forecast.registered import ForecastError
+    from petrobot.coordinator.cli.forecast import compared
+    from petrobot.coordinator.forecast.registered import ForecastError
 
     try:
         return compared(forecast, folder)
@@ -163,14 +227,14 @@ def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
 
 def _print_check(check: dict[str, Any] | None) -> None:
     if check is not None:
-        from coordinator.forecast.tables import agreement_text
+        from petrobot.coordinator.forecast.tables import agreement_text
 
         print(agreement_text(check))
 
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
-    from coordinator.check import check
-    from coordinator.cli.lockstep import substitutes
+    from petrobot.coordinator.check import check
+    from petrobot.coordinator.cli.lockstep import substitutes
 
     directory = load_directory(options.services)
     report = check(task, {action: entry.node for action, entry in directory.actions.items()})
@@ -184,24 +248,28 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
-    from coordinator.campaign.cluster import ClusterPool
-    from coordinator.campaign.pool import LocalPool
+    from petrobot.coordinator.campaign.cluster import ClusterPool
+    from petrobot.coordinator.campaign.pool import LocalPool
 
     if options.cluster:
         async with ClusterPool(campaign.plan, options.cluster) as cluster:
             await campaign.run(cluster)
     else:
-        async with LocalPool(campaign.plan, options.workers, campaign.folder / "workers.log") as pool:
+        async with LocalPool(
+            campaign.plan, options.workers, campaign.folder / "workers.log"
+        ) as pool:
             await campaign.run(pool)
 
 
 def _plan(options: argparse.Namespace, task: Task) -> Plan:
-    from coordinator.campaign.plan import Plan, digest
-    from coordinator.campaign.policies import learns
-    from coordinator.cli.parameters import parameter_of
+    from petrobot.coordinator.campaign.plan import Plan, digest
+    from petrobot.coordinator.campaign.policies import learns
+    from petrobot.coordinator.cli.parameters import parameter_of
 
     given = dict(_pair("--set", text) for text in options.set)
-    regimes = tuple(name for name in options.regime.split(",") if name) or (str(task.parameters.get("regime", "")),)
+    regimes = tuple(name for name in options.regime.split(",") if name) or (
+        str(task.parameters.get("regime", "")),
+    )
     if regimes != ("",) and "regime" not in task.parameters:
         raise CommandError(2, f"--regime {options.regime}: {task.name} has no parameter regime")
     if len(set(regimes)) < len(regimes):
@@ -231,12 +299,16 @@ def _block(task: Task, wanted: int | None) -> int:
 
 
 def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
-    from coordinator.campaign.policies import learned_choices
+    from petrobot.coordinator.campaign.policies import learned_choices
 
-    found: dict[str, Any] = {name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None}
+    found: dict[str, Any] = {
+        name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None
+    }
     if options.learned is not None:
         if options.selector != "fixed":
-            raise CommandError(2, f"--learned chooses what was learned; leave --selector {options.selector} out")
+            raise CommandError(
+                2, f"--learned chooses what was learned; leave --selector {options.selector} out"
+            )
         found["by_regime"] = learned_choices(options.learned)
     return found
 
@@ -250,20 +322,38 @@ def _pair(option: str, text: str) -> tuple[str, str]:
 
 def text_of(result: dict[str, Any]) -> str:
     """The result for people."""
-    lines = [f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed {result['seed']}"]
+    lines = [
+        f"{result['task']}: {result['begun']} runs, selector {result['selector']}, seed "
+        f"{result['seed']}"
+    ]
     wide = max(16, *(len(name) + 2 for name in (*result["by_regime"], *result["chosen"])))
     for name, part in [*result["by_regime"].items(), ("all", result)]:
         low, high = part["wilson"]
-        goal = "" if part["R_goal"] is None else f"R_goal {part['R_goal']:.4f} [{low:.4f}, {high:.4f}]  "
-        times = "" if part["mean"] is None else f"  mean {part['mean']:.3f} s, 90 % {part['q90']:.3f} s"
-        lines.append(f"  {name or '-':{wide}}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}")
+        goal = (
+            ""
+            if part["R_goal"] is None
+            else f"R_goal {part['R_goal']:.4f} [{low:.4f}, {high:.4f}]  "
+        )
+        times = (
+            "" if part["mean"] is None else f"  mean {part['mean']:.3f} s, 90 % {part['q90']:.3f} s"
+        )
+        lines.append(
+            f"  {name or '-':{wide}}{goal}P_complete {part['P_complete'] or 0.0:.4f}{times}"
+        )
     for task, actions in result["chosen"].items():
         if len(actions) > 1:
-            shown = ", ".join(f"{a} {n}" + _in_brackets(result, task, a) for a, n in actions.items())
+            shown = ", ".join(
+                f"{a} {n}" + _in_brackets(result, task, a) for a, n in actions.items()
+            )
             lines.append(f"  {task:{wide}}{shown}")
-            lines += [f"  {'':{wide}}{remark}" for remark in _remarks(result["judged"].get(task, {}))]
+            lines += [
+                f"  {'':{wide}}{remark}" for remark in _remarks(result["judged"].get(task, {}))
+            ]
     speed = result["times_real_time_per_core"]
-    lines.append(f"  {result['sim_s']:.1f} s simulated in {result['wall_s']:.1f} s: {speed} x real time a core")
+    lines.append(
+        f"  {result['sim_s']:.1f} s simulated in {result['wall_s']:.1f} s: {speed} x real "
+        "time a core"
+    )
     lines.append(f"  table: {result['rows']}")
     return "\n".join(lines)
 
@@ -282,9 +372,16 @@ def _remarks(judged: dict[str, Any]) -> list[str]:
     """What J of a primitive task cannot say."""
     out = []
     if judged and not judged["meet_target"] and judged["target"] is not None:
-        out.append(f"no action surely reaches R {judged['target']:g} in any regime: J without a target")
+        out.append(
+            f"no action surely reaches R {judged['target']:g} in any regime: J without a target"
+        )
     if judged and not judged["regimes"]:
-        out.append("there is no regime in which all were run: J of each in its own regimes, not comparable")
+        out.append(
+            "there is no regime in which all were run: J of each in its own regimes, not comparable"
+        )
     for action in judged.get("uncosted", ()):
-        out.append(f"{action}: no run reported {judged['cost']}; its cost is taken as 0. Correct `cost` or the action")
+        out.append(
+            f"{action}: no run reported {judged['cost']}; its cost is taken as 0. Correct "
+            "`cost` or the action"
+        )
     return out

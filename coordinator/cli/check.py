@@ -1,4 +1,5 @@
-"""Check a task before it runs: branches, conflicts, actions on nodes, and its state space for deadlock and unboundedness."""
+"""Check a task before it runs: branches, conflicts, actions on nodes, and its state space for
+deadlock and unboundedness."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.loading import (
+from petrobot.coordinator.cli.loading import (
     SHIPPED_CELL,
     add_services_argument,
     cell_path,
@@ -21,9 +22,9 @@ from coordinator.cli.loading import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from coordinator.analysis.report import Analysis
-    from coordinator.check import Report
-    from coordinator.task import Task
+    from petrobot.coordinator.analysis.report import Analysis
+    from petrobot.coordinator.check import Report
+    from petrobot.coordinator.task import Task
 
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
@@ -39,13 +40,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     add_services_argument(parser)
     parser.add_argument(
-        "--live", action="store_true", help="ask the nodes too: is each one up, does it offer what it should"
+        "--live",
+        action="store_true",
+        help="ask the nodes too: is each one up, does it offer what it should",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the findings as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the findings as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check; 0 when the task may run, 2 when it may not, 3 when only a node that it needs is missing."""
+    """Check; 0 when the task may run, 2 when it may not, 3 when only a node that it needs is
+    missing."""
     task = load_task(options.task)
     services = cell_path(options.services, options.task, task)
     report = _checked(task, services)
@@ -57,19 +63,32 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         found = {} if analysis is None else _plain_analysis(analysis)
         findings = _plain(report, options.task)
-        write_json(options.json, {"task": task.name, "ok": ok, "findings": findings, **found, **live})
+        write_json(
+            options.json, {"task": task.name, "ok": ok, "findings": findings, **found, **live}
+        )
     if options.json != "-":
         told = [f"missing {line}" for line in missing] + _told(report, options.task)
         print("\n".join([*told, _text(options.task, analysis, ok and not missing)]))
-    return 2 if not ok else 130 if analysis is not None and analysis.interrupted else 3 if missing else 0
+    return (
+        2
+        if not ok
+        else 130
+        if analysis is not None and analysis.interrupted
+        else 3
+        if missing
+        else 0
+    )
 
 
 def _checked(task: Task, services: Path) -> Report:
     """What is to be said of the task, and of the actions that a location file offers it."""
-    from coordinator.check import check
+    from petrobot.coordinator.check import check
 
     if services == SHIPPED_CELL and not services.exists():
-        said = "there is none here, and none came with petrobot: whether nodes offer the actions was not checked"
+        said = (
+            "there is none here, and none came with petrobot: whether nodes offer the "
+            "actions was not checked"
+        )
         return _noted(check(task), said)
     directory = load_directory(services)
     refuse_misplaced(directory)
@@ -80,24 +99,34 @@ def _checked(task: Task, services: Path) -> Report:
         source=str(services),
     )
     if services == SHIPPED_CELL and any(finding.code == "unoffered" for finding in report.findings):
-        return _noted(report, f"there is none here, so {services} was used, which comes with petrobot")
+        return _noted(
+            report, f"there is none here, so {services} was used, which comes with petrobot"
+        )
     return report
 
 
 def _noted(report: Report, said: str) -> Report:
     """The findings with a note about the location file that was not given."""
-    from coordinator.check import Finding, Report, Severity
+    from petrobot.coordinator.check import Finding, Report, Severity
 
     remedy = "write one of your own, or give --services FILE"
-    return Report((*report.findings, Finding(Severity.NOTE, NO_CELL, "services.toml", said, remedy)))
+    return Report(
+        (*report.findings, Finding(Severity.NOTE, NO_CELL, "services.toml", said, remedy))
+    )
 
 
 def _missing(task: Task, services: Path | None) -> list[str]:
-    """What the task needs and the nodes do not give now: a line for each node that is away or offers less than it should."""
-    from coordinator.mission.asking import ask_all
+    """What the task needs and the nodes do not give now: a line for each node that is away or
+    offers less than it should."""
+    from petrobot.coordinator.mission.asking import ask_all
 
     directory = load_directory(services)
-    used = {a for p in task.flat.places.values() if p.task for a in task.primitive_task_of(p.name).alternatives}
+    used = {
+        a
+        for p in task.flat.places.values()
+        if p.task
+        for a in task.primitive_task_of(p.name).alternatives
+    }
     wanted: dict[str, set[str]] = {}
     for action in used & set(directory.actions):
         wanted.setdefault(directory.where(action), set()).add(action)
@@ -110,14 +139,15 @@ def _missing(task: Task, services: Path | None) -> list[str]:
             lines.append(f"{node} at {told[node]['address']} is away ({why}): {', '.join(lacks)}")
         elif lacks:
             lines.append(
-                f"{node} at {told[node]['address']} does not offer {', '.join(lacks)}: is its services.toml the same?"
+                f"{node} at {told[node]['address']} does not offer {', '.join(lacks)}: is "
+                "its services.toml the same?"
             )
     return lines
 
 
 def _analysed(task: Task) -> Analysis:
-    from coordinator.analysis.report import analyse
-    from coordinator.analysis.space import Limits
+    from petrobot.coordinator.analysis.report import analyse
+    from petrobot.coordinator.analysis.space import Limits
 
     limits = Limits(states=MOST_STATES, seconds=LONGEST, memory=MOST_MEMORY, clock=time.monotonic)
     return analyse(task, limits=limits)
@@ -148,8 +178,9 @@ def _told(report: Report, name: str) -> list[str]:
 
 
 def _lines(report: Report, name: str) -> list[int | None]:
-    """The line of each finding's key, or of the macro place in which it is; None for what is not about the task file."""
-    from coordinator.taskfile.errors import key_lines, line_of
+    """The line of each finding's key, or of the macro place in which it is; None for what is not
+    about the task file."""
+    from petrobot.coordinator.taskfile.errors import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
     return [None if f.code == NO_CELL else line_of(f.key, lines) for f in report.findings]
@@ -159,10 +190,14 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
     ended, lines = "", list[str]()
     if analysis is not None:
         verdicts = {True: "yes", False: "NO", None: "unknown"}
-        shown = {k: v for k, v in analysis.verdicts().items() if k != "safe"}  # runs to do are several tokens
+        shown = {
+            k: v for k, v in analysis.verdicts().items() if k != "safe"
+        }  # runs to do are several tokens
         told = [f"{key.replace('_', ' ')} {verdicts[v.holds]}" for key, v in shown.items()]
         lines += [f"{'note':8}final: {note}" for note in analysis.notes]
-        lines.append(f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{_cut(analysis)}")
+        lines.append(
+            f"{len(analysis.qualitative.space)} markings: {', '.join(told)}{_cut(analysis)}"
+        )
         lines += _objections(analysis)
         if analysis.objections:
             lines.append(f"petrobot analyse {name} --pictures FOLDER shows how it comes to that")
@@ -171,8 +206,9 @@ def _text(name: str, analysis: Analysis | None, ok: bool) -> str:
 
 
 def _cut(analysis: Analysis) -> str:
-    """Why the search ended early, and whether `analyse` would go on: not beyond a proof that the net has no end."""
-    from coordinator.analysis.report import ENDLESS
+    """Why the search ended early, and whether `analyse` would go on: not beyond a proof that the
+    net has no end."""
+    from petrobot.coordinator.analysis.report import ENDLESS
 
     space = analysis.qualitative.space
     if space.complete:

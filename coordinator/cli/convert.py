@@ -1,26 +1,33 @@
-"""Read a net in one format and write it in another, by the files' endings; whatever cannot be kept is listed."""
+"""Read a net in one format and write it in another, by the files' endings; whatever cannot be kept
+is listed."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from coordinator.cli.loading import task_path
+from petrobot.coordinator.cli.loading import task_path
 
 EXAMPLE = "petrobot convert catch_ball catch_ball.pnml"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("source", help="a net or task file, or the name of a task that comes with petrobot")
-    parser.add_argument("target", type=Path, help="the file to write: .pnml, .net (TINA), .dot, .drn (Storm)")
-    parser.add_argument("--json", metavar="FILE", help="write what was not kept as JSON (- for standard output)")
+    parser.add_argument(
+        "source", help="a net or task file, or the name of a task that comes with petrobot"
+    )
+    parser.add_argument(
+        "target", type=Path, help="the file to write: .pnml, .net (TINA), .dot, .drn (Storm)"
+    )
+    parser.add_argument(
+        "--json", metavar="FILE", help="write what was not kept as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Convert."""
-    from coordinator.analysis.commands import convert_command
-    from coordinator.cli.analyse import give
-    from coordinator.taskfile import load
+    from petrobot.coordinator.analysis.commands import convert_command
+    from petrobot.coordinator.cli.analyse import give
+    from petrobot.coordinator.taskfile import load
 
     return give(convert_command(task_path(options.source), options.target, load), options.json)

@@ -1,4 +1,5 @@
-"""`petrobot run --from RUN:RECORD`: a simulated run of the same task that sets out where a recorded one stood."""
+"""`petrobot run --from RUN:RECORD`: a simulated run of the same task that sets out where a recorded
+one stood."""
 
 from __future__ import annotations
 
@@ -6,16 +7,16 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.parameters import pairs, parameter_of
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.parameters import pairs, parameter_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from coordinator.cli.replaying import Recorded
-    from coordinator.launch import Setting
-    from coordinator.operator.departure import Departure
-    from coordinator.record.recording import JournalStore
+    from petrobot.coordinator.cli.replaying import Recorded
+    from petrobot.coordinator.launch import Setting
+    from petrobot.coordinator.operator.departure import Departure
+    from petrobot.coordinator.record.recording import JournalStore
 
 REFUSED = {
     "task": "the task comes from the run",
@@ -35,7 +36,8 @@ def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
         "--from",
         dest="departs",
         metavar="RUN[:RECORD]",
-        help="simulate the task of a recorded run from the state after one of its records (`petrobot log` numbers them; "
+        help="simulate the task of a recorded run from the state after one of its records "
+        "(`petrobot log` numbers them; "
         "0, the default, is its beginning), in lock step, in a run folder of its own",
     )
     parser.add_argument(
@@ -43,17 +45,18 @@ def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="[PLACE=]END",
-        help="with --from: what becomes of the runs that went on then: again (begin anew, the default), success, failure or "
+        help="with --from: what becomes of the runs that went on then: again (begin anew, "
+        "the default), success, failure or "
         "error[:CAUSE]; of one place, or of all",
     )
 
 
 def depart(options: argparse.Namespace) -> int:
     """Simulate from the point; the exit code says whether the task reached its end."""
-    from coordinator.cli.giving import give, progress
-    from coordinator.cli.lockstep import in_one_process, substitutes
-    from coordinator.mission.mission import MissionError
-    from coordinator.record.journal import JournalError
+    from petrobot.coordinator.cli.giving import give, progress
+    from petrobot.coordinator.cli.lockstep import in_one_process, substitutes
+    from petrobot.coordinator.mission.mission import MissionError
+    from petrobot.coordinator.record.journal import JournalError
 
     found, departure = _found(options)
     setting = _setting(found, departure, options)
@@ -67,23 +70,29 @@ def depart(options: argparse.Namespace) -> int:
         raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
     except JournalError as fault:
         raise CommandError(2, str(fault)) from fault
-    told = {"from": {"run": departure.run, "record": departure.record, "going": dict(departure.going)}}
+    told = {
+        "from": {"run": departure.run, "record": departure.record, "going": dict(departure.going)}
+    }
     result = {**mission.result("lockstep", time.perf_counter() - begun), **told}
     give(result, found.task, timeline, options, options.folder)
     return 0 if result["status"] == "success" else 1
 
 
 def _found(options: argparse.Namespace) -> tuple[Recorded, Departure]:
-    from coordinator.cli.replaying import recorded
-    from coordinator.operator.departure import DepartureError, departure
-    from coordinator.record.journal import JournalError
-    from coordinator.record.recording import ReplayError
+    from petrobot.coordinator.cli.replaying import recorded
+    from petrobot.coordinator.operator.departure import DepartureError, departure
+    from petrobot.coordinator.record.journal import JournalError
+    from petrobot.coordinator.record.recording import ReplayError
 
     for name, why in REFUSED.items():
         if getattr(options, name):
-            raise CommandError(2, f"--from goes with no {'--' if name != 'task' else ''}{name}: {why}")
+            raise CommandError(
+                2, f"--from goes with no {'--' if name != 'task' else ''}{name}: {why}"
+            )
     if options.mode == "realtime" or options.processes != 1:
-        raise CommandError(2, "--from simulates in one process: a real cell does not stand where a marking says")
+        raise CommandError(
+            2, "--from simulates in one process: a real cell does not stand where a marking says"
+        )
     name, record = _named(options.departs)
     found = recorded(name)
     try:
@@ -103,7 +112,7 @@ def _named(text: str) -> tuple[str, int]:
 
 
 def _going(texts: list[str]) -> dict[str, str] | str:
-    from coordinator.operator.departure import AGAIN
+    from petrobot.coordinator.operator.departure import AGAIN
 
     if any("=" not in text for text in texts):
         if len(texts) > 1:
@@ -113,14 +122,16 @@ def _going(texts: list[str]) -> dict[str, str] | str:
 
 
 def _setting(found: Recorded, departure: Departure, options: argparse.Namespace) -> Setting:
-    from coordinator.operator.departure import departing
+    from petrobot.coordinator.operator.departure import departing
 
     given = dict(pairs("--set", options.set))
     if options.regime is not None:
         given["regime"] = options.regime
     parameters = {name: parameter_of(found.task, name, text) for name, text in given.items()}
     try:
-        return departing(found.journal, found.task, found.engine, departure, options.seed, parameters)
+        return departing(
+            found.journal, found.task, found.engine, departure, options.seed, parameters
+        )
     except ValueError as fault:
         raise CommandError(2, str(fault)) from fault
 
@@ -133,10 +144,12 @@ def _mock(found: Recorded, options: argparse.Namespace) -> Path | None:
     return given or (Path(then) if then else None)
 
 
-def _store(found: Recorded, setting: Setting, departure: Departure, options: argparse.Namespace) -> JournalStore:
-    from coordinator.launch import mission_id
-    from coordinator.operator.departure import departed_store
-    from coordinator.record.runfolder import DEFAULT
+def _store(
+    found: Recorded, setting: Setting, departure: Departure, options: argparse.Namespace
+) -> JournalStore:
+    from petrobot.coordinator.launch import mission_id
+    from petrobot.coordinator.operator.departure import departed_store
+    from petrobot.coordinator.record.runfolder import DEFAULT
 
     options.folder = (options.journal or DEFAULT) / mission_id(found.task)
     more: dict[str, Any] = {"durable": options.durable}

@@ -1,4 +1,5 @@
-"""Emergency stop: straight to the nodes and their bus, whatever the coordinator does; everybody may say it."""
+"""Emergency stop: straight to the nodes and their bus, whatever the coordinator does; everybody may
+say it."""
 
 from __future__ import annotations
 
@@ -9,27 +10,36 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import add_services_argument, load_directory, write_json
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import add_services_argument, load_directory, write_json
 
 if TYPE_CHECKING:
-    from coordinator.operator.door_file import Door
-    from coordinator.operator.emergency import Stopped
+    from petrobot.coordinator.operator.door_file import Door
+    from petrobot.coordinator.operator.emergency import Stopped
 
 EXAMPLE = "petrobot estop"
 COORDINATOR_PATIENCE = 1.0
-"""Seconds that the coordinator has to hear of it; the devices have been stopped before it is told."""
+"""Seconds that the coordinator has to hear of it; the devices have been stopped before it is
+told."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "--clear", action="store_true", help="devices take orders again; nothing moves before an action moves it"
+        "--clear",
+        action="store_true",
+        help="devices take orders again; nothing moves before an action moves it",
     )
     parser.add_argument(
-        "--bus", action="store_true", help="stop the devices on this host's buses, too, without waiting for their node"
+        "--bus",
+        action="store_true",
+        help="stop the devices on this host's buses, too, without waiting for their node",
     )
-    parser.add_argument("--run", metavar="RUN", help="the run whose cell is meant (default: the newest that goes on)")
+    parser.add_argument(
+        "--run",
+        metavar="RUN",
+        help="the run whose cell is meant (default: the newest that goes on)",
+    )
     parser.add_argument(
         "--journal",
         metavar="FOLDER",
@@ -37,31 +47,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path("runs"),
         help="where runs are kept (default: %(default)s)",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the answers as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the answers as JSON (- for standard output)"
+    )
     add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
-    from coordinator.operator.emergency import CLEAR, STOP, order_all
-    from services.comm.credentials import COORDINATOR, credentials
+    from petrobot.coordinator.operator.emergency import CLEAR, STOP, order_all
+    from petrobot.services.comm.credentials import COORDINATOR, credentials
 
     door = _door(options)
     path = options.services or (Path(door.services) if door is not None and door.services else None)
     directory = load_directory(path)
     verb = CLEAR if options.clear else STOP
     begun = time.perf_counter()
-    answers = asyncio.run(order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus))
+    answers = asyncio.run(
+        order_all(directory, credentials(directory, COORDINATOR), verb, bus=options.bus)
+    )
     took = time.perf_counter() - begun
-    coordinator = asyncio.run(_tell(door, options.journal)) if door is not None and not options.clear else ""
+    coordinator = (
+        asyncio.run(_tell(door, options.journal)) if door is not None and not options.clear else ""
+    )
     _show(options, answers, coordinator, took)
     return 0 if answers and all(answer.answered or answer.cleared for answer in answers) else 3
 
 
 def _door(options: argparse.Namespace) -> Door | None:
-    """The run that goes on, if one does: it says which cell is meant, and its coordinator is told."""
-    from coordinator.operator.door_file import find_door
-    from coordinator.record.runfolder import NoRunError
+    """The run that goes on, if one does: it says which cell is meant, and its coordinator is
+    told."""
+    from petrobot.coordinator.operator.door_file import find_door
+    from petrobot.coordinator.record.runfolder import NoRunError
 
     try:
         return find_door(options.run, options.journal)
@@ -72,22 +89,25 @@ def _door(options: argparse.Namespace) -> Door | None:
 
 
 async def _tell(door: Door, folder: Path) -> str:
-    """Let the coordinator abort its run, so that it does not look for a way around; what came of it, in words."""
-    from coordinator.cli.operate.hand import connect
-    from coordinator.hmi.client import OperatorError
+    """Let the coordinator abort its run, so that it does not look for a way around; what came of
+    it, in words."""
+    from petrobot.coordinator.cli.operate.hand import connect
+    from petrobot.coordinator.hmi.client import OperatorError
 
     try:
         async with asyncio.timeout(COORDINATOR_PATIENCE), connect(door, None) as client:
             answer = await client.command("estop")
     except (OperatorError, TimeoutError):
-        return f"{door.run}: " + ("the coordinator does not answer" if _goes_on(door, folder) else "has ended")
+        return f"{door.run}: " + (
+            "the coordinator does not answer" if _goes_on(door, folder) else "has ended"
+        )
     return f"{door.run}: aborted" if answer.get("ok") else f"{door.run}: {answer.get('text')}"
 
 
 def _goes_on(door: Door, folder: Path) -> bool:
     """Whether the run's door is still there: a run whose devices stop may end by itself."""
-    from coordinator.operator.door_file import find_door
-    from coordinator.record.runfolder import NoRunError
+    from petrobot.coordinator.operator.door_file import find_door
+    from petrobot.coordinator.record.runfolder import NoRunError
 
     try:
         return find_door(door.run, folder) == door
@@ -95,9 +115,14 @@ def _goes_on(door: Door, folder: Path) -> bool:
         return False
 
 
-def _show(options: argparse.Namespace, answers: list[Stopped], coordinator: str, took: float) -> None:
+def _show(
+    options: argparse.Namespace, answers: list[Stopped], coordinator: str, took: float
+) -> None:
     if options.json:
-        data: dict[str, Any] = {"nodes": [asdict(answer) for answer in answers], "coordinator": coordinator}
+        data: dict[str, Any] = {
+            "nodes": [asdict(answer) for answer in answers],
+            "coordinator": coordinator,
+        }
         write_json(options.json, {**data, "seconds": round(took, 4)})
     if options.json == "-":
         return

@@ -1,4 +1,5 @@
-"""Forecast further runs of a task from measured ones, and register the forecast before they run; or compare it with them."""
+"""Forecast further runs of a task from measured ones, and register the forecast before they run; or
+compare it with them."""
 
 from __future__ import annotations
 
@@ -8,17 +9,17 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import load_directory, load_task, write_json
-from services.comm.quantities import whole
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import load_directory, load_task, write_json
+from petrobot.services.comm.quantities import whole
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from coordinator.campaign.plan import Plan
-    from coordinator.campaign.rows import Row
-    from coordinator.forecast.history import Training
-    from coordinator.learning.learning import Estimates
-    from coordinator.task import Task
+    from petrobot.coordinator.campaign.plan import Plan
+    from petrobot.coordinator.campaign.rows import Row
+    from petrobot.coordinator.forecast.history import Training
+    from petrobot.coordinator.learning.learning import Estimates
+    from petrobot.coordinator.task import Task
 
 EXAMPLE = (
     "petrobot forecast catch_ball --estimates campaigns/train --runs 1000 --out forecast.json\n"
@@ -28,7 +29,9 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("task", nargs="?", help="a task file, or the name of a task that comes with petrobot")
+    parser.add_argument(
+        "task", nargs="?", help="a task file, or the name of a task that comes with petrobot"
+    )
     parser.add_argument(
         "--estimates",
         metavar="FILE|CAMPAIGN",
@@ -36,45 +39,79 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a campaign's folder, or an estimates file without its throws",
     )
     parser.add_argument(
-        "--runs", type=whole(), default=1000, metavar="N", help="that will be run in each regime (%(default)s)"
-    )
-    parser.add_argument("--regime", default="", metavar="A,B", help="only these (default: all that were measured)")
-    parser.add_argument(
-        "--choose", default="", metavar="TASK=ACTION,...", help="choices of the new runs (default: as measured)"
-    )
-    parser.add_argument("--learned", metavar="CAMPAIGN", type=Path, help="new runs take what this campaign has learned")
-    parser.add_argument("--replicates", type=whole(20), default=400, metavar="B", help="of the bootstrap (%(default)s)")
-    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="of the simulation (%(default)s)")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="register the forecast here; never written over")
-    parser.add_argument(
-        "--doubtful", action="store_true", help="register it although it does not repeat even its own training"
+        "--runs",
+        type=whole(),
+        default=1000,
+        metavar="N",
+        help="that will be run in each regime (%(default)s)",
     )
     parser.add_argument(
-        "--compare", nargs=2, metavar=("FORECAST", "CAMPAIGN"), type=Path, help="compare with what was measured"
+        "--regime", default="", metavar="A,B", help="only these (default: all that were measured)"
+    )
+    parser.add_argument(
+        "--choose",
+        default="",
+        metavar="TASK=ACTION,...",
+        help="choices of the new runs (default: as measured)",
+    )
+    parser.add_argument(
+        "--learned",
+        metavar="CAMPAIGN",
+        type=Path,
+        help="new runs take what this campaign has learned",
+    )
+    parser.add_argument(
+        "--replicates",
+        type=whole(20),
+        default=400,
+        metavar="B",
+        help="of the bootstrap (%(default)s)",
+    )
+    parser.add_argument(
+        "--seed", type=whole(0), default=1, metavar="S", help="of the simulation (%(default)s)"
+    )
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help="register the forecast here; never written over"
+    )
+    parser.add_argument(
+        "--doubtful",
+        action="store_true",
+        help="register it although it does not repeat even its own training",
+    )
+    parser.add_argument(
+        "--compare",
+        nargs=2,
+        metavar=("FORECAST", "CAMPAIGN"),
+        type=Path,
+        help="compare with what was measured",
     )
     parser.add_argument("--markdown", metavar="FILE", type=Path, help="write the table as Markdown")
-    parser.add_argument("--json", metavar="FILE", help="write everything as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write everything as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Forecast, or compare: exit code 1 when the forecast is doubtful or disagrees."""
-    from coordinator.campaign.plan import CampaignError
-    from coordinator.forecast.registered import ForecastError
+    from petrobot.coordinator.campaign.plan import CampaignError
+    from petrobot.coordinator.forecast.registered import ForecastError
 
     try:
         if options.compare is not None:
             registered, folder = options.compare
             return _compare(registered, folder, options)
         if options.task is None or options.estimates is None:
-            raise CommandError(2, "give TASK and --estimates CAMPAIGN to forecast, or --compare FORECAST CAMPAIGN")
+            raise CommandError(
+                2, "give TASK and --estimates CAMPAIGN to forecast, or --compare FORECAST CAMPAIGN"
+            )
         return _forecast(options)
     except (ForecastError, CampaignError) as fault:
         raise CommandError(2, str(fault)) from fault
 
 
 def _forecast(options: argparse.Namespace) -> int:
-    from coordinator.forecast.registered import register, write
-    from coordinator.forecast.tables import forecast_text
+    from petrobot.coordinator.forecast.registered import register, write
+    from petrobot.coordinator.forecast.tables import forecast_text
 
     task = load_task(options.task)
     trainings, estimates, about = _trainings(task, options.estimates)
@@ -92,24 +129,33 @@ def _forecast(options: argparse.Namespace) -> int:
         if registered:
             print(f"registered: {options.out}  sha256 {made['sha256'][:16]}")
     if doubtful and not options.doubtful:
-        kept = "" if options.out is None else f"; {options.out} is not written, --doubtful registers it all the same"
+        kept = (
+            ""
+            if options.out is None
+            else f"; {options.out} is not written, --doubtful registers it all the same"
+        )
         print(f"petrobot forecast: DOUBTFUL, see above{kept}", file=sys.stderr)
         return 1
     return 0
 
 
 def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
-    """Training throws by regime, the estimates, and what the forecast says about where they come from."""
-    from coordinator.campaign.observed import estimates_of
-    from coordinator.campaign.plan import digest, read_manifest
-    from coordinator.campaign.table import TABLE, read_table
-    from coordinator.forecast.history import by_regime
-    from coordinator.forecast.summed import read_estimates, trainings_of
+    """Training throws by regime, the estimates, and what the forecast says about where they come
+    from."""
+    from petrobot.coordinator.campaign.observed import estimates_of
+    from petrobot.coordinator.campaign.plan import digest, read_manifest
+    from petrobot.coordinator.campaign.table import TABLE, read_table
+    from petrobot.coordinator.forecast.history import by_regime
+    from petrobot.coordinator.forecast.summed import read_estimates, trainings_of
 
     if not path.is_dir():
         known = read_estimates(path)
         _refuse_other_names(task, path, {key.primitive_task: [key.action] for key in known.tallies})
-        return trainings_of(task, known), known, {"estimates": {"file": path.name, "sha256": digest(path)}}
+        return (
+            trainings_of(task, known),
+            known,
+            {"estimates": {"file": path.name, "sha256": digest(path)}},
+        )
     plan = read_manifest(path)
     _refuse_other_task(task, plan, path)
     rows = list(read_table(path / TABLE))
@@ -118,7 +164,12 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
     if not found:
         raise CommandError(2, f"{path}: the table holds no throw yet")
     about = {
-        "estimates": {"campaign": path.name, "seed": plan.seed, "block": plan.block, "sha256": digest(path / TABLE)},
+        "estimates": {
+            "campaign": path.name,
+            "seed": plan.seed,
+            "block": plan.block,
+            "sha256": digest(path / TABLE),
+        },
         "task_sha256": plan.digests["task"],
     }
     return found, estimates_of(task, rows, path.name), about
@@ -126,20 +177,23 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
 
 def _refuse_other_task(task: Task, plan: Plan, path: Path) -> None:
     """Raises CommandError when a campaign ran a task of another name, where its file still is."""
-    from coordinator.campaign.plan import MANIFEST
+    from petrobot.coordinator.campaign.plan import MANIFEST
 
     if not Path(plan.task).is_file():
         return
     name = load_task(plan.task).name
     if name != task.name:
         raise CommandError(
-            2, f"{path / MANIFEST}: task: the campaign ran {name}, not {task.name}; give --estimates of {task.name}"
+            2,
+            f"{path / MANIFEST}: task: the campaign ran {name}, not {task.name}; give "
+            f"--estimates of {task.name}",
         )
 
 
 def _refuse_other_runs(task: Task, rows: Iterable[Row], path: Path) -> None:
-    """Raises CommandError for runs in places or of actions that the task does not have (any more)."""
-    from coordinator.campaign.table import TABLE
+    """Raises CommandError for runs in places or of actions that the task does not have (any
+    more)."""
+    from petrobot.coordinator.campaign.table import TABLE
 
     actions: dict[str, dict[str, None]] = {}
     for row in rows:
@@ -150,7 +204,8 @@ def _refuse_other_runs(task: Task, rows: Iterable[Row], path: Path) -> None:
         if known is None or not known.task:
             raise CommandError(
                 2,
-                f"{path / TABLE}: runs: {task.name} has no action place {place}; the task file is another one: train anew",
+                f"{path / TABLE}: runs: {task.name} has no action place {place}; the task "
+                "file is another one: train anew",
             )
         _refuse_other_actions(task, known.task, found, path / TABLE)
 
@@ -161,7 +216,8 @@ def _refuse_other_actions(task: Task, primitive: str, actions: Iterable[str], so
         if action not in offered:
             raise CommandError(
                 2,
-                f"{source}: runs: {primitive} of {task.name} has no action {action} ({', '.join(offered)}); the task file is "
+                f"{source}: runs: {primitive} of {task.name} has no action {action} "
+                f"({', '.join(offered)}); the task file is "
                 "another one: train anew",
             )
 
@@ -171,14 +227,17 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
     if not set(found) & set(task.flat.primitive_tasks):
         raise CommandError(
             2,
-            f"{path}: it holds estimates of {', '.join(sorted(found))}; {task.name} has {', '.join(task.flat.primitive_tasks)}",
+            f"{path}: it holds estimates of {', '.join(sorted(found))}; {task.name} has "
+            f"{', '.join(task.flat.primitive_tasks)}",
         )
 
 
-def _request(task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace) -> Any:
-    from coordinator.campaign.policies import learned_choices
-    from coordinator.forecast.choices import choices_of
-    from coordinator.forecast.predict import Request
+def _request(
+    task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
+) -> Any:
+    from petrobot.coordinator.campaign.policies import learned_choices
+    from petrobot.coordinator.forecast.choices import choices_of
+    from petrobot.coordinator.forecast.predict import Request
 
     if regime not in trainings:
         raise CommandError(2, f"--regime {regime}: not measured; there are {', '.join(trainings)}")
@@ -187,15 +246,24 @@ def _request(task: Task, trainings: Mapping[str, Training], regime: str, options
     if options.learned is not None and regime not in learned:
         raise CommandError(
             2,
-            f"--learned {options.learned}: nothing was learned of regime {regime or '-'}; there are {', '.join(learned)}",
+            f"--learned {options.learned}: nothing was learned of regime {regime or '-'}; "
+            f"there are {', '.join(learned)}",
         )
-    asked = {name: (action, f"--learned {options.learned}") for name, action in learned.get(regime, {}).items()}
-    asked |= {name: (action, "--choose") for name, action in (_pair(t) for t in options.choose.split(",") if t)}
+    asked = {
+        name: (action, f"--learned {options.learned}")
+        for name, action in learned.get(regime, {}).items()
+    }
+    asked |= {
+        name: (action, "--choose")
+        for name, action in (_pair(t) for t in options.choose.split(",") if t)
+    }
     for name, (action, option) in asked.items():
         primitive = task.primitive_tasks.get(name)
         if primitive is None or action not in primitive.alternatives:
             known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
-            raise CommandError(2, f"{option}: {name}={action} is not known to {task.name}; choose among {known}")
+            raise CommandError(
+                2, f"{option}: {name}={action} is not known to {task.name}; choose among {known}"
+            )
         choices[name] = {action: 1.0}
     return Request(options.runs, choices, options.seed, options.replicates)
 
@@ -208,7 +276,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int:
-    from coordinator.forecast.tables import agreement_markdown, agreement_text
+    from petrobot.coordinator.forecast.tables import agreement_markdown, agreement_text
 
     found = compared(registered, folder)
     if options.markdown is not None:
@@ -222,14 +290,19 @@ def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int
 
 
 def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
-    """The task of a campaign that may be compared with a registered forecast. Raises CommandError."""
+    """The task of a campaign that may be compared with a registered forecast. Raises
+    CommandError."""
     task = load_task(plan.task)
     if task.name != forecast["task"]:
-        raise CommandError(2, f"{registered} forecasts {forecast['task']}, the campaign runs {task.name}")
+        raise CommandError(
+            2, f"{registered} forecasts {forecast['task']}, the campaign runs {task.name}"
+        )
     training = forecast["estimates"]
     if training.get("seed") == plan.seed and training.get("block") == plan.block:
         raise CommandError(
-            2, f"{registered} was trained on these throws (seed {plan.seed}): run the campaign with another --seed"
+            2,
+            f"{registered} was trained on these throws (seed {plan.seed}): run the campaign "
+            "with another --seed",
         )
     for regime, counts in _planned(plan, task).items():
         _refuse_other_choices(registered, forecast, regime, counts)
@@ -237,8 +310,9 @@ def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
 
 
 def _planned(plan: Plan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
-    """By regime: how a campaign that learns nothing will choose; empty where its file of services is not here."""
-    from coordinator.campaign.policies import learns, policy_of
+    """By regime: how a campaign that learns nothing will choose; empty where its file of services
+    is not here."""
+    from petrobot.coordinator.campaign.policies import learns, policy_of
 
     if learns(plan.selector) or not Path(plan.services).is_file():
         return {}
@@ -250,7 +324,9 @@ def _planned(plan: Plan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
                 counts = out.setdefault(block.regime, {}).setdefault(name, {})
                 for action, p in shares.items():
                     counts[action] = counts.get(action, 0.0) + p
-    return {r: {name: _certain(counts) for name, counts in chosen.items()} for r, chosen in out.items()}
+    return {
+        r: {name: _certain(counts) for name, counts in chosen.items()} for r, chosen in out.items()
+    }
 
 
 def _certain(counts: Mapping[str, float]) -> dict[str, float]:
@@ -260,31 +336,37 @@ def _certain(counts: Mapping[str, float]) -> dict[str, float]:
 
 
 def _refuse_other_choices(
-    registered: Path, forecast: Mapping[str, Any], regime: str, counts: Mapping[str, Mapping[str, float]]
+    registered: Path,
+    forecast: Mapping[str, Any],
+    regime: str,
+    counts: Mapping[str, Mapping[str, float]],
 ) -> None:
     """Raises CommandError when a regime's runs choose otherwise than their forecast says."""
-    from coordinator.forecast.choices import in_words, misfit, remedy
+    from petrobot.coordinator.forecast.choices import in_words, misfit, remedy
 
     said = forecast["regimes"].get(regime)
     names = [] if said is None else misfit(said, counts)
     if said is not None and names:
         raise CommandError(
             2,
-            f"{registered} is of other choices, regime {regime or '-'}: it forecasts {in_words(said['choices'], names)}; the "
-            f"campaign chooses {in_words(counts, names)}: {remedy(said['choices'], names)}, or forecast what it chooses "
+            f"{registered} is of other choices, regime {regime or '-'}: it forecasts "
+            f"{in_words(said['choices'], names)}; the "
+            f"campaign chooses {in_words(counts, names)}: {remedy(said['choices'], names)}, "
+            "or forecast what it chooses "
             "(petrobot forecast --choose)",
         )
 
 
 def compared(registered: Path, folder: Path) -> dict[str, Any]:
-    """A registered forecast beside what a campaign measured. Raises CommandError when they do not belong together."""
-    from coordinator.campaign.plan import read_manifest
-    from coordinator.campaign.spent import began
-    from coordinator.campaign.table import TABLE, read_table
-    from coordinator.forecast.agreement import agreement
-    from coordinator.forecast.choices import choice_counts
-    from coordinator.forecast.history import by_regime
-    from coordinator.forecast.registered import read
+    """A registered forecast beside what a campaign measured. Raises CommandError when they do not
+    belong together."""
+    from petrobot.coordinator.campaign.plan import read_manifest
+    from petrobot.coordinator.campaign.spent import began
+    from petrobot.coordinator.campaign.table import TABLE, read_table
+    from petrobot.coordinator.forecast.agreement import agreement
+    from petrobot.coordinator.forecast.choices import choice_counts
+    from petrobot.coordinator.forecast.history import by_regime
+    from petrobot.coordinator.forecast.registered import read
 
     forecast, plan = read(registered), read_manifest(folder)
     task = fitting(registered, forecast, plan)
@@ -298,11 +380,17 @@ def compared(registered: Path, folder: Path) -> dict[str, Any]:
     first = began(folder)
     return {
         "task": task.name,
-        "forecast": {"file": registered.name, "sha256": forecast["sha256"], "registered_at": forecast["registered_at"]},
+        "forecast": {
+            "file": registered.name,
+            "sha256": forecast["sha256"],
+            "registered_at": forecast["registered_at"],
+        },
         "campaign": {"folder": folder.name, "seed": plan.seed, "began_at": first},
         "registered_before": first is not None and forecast["registered_at"] <= first,
         "same_block": forecast["estimates"].get("block") in (None, plan.block),
-        "doubts": {name: said["doubts"] for name, said in forecast["regimes"].items() if said.get("doubts")},
+        "doubts": {
+            name: said["doubts"] for name, said in forecast["regimes"].items() if said.get("doubts")
+        },
         "same_task_file": forecast.get("task_sha256") in (None, plan.digests["task"]),
         **found,
     }

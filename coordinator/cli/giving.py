@@ -1,4 +1,5 @@
-"""What a run leaves: progress while it goes on, then its result in the terminal, as JSON, beside its journal and as a report."""
+"""What a run leaves: progress while it goes on, then its result in the terminal, as JSON, beside
+its journal and as a report."""
 
 from __future__ import annotations
 
@@ -9,13 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.loading import pictures_of, write_json
-from services.comm.whole_file import write_whole
+from petrobot.coordinator.cli.loading import pictures_of, write_json
+from petrobot.services.comm.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from coordinator.mission.mission import Mission
-    from coordinator.record.timeline import Timeline
-    from coordinator.task import Task
+    from petrobot.coordinator.mission.mission import Mission
+    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.task import Task
 
 
 @contextmanager
@@ -24,34 +25,40 @@ def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float],
     if options.quiet or options.json == "-":
         yield None
         return
-    from coordinator.cli.progress import live_progress
+    from petrobot.coordinator.cli.progress import live_progress
 
     with live_progress() as watch:
         yield watch
 
 
 def give(
-    result: dict[str, Any], task: Task, timeline: Timeline, options: argparse.Namespace, folder: Path | None
+    result: dict[str, Any],
+    task: Task,
+    timeline: Timeline,
+    options: argparse.Namespace,
+    folder: Path | None,
 ) -> None:
-    """Write the result where it was asked for and beside the journal, print it, leave the report."""
+    """Write the result where it was asked for and beside the journal, print it, leave the
+    report."""
     if folder is not None:
-        from coordinator.record.runfolder import RESULT
+        from petrobot.coordinator.record.runfolder import RESULT
 
         write_json(str(folder / RESULT), result)
     if options.json:
         write_json(options.json, result)
     if options.json != "-":
-        from coordinator.cli.progress import print_result
+        from petrobot.coordinator.cli.progress import print_result
 
         print_result(result)
         if folder is None and result["status"] != "success":
             print(
-                "not kept; with --journal runs, `petrobot log` and `petrobot report` show what led there",
+                "not kept; with --journal runs, `petrobot log` and `petrobot report` show "
+                "what led there",
                 file=sys.stderr,
             )
     if options.report is not None:
-        from coordinator.drawing import draw
-        from coordinator.report import report_html
+        from petrobot.coordinator.drawing import draw
+        from petrobot.coordinator.report import report_html
 
         write_json(str(options.report / "result.json"), result)
         page = options.report / "index.html"

@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from services.comm.quantities import whole
+from petrobot.services.comm.quantities import whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from coordinator.launch import Setting
-    from coordinator.record.recording import JournalStore
-    from services.comm.directory import Directory
+    from petrobot.coordinator.launch import Setting
+    from petrobot.coordinator.record.recording import JournalStore
+    from petrobot.services.comm.directory import Directory
 
 
 def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,8 @@ def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
         "--journal",
         metavar="FOLDER",
         type=Path,
-        help="where runs are kept (default: runs in real time; a run in lock step is kept only with this option)",
+        help="where runs are kept (default: runs in real time; a run in lock step is kept "
+        "only with this option)",
     )
     parser.add_argument(
         "--keep",
@@ -34,13 +35,14 @@ def add_journal_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--durable",
         action="store_true",
-        help="sync the journal before every start, also of actions without a device (costs a sync each)",
+        help="sync the journal before every start, also of actions without a device (costs a "
+        "sync each)",
     )
 
 
 def journal_folder(options: argparse.Namespace) -> Path | None:
     """Where this run is to be kept, None if nowhere."""
-    from coordinator.record.runfolder import DEFAULT
+    from petrobot.coordinator.record.runfolder import DEFAULT
 
     return options.journal if options.journal is not None or options.mode == "lockstep" else DEFAULT
 
@@ -55,11 +57,11 @@ def new_store(
     **more: Any,
 ) -> JournalStore:
     """The journal of a run that begins, in a folder of its own; `more` goes into its header."""
-    from coordinator.cli.loading import task_path
-    from coordinator.launch import with_runs
-    from coordinator.record.journal import JournalWriter
-    from coordinator.record.recording import JournalStore, clock_reading
-    from coordinator.record.runfolder import JOURNAL, header
+    from petrobot.coordinator.cli.loading import task_path
+    from petrobot.coordinator.launch import with_runs
+    from petrobot.coordinator.record.journal import JournalWriter
+    from petrobot.coordinator.record.recording import JournalStore, clock_reading
+    from petrobot.coordinator.record.runfolder import JOURNAL, header
 
     services = directory.source.read_text(encoding="utf-8")
     given: Mapping[str, Any] = {
@@ -72,14 +74,16 @@ def new_store(
         "mock": str(options.mock.resolve()) if options.mock else "",
         **more,
     }
-    first = header(mission, task_path(options.task).read_text(encoding="utf-8"), services, options.mode, given)
+    first = header(
+        mission, task_path(options.task).read_text(encoding="utf-8"), services, options.mode, given
+    )
     return JournalStore(JournalWriter(folder / JOURNAL, first), origin, durable=options.durable)
 
 
 def tidy(options: argparse.Namespace) -> None:
     """Remove what `--keep` says is too old; a run without a result is never removed."""
     if options.keep is not None and options.folder is not None:
-        from coordinator.record.runfolder import retain
+        from petrobot.coordinator.record.runfolder import retain
 
         for name in retain(options.folder.parent, options.keep):
             print(f"removed the run {name} (--keep {options.keep})", file=sys.stderr)

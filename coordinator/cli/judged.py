@@ -1,4 +1,5 @@
-"""`learned show`: what is known of actions, how they are judged, over all contexts and in each, and what remains to be said."""
+"""`learned show`: what is known of actions, how they are judged, over all contexts and in each, and
+what remains to be said."""
 
 from __future__ import annotations
 
@@ -9,13 +10,13 @@ from functools import reduce
 from math import inf, isfinite, isnan
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import write_json
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import write_json
 
 if TYPE_CHECKING:
-    from coordinator.experience.estimates_file import Kept
-    from coordinator.learning.estimate import Tally
-    from coordinator.learning.objective import Comparison, Figures, Question
+    from petrobot.coordinator.experience.estimates_file import Kept
+    from petrobot.coordinator.learning.estimate import Tally
+    from petrobot.coordinator.learning.objective import Comparison, Figures, Question
 
 Tallies = Mapping[str, "Mapping[str, Tally]"]
 """By action, then by context."""
@@ -23,7 +24,7 @@ Tallies = Mapping[str, "Mapping[str, Tally]"]
 
 def show(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> int:
     """Print what is known of the primitive tasks' actions, and write it as JSON."""
-    from coordinator.learning.objective import compare
+    from petrobot.coordinator.learning.objective import compare
 
     known = {task: kept.estimates.of(task, options.context) for task in tasks}
     refuse_unknown_context(kept, tasks, options)
@@ -44,7 +45,8 @@ def show(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> int:
 
 
 def _question(kept: Kept, task: str, options: argparse.Namespace) -> Question:
-    """As given; else by what the file says that the actions were judged (its target counts over contexts, not in one)."""
+    """As given; else by what the file says that the actions were judged (its target counts over
+    contexts, not in one)."""
     asked = kept.question(task)
     target = asked.target if options.target is None and options.context is None else options.target
     return replace(
@@ -63,29 +65,46 @@ def refuse_unknown_context(kept: Kept, tasks: Sequence[str], options: argparse.N
     if options.context not in known:
         there = ", ".join(repr(c) for c in sorted(known)) or "none"
         raise CommandError(
-            2, f"--context {options.context!r}: {options.file} knows no run in it; it knows the contexts {there}"
+            2,
+            f"--context {options.context!r}: {options.file} knows no run in it; it knows the "
+            f"contexts {there}",
         )
 
 
 def _refuse_unknown_cost(known: Mapping[str, Tallies], options: argparse.Namespace) -> None:
     """A number that no result has would be a cost of 0 for everything."""
     kind, _, name = (options.cost or "").partition(":")
-    tallies = [t for by_action in known.values() for by_context in by_action.values() for t in by_context.values()]
+    tallies = [
+        t
+        for by_action in known.values()
+        for by_context in by_action.values()
+        for t in by_context.values()
+    ]
     if kind != "value" or not name or any(name in t.values for t in tallies):
         return
-    there = ", ".join(f"value:{n}" for n in sorted({n for t in tallies for n in t.values})) or "no numbers at all"
+    there = (
+        ", ".join(f"value:{n}" for n in sorted({n for t in tallies for n in t.values}))
+        or "no numbers at all"
+    )
     raise CommandError(
-        2, f"--cost {options.cost}: no result in {options.file} has a number {name!r}; the results have: {there}"
+        2,
+        f"--cost {options.cost}: no result in {options.file} has a number {name!r}; the "
+        f"results have: {there}",
     )
 
 
-# --- plain data --------------------------------------------------------------------------------------------------------
+# --- plain data -------------------------------------------------------------------------------
 
 
 def _plain(
-    kept: Kept, task: str, tallies: Tallies, asked: Question, judged: Comparison, options: argparse.Namespace
+    kept: Kept,
+    task: str,
+    tallies: Tallies,
+    asked: Question,
+    judged: Comparison,
+    options: argparse.Namespace,
 ) -> dict[str, Any]:
-    from coordinator.learning.objective import cost_to_reach, pareto, reliability_for
+    from petrobot.coordinator.learning.objective import cost_to_reach, pareto, reliability_for
 
     rows = [_row(tallies[f.action], asked, f) for f in judged.figures]
     front = {f.action for f in pareto(judged.figures)}
@@ -114,7 +133,7 @@ def _plain(
 
 
 def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[str, Any]:
-    from coordinator.learning.estimate import Tally, merge
+    from petrobot.coordinator.learning.estimate import Tally, merge
 
     whole = reduce(merge, by_context.values(), Tally())
     cost = whole.cost(asked.measure)
@@ -139,7 +158,9 @@ def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[s
         "unknown": whole.unknown,
         "corrected": whole.corrected,
         "causes": {
-            f"{status}: {cause or '-'}": n for (status, cause), n in whole.counts.items() if status != "success"
+            f"{status}: {cause or '-'}": n
+            for (status, cause), n in whole.counts.items()
+            if status != "success"
         },
         "not_executed": dict(whole.not_executed),
     }
@@ -157,14 +178,25 @@ def _times(tally: Tally) -> dict[str, Any]:
 
 def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
     """Each action in each context by itself, J with the rho of the whole comparison."""
-    from coordinator.learning.objective import compare
+    from petrobot.coordinator.learning.objective import compare
 
     out = []
     for action, by_context in tallies.items():
         for context, tally in by_context.items():
             (f,) = compare({action: {context: tally}}, asked).figures
-            row = {"action": action, "context": context, "runs": f.runs, "R": _number(f.reliability)}
-            row |= {"R_low": f.lower, "R_high": f.upper, "A": f.availability, "C": _number(f.cost), "J": _number(f.j)}
+            row = {
+                "action": action,
+                "context": context,
+                "runs": f.runs,
+                "R": _number(f.reliability),
+            }
+            row |= {
+                "R_low": f.lower,
+                "R_high": f.upper,
+                "A": f.availability,
+                "C": _number(f.cost),
+                "J": _number(f.j),
+            }
             out.append(row | _times(tally))
     return out
 
@@ -184,22 +216,33 @@ def _selectors(kept: Kept, task: str) -> dict[str, Any]:
 
 
 def _break_even(judged: Comparison) -> list[dict[str, Any]]:
-    """rho at which the best action would stop being so, against each other one: `above` or `below` it the other is better."""
-    from coordinator.learning.objective import break_even
+    """rho at which the best action would stop being so, against each other one: `above` or `below`
+    it the other is better."""
+    from petrobot.coordinator.learning.objective import break_even
 
     if judged.best is None:
         return []
     best = judged.of(judged.best)
-    found = [(other, break_even(best, other)) for other in judged.figures if other.action != best.action]
+    found = [
+        (other, break_even(best, other)) for other in judged.figures if other.action != best.action
+    ]
     return [
-        {"against": other.action, "rho": rho, "better": "above" if other.cost < best.cost else "below"}
+        {
+            "against": other.action,
+            "rho": rho,
+            "better": "above" if other.cost < best.cost else "below",
+        }
         for other, rho in found
         if rho is not None
     ]
 
 
 def _answer(figures: Figures | None) -> dict[str, Any] | None:
-    return None if figures is None else {"action": figures.action, "R": figures.reliability, "C": figures.cost}
+    return (
+        None
+        if figures is None
+        else {"action": figures.action, "R": figures.reliability, "C": figures.cost}
+    )
 
 
 def _number(x: float) -> float | None:
@@ -214,7 +257,7 @@ def _words(asked: Question) -> str:
     return " ".join(parts)
 
 
-# --- for people --------------------------------------------------------------------------------------------------------
+# --- for people -------------------------------------------------------------------------------
 
 
 def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> None:
@@ -232,7 +275,17 @@ def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> Non
     )
     table.show_edge = table.pad_edge = False
     always_there = all(row["A"] == 1.0 for row in about["actions"])
-    columns = ["action", "runs", "R", "R 95 %", "C", "J", "s p50/p90", "cpu ms", *([] if always_there else ["A"])]
+    columns = [
+        "action",
+        "runs",
+        "R",
+        "R 95 %",
+        "C",
+        "J",
+        "s p50/p90",
+        "cpu ms",
+        *([] if always_there else ["A"]),
+    ]
     for column in columns:
         table.add_column(column, justify="left" if column == "action" else "right", no_wrap=True)
     for row in about["actions"]:
@@ -269,20 +322,28 @@ def _warnings(about: Mapping[str, Any]) -> list[str]:
     """What J of this table cannot say."""
     lines, run = [], [row for row in about["actions"] if row["runs"]]
     if about["target_unmet"] and run:
-        lines.append(f"no action surely reaches R {about['target']:g} in any context: judged without a target")
+        lines.append(
+            f"no action surely reaches R {about['target']:g} in any context: judged without "
+            "a target"
+        )
     elif about["target"] is not None:
         below = [row["action"] for row in run if not row["scenarios"]]
-        lines += [f"{action} does not surely reach R {about['target']:g} in any context: no J" for action in below]
+        lines += [
+            f"{action} does not surely reach R {about['target']:g} in any context: no J"
+            for action in below
+        ]
     over = ", ".join(map(_named, about["judged_over"]))
     if not over and len(run) > 1:
         lines.append(
-            "there is no context in which all actions were run: each is judged in its own, the order says little"
+            "there is no context in which all actions were run: each is judged in its own, "
+            "the order says little"
         )
     elif over and len(about["judged_over"]) < len(about["contexts"]):
         lines.append(f"judged over the contexts in which all actions were run: {over}")
     for action in about["uncosted"]:
         lines.append(
-            f"{action}: no run reported {about['cost']}, so its cost is taken as 0; give another --cost, or correct `cost` "
+            f"{action}: no run reported {about['cost']}, so its cost is taken as 0; give "
+            "another --cost, or correct `cost` "
             "in the task file or the name in the action's result"
         )
     lines += [f"elsewhere it was judged by {asked}" for asked in about["asked_elsewhere"]]
@@ -297,9 +358,13 @@ def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]
             most = f", where it costs {_cell(row['C_largest'])} at most" if row["scenarios"] else ""
             lines.append(f"{row['action']} meets R {about['target']:g} in: {met}{most}")
         if row["causes"]:
-            lines.append(f"{row['action']}: " + ", ".join(f"{n} {cause}" for cause, n in row["causes"].items()))
+            lines.append(
+                f"{row['action']}: "
+                + ", ".join(f"{n} {cause}" for cause, n in row["causes"].items())
+            )
     lines += [
-        f"{b['against']} is better than {about['best']} {b['better']} rho = {b['rho']:.4g}" for b in about["break_even"]
+        f"{b['against']} is better than {about['best']} {b['better']} rho = {b['rho']:.4g}"
+        for b in about["break_even"]
     ]
     for key, words in (
         ("to_reach", f"R {options.target} costs least with"),
@@ -308,7 +373,9 @@ def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]
         if key in about:
             answer = about[key]
             said = (
-                "nothing known" if answer is None else f"{answer['action']}: R {answer['R']:.3f}, C {answer['C']:.4g}"
+                "nothing known"
+                if answer is None
+                else f"{answer['action']}: R {answer['R']:.3f}, C {answer['C']:.4g}"
             )
             lines.append(f"{words} {said}")
     for name, selector in about["selectors"].items():

@@ -1,5 +1,5 @@
-"""Make what several hosts need to trust each other: one shared key, or certificates (--tls); and say where to copy it, and how
-to put it in the place of an older one without an outage."""
+"""Make what several hosts need to trust each other: one shared key, or certificates (--tls); and
+say where to copy it, and how to put it in the place of an older one without an outage."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import add_services_argument, load_directory
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import add_services_argument, load_directory
 
 if TYPE_CHECKING:
-    from services.comm.directory import Directory
+    from petrobot.services.comm.directory import Directory
 
 EXAMPLE = "petrobot keys --tls"
 
@@ -19,7 +19,10 @@ EXAMPLE = "petrobot keys --tls"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "--file", type=Path, default=Path("cell.key"), help="the shared key file to write (default: %(default)s)"
+        "--file",
+        type=Path,
+        default=Path("cell.key"),
+        help="the shared key file to write (default: %(default)s)",
     )
     parser.add_argument(
         "--tls",
@@ -27,20 +30,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         nargs="?",
         const=Path("keys"),
-        help="make certificates for mutual TLS in this folder (%(const)s) instead: they also keep others from reading",
+        help="make certificates for mutual TLS in this folder (%(const)s) instead: they also "
+        "keep others from reading",
     )
     add_services_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the key or the certificates; what exists is never overwritten, but for certificates that end within 30 days."""
+    """Write the key or the certificates; what exists is never overwritten, but for certificates
+    that end within 30 days."""
     directory = load_directory(options.services)
-    print(_certificates(directory, options.tls) if options.tls is not None else _shared_key(directory, options.file))
+    print(
+        _certificates(directory, options.tls)
+        if options.tls is not None
+        else _shared_key(directory, options.file)
+    )
     return 0
 
 
 def _shared_key(directory: Directory, file: Path) -> str:
-    from services.comm.security import KeyFileError, new_key, write_key
+    from petrobot.services.comm.security import KeyFileError, new_key, write_key
 
     try:
         write_key(file, new_key())
@@ -49,23 +58,28 @@ def _shared_key(directory: Directory, file: Path) -> str:
     hosts = ", ".join(sorted({node.host for node in directory.nodes.values()}))
     return (
         f"wrote {file}: readable by you alone, never printed, never logged\n"
-        f"1. copy it beside services.toml on every host ({hosts}), for example: scp -p {file} HOST:FOLDER/\n"
+        f"1. copy it beside services.toml on every host ({hosts}), for example: scp -p "
+        f"{file} HOST:FOLDER/\n"
         f"2. name it in {directory.source}, the same on every host:\n"
         f'   [keys]\n   file = "{file.name}"' + _instead(directory, "file", file.name)
     )
 
 
 def _instead(directory: Directory, kind: str, new: str) -> str:
-    """How to replace what services.toml names now, host by host; empty if it names none of this kind, or this one."""
+    """How to replace what services.toml names now, host by host; empty if it names none of this
+    kind, or this one."""
     old = directory.keys.get(kind, new)
     if old == new:
         return ""
     both = [f'{kind} = "{new}", also = "{old}"']
-    if kind == "certificates":  # a certificate of the new authority is shown only where all accept it
+    if (
+        kind == "certificates"
+    ):  # a certificate of the new authority is shown only where all accept it
         both.insert(0, f'{kind} = "{old}", also = "{new}"')
     passes = [*both, f'{kind} = "{new}" alone']
     lines = [
-        f"in the place of {old}, in {len(passes)} rounds; in each, change one host after the other and start its nodes again:"
+        f"in the place of {old}, in {len(passes)} rounds; in each, change one host after the "
+        "other and start its nodes again:"
     ]
     lines += [f"   round {number}: [keys] {keys}" for number, keys in enumerate(passes, 1)]
     return "\n" + "\n".join([*lines, f"then remove {old} from every host"])
@@ -73,11 +87,14 @@ def _instead(directory: Directory, kind: str, new: str) -> str:
 
 def _certificates(directory: Directory, folder: Path) -> str:
     try:
-        from coordinator.certificates import CA_KEY, CertificateError, make_certificates
+        from petrobot.coordinator.certificates import CA_KEY, CertificateError, make_certificates
     except ImportError as fault:
-        text = f"making certificates needs the package cryptography: pip install 'petrobot[tls]' ({fault})"
+        text = (
+            "making certificates needs the package cryptography: pip install "
+            f"'petrobot[tls]' ({fault})"
+        )
         raise CommandError(2, text) from fault
-    from services.comm.credentials import CA_FILE, COORDINATOR
+    from petrobot.services.comm.credentials import CA_FILE, COORDINATOR
 
     try:
         written = make_certificates(folder, [COORDINATOR, *directory.nodes])
@@ -95,12 +112,16 @@ def _certificates(directory: Directory, folder: Path) -> str:
             f"wrote {', '.join(written)} in {folder}"
             if written
             else f"{folder} has a certificate for every node already",
-            f"1. copy into a folder {folder.name}/ beside services.toml (scp -p keeps keys unreadable for others), on",
+            f"1. copy into a folder {folder.name}/ beside services.toml (scp -p keeps keys "
+            "unreadable for others), on",
             *copies,
-            f"   the coordinator's host, and wherever `petrobot estop` is to work: {CA_FILE}, {COORDINATOR}.pem, "
+            "   the coordinator's host, and wherever `petrobot estop` is to work: "
+            f"{CA_FILE}, {COORDINATOR}.pem, "
             f"{COORDINATOR}.key",
-            f"2. keep {CA_KEY} here alone: who has it can make certificates; it is needed when a node is added, and when",
-            "   certificates end: run this again in their last 30 days (petrobot nodes and each node's start say so)",
+            f"2. keep {CA_KEY} here alone: who has it can make certificates; it is needed "
+            "when a node is added, and when",
+            "   certificates end: run this again in their last 30 days (petrobot nodes and "
+            "each node's start say so)",
             f"3. name the folder in {directory.source}, the same on every host:",
             f'   [keys]\n   certificates = "{folder.name}"',
         ]

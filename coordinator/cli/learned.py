@@ -1,4 +1,5 @@
-"""Show what was learned, of actions or of a whole task; merge estimates files; freeze, thaw or reset a primitive task."""
+"""Show what was learned, of actions or of a whole task; merge estimates files; freeze, thaw or
+reset a primitive task."""
 
 from __future__ import annotations
 
@@ -6,15 +7,18 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coordinator.cli import CommandError
-from coordinator.cli.judged import refuse_unknown_context, show
-from coordinator.cli.propagated import show_task
-from services.comm.quantities import number, probability
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.judged import refuse_unknown_context, show
+from petrobot.coordinator.cli.propagated import show_task
+from petrobot.services.comm.quantities import number, probability
 
 if TYPE_CHECKING:
-    from coordinator.experience.estimates_file import EstimatesFile, Kept
+    from petrobot.coordinator.experience.estimates_file import EstimatesFile, Kept
 
-EXAMPLE = "petrobot learned show learned.db --target 0.95\n  petrobot learned merge learned.db other_machine.db"
+EXAMPLE = (
+    "petrobot learned show learned.db --target 0.95\n  petrobot learned merge "
+    "learned.db other_machine.db"
+)
 VERBS = ("show", "task", "merge", "freeze", "thaw", "reset")
 
 
@@ -23,42 +27,64 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("verb", choices=VERBS, help="what to do with the file")
     parser.add_argument("file", type=Path, help="an estimates file, as `run --learn FILE` keeps it")
     parser.add_argument(
-        "more", nargs="*", metavar="FILE|TASK", help="merge: files to take in; else: primitive tasks (all)"
+        "more",
+        nargs="*",
+        metavar="FILE|TASK",
+        help="merge: files to take in; else: primitive tasks (all)",
     )
     parser.add_argument(
-        "--context", metavar="TEXT", help="show, task: only this context (default: all; show takes them as scenarios)"
+        "--context",
+        metavar="TEXT",
+        help="show, task: only this context (default: all; show takes them as scenarios)",
     )
     parser.add_argument(
         "--cost",
         metavar="MEASURE",
-        help="wall, cpu, count or value:NAME (default: the one that they were judged by when they were run)",
+        help="wall, cpu, count or value:NAME (default: the one that they were judged by when "
+        "they were run)",
     )
     parser.add_argument(
         "--target",
         type=probability,
         metavar="R",
-        help="target reliability: which scenarios and actions meet it (default: the one they were judged by)",
+        help="target reliability: which scenarios and actions meet it (default: the one they "
+        "were judged by)",
     )
     parser.add_argument(
-        "--budget", type=number(above=0.0), metavar="C", help="what reliability may be had for this cost at most"
+        "--budget",
+        type=number(above=0.0),
+        metavar="C",
+        help="what reliability may be had for this cost at most",
     )
     parser.add_argument(
-        "--rho", type=number(least=0.0), metavar="W", help="weight of cost in J (default: 1 / the largest cost)"
+        "--rho",
+        type=number(least=0.0),
+        metavar="W",
+        help="weight of cost in J (default: 1 / the largest cost)",
     )
-    parser.add_argument("--selectors", action="store_true", help="reset: forget selectors' states, keep the estimates")
-    parser.add_argument("--json", metavar="FILE", help="write what is shown as JSON (- for standard output)")
+    parser.add_argument(
+        "--selectors",
+        action="store_true",
+        help="reset: forget selectors' states, keep the estimates",
+    )
+    parser.add_argument(
+        "--json", metavar="FILE", help="write what is shown as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Do it."""
-    from coordinator.experience.estimates_file import EstimatesError, EstimatesFile
+    from petrobot.coordinator.experience.estimates_file import EstimatesError, EstimatesFile
 
     file = EstimatesFile(options.file)
     try:
         if options.verb == "merge":
             return _merge(file, options)
         if not options.file.exists():
-            raise CommandError(2, f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it")
+            raise CommandError(
+                2,
+                f"{options.file}: no such file; `petrobot run ... --learn {options.file}` makes it",
+            )
         kept = file.read()
         if options.verb == "task":
             refuse_unknown_context(kept, _tasks(kept), options)
@@ -79,7 +105,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _merge(file: EstimatesFile, options: argparse.Namespace) -> int:
     if not options.more:
-        raise CommandError(2, f"merge into {options.file} what? Give one or more other estimates files")
+        raise CommandError(
+            2, f"merge into {options.file} what? Give one or more other estimates files"
+        )
     for other in options.more:
         file.merge(Path(other))
     kept = file.read()
@@ -89,14 +117,18 @@ def _merge(file: EstimatesFile, options: argparse.Namespace) -> int:
 
 
 def _tasks(kept: Kept) -> list[str]:
-    return sorted({k.primitive_task for k in kept.estimates.tallies} | {task for task, _ in kept.selectors})
+    return sorted(
+        {k.primitive_task for k in kept.estimates.tallies} | {task for task, _ in kept.selectors}
+    )
 
 
 def _refuse_unknown(kept: Kept, options: argparse.Namespace) -> None:
     for task in options.more:
         if task not in _tasks(kept):
             raise CommandError(
-                2, f"{options.file} knows no primitive task {task!r}; it knows: {', '.join(_tasks(kept))}"
+                2,
+                f"{options.file} knows no primitive task {task!r}; it knows: "
+                f"{', '.join(_tasks(kept))}",
             )
 
 

@@ -1,4 +1,5 @@
-"""How commands learn: the options of `run`, the session that is opened on the estimates file, and its saving."""
+"""How commands learn: the options of `run`, the session that is opened on the estimates file, and
+its saving."""
 
 from __future__ import annotations
 
@@ -9,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from services.comm.quantities import probability
+from petrobot.coordinator.cli import CommandError
+from petrobot.services.comm.quantities import probability
 
 if TYPE_CHECKING:
-    from coordinator.experience.learning_session import LearningSession
-    from coordinator.mission.partners import FirstAlternative
-    from coordinator.task import Task
-    from services.comm.directory import Directory
+    from petrobot.coordinator.experience.learning_session import LearningSession
+    from petrobot.coordinator.mission.partners import FirstAlternative
+    from petrobot.coordinator.task import Task
+    from petrobot.services.comm.directory import Directory
 
 SELECTORS = (
     "nikolic_fu",
@@ -29,16 +30,23 @@ SELECTORS = (
     "fixed",
     "round_robin",
 )
-"""Names for --help without importing numpy; a test compares them with the selectors that there are."""
+"""Names for --help without importing numpy; a test compares them with the selectors that there
+are."""
 
 
 def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
     """Whether, where and how a command learns."""
     parser.add_argument(
-        "--learn", metavar="FILE", type=Path, help="learn which actions are best, and keep it in this estimates file"
+        "--learn",
+        metavar="FILE",
+        type=Path,
+        help="learn which actions are best, and keep it in this estimates file",
     )
     parser.add_argument(
-        "--selector", choices=SELECTORS, metavar="NAME", help=f"who chooses: {', '.join(SELECTORS)} (with --learn)"
+        "--selector",
+        choices=SELECTORS,
+        metavar="NAME",
+        help=f"who chooses: {', '.join(SELECTORS)} (with --learn)",
     )
     parser.add_argument(
         "--target",
@@ -50,10 +58,13 @@ def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
         "--context",
         action="append",
         metavar="NAME|CONDITION",
-        help="learn apart for each value of a parameter or variable, or for a condition (default: regime, if there is one)",
+        help="learn apart for each value of a parameter or variable, or for a condition "
+        "(default: regime, if there is one)",
     )
     parser.add_argument(
-        "--frozen", action="store_true", help="choose the best that was learned, and learn nothing (with --learn)"
+        "--frozen",
+        action="store_true",
+        help="choose the best that was learned, and learn nothing (with --learn)",
     )
 
 
@@ -64,16 +75,28 @@ def opened(
     if options.learn is None:
         for name in ("selector", "target", "context", "frozen"):
             if getattr(options, name):
-                raise CommandError(2, f"--{name} needs --learn FILE: without it nothing is learned or read")
+                raise CommandError(
+                    2, f"--{name} needs --learn FILE: without it nothing is learned or read"
+                )
         return None
-    from coordinator.experience.estimates_file import EstimatesError
-    from coordinator.experience.learning_session import LearningSession, LearningSetting
-    from coordinator.learning.selectors import DEFAULT
+    from petrobot.coordinator.experience.estimates_file import EstimatesError
+    from petrobot.coordinator.experience.learning_session import LearningSession, LearningSetting
+    from petrobot.coordinator.learning.selectors import DEFAULT
 
     contexts = None if options.context is None else tuple(part for part in options.context if part)
-    declared = {a.name: a.compute_time for a in directory.actions.values()} if options.mode == "lockstep" else None
+    declared = (
+        {a.name: a.compute_time for a in directory.actions.values()}
+        if options.mode == "lockstep"
+        else None
+    )
     setting = LearningSetting(
-        options.learn, options.selector or DEFAULT, options.target, contexts, chosen, options.frozen, declared
+        options.learn,
+        options.selector or DEFAULT,
+        options.target,
+        contexts,
+        chosen,
+        options.frozen,
+        declared,
     )
     try:
         return LearningSession(task, setting, options.seed)
@@ -83,7 +106,8 @@ def opened(
 
 @contextmanager
 def saved(session: LearningSession | None) -> Iterator[dict[str, Any]]:
-    """Save what a mission run learned, also when it is interrupted; what is yielded then holds what the result says of it."""
+    """Save what a mission run learned, also when it is interrupted; what is yielded then holds what
+    the result says of it."""
     told: dict[str, Any] = {}
     try:
         yield told
@@ -96,7 +120,7 @@ def saved(session: LearningSession | None) -> Iterator[dict[str, Any]]:
 
 
 def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
-    from coordinator.experience.estimates_file import EstimatesError
+    from petrobot.coordinator.experience.estimates_file import EstimatesError
 
     try:
         runs = session.save(interrupted=interrupted)
@@ -105,7 +129,8 @@ def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
     learning, values = session.learning, session.selector.context
     for name, action, measure in learning.uncosted():
         print(
-            f"{name}: no run of {action} reported {measure}, so its cost was taken as 0; correct `cost` in the task file or the "
+            f"{name}: no run of {action} reported {measure}, so its cost was taken as 0; "
+            "correct `cost` in the task file or the "
             "name in the action's result",
             file=sys.stderr,
         )
@@ -121,14 +146,18 @@ def _save(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
     }
 
 
-def resumed_selector(task: Task, header: Mapping[str, Any]) -> tuple[FirstAlternative, LearningSession | None]:
+def resumed_selector(
+    task: Task, header: Mapping[str, Any]
+) -> tuple[FirstAlternative, LearningSession | None]:
     """Who chose in a recorded run, as at its beginning."""
-    from coordinator.experience.estimates_file import EstimatesError
-    from coordinator.experience.learning_session import fixed_by_user, session_of
-    from coordinator.mission.partners import FirstAlternative
+    from petrobot.coordinator.experience.estimates_file import EstimatesError
+    from petrobot.coordinator.experience.learning_session import fixed_by_user, session_of
+    from petrobot.coordinator.mission.partners import FirstAlternative
 
     try:
         session = session_of(task, header)
     except (EstimatesError, ValueError) as fault:
         raise CommandError(2, str(fault)) from fault
-    return (FirstAlternative(fixed_by_user(header)) if session is None else session.selector), session
+    return (
+        FirstAlternative(fixed_by_user(header)) if session is None else session.selector
+    ), session

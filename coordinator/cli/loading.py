@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from services.comm.json_text import json_text
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.services.comm.json_text import json_text
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Mapping
 
-    from coordinator.task import Task
-    from services.comm.directory import Directory
+    from petrobot.coordinator.task import Task
+    from petrobot.services.comm.directory import Directory
 
 SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; they are known by their bare names."""
-SHIPPED_CELL = Path(__file__).parents[2] / "services.toml"
-"""The location file that comes with petrobot."""
+SHIPPED_CELL = (Path(__file__).parents[2] / "services.toml").resolve()
+"""The location file that comes with petrobot: that of the catching cell."""
 OWN = Path("tasks")
 """Where the operator's page saves tasks: beside what one works on."""
 
@@ -30,13 +30,15 @@ def add_services_argument(parser: argparse.ArgumentParser) -> None:
         "--services",
         metavar="FILE",
         type=Path,
-        help="the location file (default: the one that the task names in `services`, where there is a task that does, "
+        help="the location file (default: the one that the task names in `services`, where "
+        "there is a task that does, "
         "else services.toml here, else the one that comes with petrobot)",
     )
 
 
 def task_path(name: str) -> Path:
-    """The file of a task given by path, or by its bare name: one's own in `tasks` here, else a shipped one."""
+    """The file of a task given by path, or by its bare name: one's own in `tasks` here, else a
+    shipped one."""
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         return path
@@ -47,12 +49,14 @@ def task_path(name: str) -> Path:
     if shipped.exists():
         return shipped
     known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
-    raise CommandError(2, f"no task {name!r}: give a .toml file, or one of those that come with petrobot: {known}")
+    raise CommandError(
+        2, f"no task {name!r}: give a .toml file, or one of those that come with petrobot: {known}"
+    )
 
 
 def load_task(name: str) -> Task:
     """Read a task file."""
-    from coordinator.taskfile import TaskFileError, load
+    from petrobot.coordinator.taskfile import TaskFileError, load
 
     path = task_path(name)
     try:
@@ -72,7 +76,8 @@ def services_path(given: Path | None) -> Path:
 
 
 def cell_path(given: Path | None, name: str, task: Task) -> Path:
-    """services.toml for a task, which was named so on the command line: the given one, the task's own, or the one at hand.
+    """services.toml for a task, which was named so on the command line: the given one, the task's
+    own, or the one at hand.
 
     Raises CommandError where the task names a file that is not there.
     """
@@ -83,37 +88,45 @@ def cell_path(given: Path | None, name: str, task: Task) -> Path:
     if not path.is_file():
         what = f"{path} is no file" if path.exists() else f"no such file: {path}"
         remedy = f"name one relative to {written.name}, drop the key, or give --services FILE"
-        raise CommandError(2, f"{file_line(written, 'task.services')}: task.services: {what}; {remedy}")
+        raise CommandError(
+            2, f"{file_line(written, 'task.services')}: task.services: {what}; {remedy}"
+        )
     return path
 
 
 def file_line(path: Path, key: str) -> str:
     """FILE:LINE of a key of a TOML file."""
-    from coordinator.taskfile.errors import key_lines, line_of
+    from petrobot.coordinator.taskfile.errors import key_lines, line_of
 
     return f"{path}:{line_of(key, key_lines(path.read_text(encoding='utf-8')))}"
 
 
 def load_directory(given: Path | None) -> Directory:
     """Read services.toml."""
-    from services.comm.directory import DirectoryError, load
+    from petrobot.services.comm.directory import DirectoryError, load
 
     path = services_path(given)
     try:
         return load(path)
     except OSError as fault:
-        text = f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
+        text = (
+            f"{path}: {fault.strerror or fault}; give --services a location file that can be read"
+        )
         raise CommandError(2, text) from fault
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
 
 
-def refuse_misplaced(directory: Directory, *, everywhere: bool = False, scripted: bool = False) -> None:
-    """Refuse a location file that names code, keys or files which this host has not: for commands that launch nodes or judge it.
+def refuse_misplaced(
+    directory: Directory, *, everywhere: bool = False, scripted: bool = False
+) -> None:
+    """Refuse a location file that names code, keys or files which this host has not: for commands
+    that launch nodes or judge it.
 
-    `everywhere`: all nodes are launched here, wherever they belong; `scripted`: actions are replaced (`--mock`).
+    `everywhere`: all nodes are launched here, wherever they belong; `scripted`: actions are
+    replaced (`--mock`).
     """
-    from services.comm.directory_places import misplaced
+    from petrobot.services.comm.directory_places import misplaced
 
     faults = misplaced(directory, everywhere=everywhere, actions=not scripted)
     if faults:
@@ -121,10 +134,11 @@ def refuse_misplaced(directory: Directory, *, everywhere: bool = False, scripted
 
 
 def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
-    """What the task's own function draws of a mission run's result, SVG by title. Raises CommandError when it cannot be had."""
+    """What the task's own function draws of a mission run's result, SVG by title. Raises
+    CommandError when it cannot be had."""
     if not task.pictures:
         return {}
-    from coordinator.launch import load_object
+    from petrobot.coordinator.launch import load_object
 
     try:
         draw = load_object(task.pictures)
@@ -145,4 +159,6 @@ def write_json(path: str, data: Any) -> None:
         make_folder(Path(path).parent)
         write_whole(Path(path), text)
     except OSError as fault:
-        raise CommandError(2, f"{path}: {fault.strerror or fault}; give --json a file that can be written") from fault
+        raise CommandError(
+            2, f"{path}: {fault.strerror or fault}; give --json a file that can be written"
+        ) from fault

@@ -1,4 +1,5 @@
-"""How `run` and `resume` drive a lock-step cell: in this process, in one process a node, or with nodes that run already."""
+"""How `run` and `resume` drive a lock-step cell: in this process, in one process a node, or with
+nodes that run already."""
 
 from __future__ import annotations
 
@@ -7,18 +8,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import file_line
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import file_line
 
 if TYPE_CHECKING:
     import argparse
 
-    from coordinator.cli.replaying import Recorded
-    from coordinator.launch import Setting
-    from coordinator.mission.mission import Mission
-    from coordinator.mission.partners import Observer, Selector, Store
-    from coordinator.record.timeline import Timeline
-    from services.comm.directory import Directory
+    from petrobot.coordinator.cli.replaying import Recorded
+    from petrobot.coordinator.launch import Setting
+    from petrobot.coordinator.mission.mission import Mission
+    from petrobot.coordinator.mission.partners import Observer, Selector, Store
+    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.services.comm.directory import Directory
 
 LONGEST = 10**9
 """Ticks."""
@@ -32,11 +33,13 @@ def begin(
     directory: Directory, setting: Setting, options: argparse.Namespace, watch: Watch | None
 ) -> tuple[Mission, Timeline]:
     """Run a task in lock step, with a journal if a folder is given for it."""
-    from coordinator.launch import lockstep_member, lockstep_mission
+    from petrobot.coordinator.launch import lockstep_member, lockstep_mission
 
     store = _new_store(directory, setting, options)
     if options.processes == 1:
-        return in_one_process(directory, setting, substitutes(options.mock, directory), watch, store)
+        return in_one_process(
+            directory, setting, substitutes(options.mock, directory), watch, store
+        )
     mission = lockstep_mission(directory, setting, store)
     member, party = lockstep_member(directory, mission, watch)
     timeline = _timed(mission)
@@ -48,8 +51,8 @@ def begin(
 
 
 def _new_store(directory: Directory, setting: Setting, options: argparse.Namespace) -> Store | None:
-    from coordinator.cli.journaling import journal_folder, new_store
-    from coordinator.launch import lockstep_id, mission_id
+    from petrobot.coordinator.cli.journaling import journal_folder, new_store
+    from petrobot.coordinator.launch import lockstep_id, mission_id
 
     folder = journal_folder(options)
     if folder is None:
@@ -67,7 +70,7 @@ def in_one_process(
     store: Store | None,
 ) -> tuple[Mission, Timeline]:
     """The whole cell in this process."""
-    from coordinator.launch import lockstep_cell
+    from petrobot.coordinator.launch import lockstep_cell
 
     cell, party = lockstep_cell(directory, setting, substituted, watch, store)
     timeline = _timed(party.mission)
@@ -76,31 +79,35 @@ def in_one_process(
 
 
 def retrace(found: Recorded, selector: Selector, watch: Watch | None) -> tuple[Mission, Timeline]:
-    """Go on with a run whose cell ended with its coordinator: made again from its seed, compared with the journal as far as that
-    goes, and written on from there."""
-    from coordinator.launch import Setting
-    from coordinator.operator.departure import departed
-    from coordinator.record.journal import JournalWriter
-    from coordinator.record.recording import RetracingStore
+    """Go on with a run whose cell ended with its coordinator: made again from its seed, compared
+    with the journal as far as that goes, and written on from there."""
+    from petrobot.coordinator.launch import Setting
+    from petrobot.coordinator.operator.departure import departed
+    from petrobot.coordinator.record.journal import JournalWriter
+    from petrobot.coordinator.record.recording import RetracingStore
 
     header = found.journal.header
     store = RetracingStore(JournalWriter(found.journal.path), found.journal)
     given = header["parameters"], header["runs"], header["seed"]
     setting = Setting(found.task, *given, selector, departed(header))
     mock = Path(header["mock"]) if header.get("mock") else None
-    return in_one_process(found.directory, setting, substitutes(mock, found.directory), watch, store)
+    return in_one_process(
+        found.directory, setting, substitutes(mock, found.directory), watch, store
+    )
 
 
 def rejoin(
     found: Recorded, selector: Selector, observers: list[Observer], watch: Watch | None
 ) -> tuple[Mission, Timeline]:
     """Go on with a run whose nodes wait for their coordinator."""
-    from coordinator.launch import lockstep_member, resumed_mission
-    from coordinator.record.timeline import Timeline
+    from petrobot.coordinator.launch import lockstep_member, resumed_mission
+    from petrobot.coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     seen = [timeline, *observers]
-    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, seen, 0.0, selector)
+    mission, go_on = resumed_mission(
+        found.directory, found.task, found.engine, found.journal, seen, 0.0, selector
+    )
     member, party = lockstep_member(found.directory, mission, watch, go_on)
     _go(member, lambda: party.over)
     return mission, timeline
@@ -110,34 +117,41 @@ def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callabl
     """The scripted actions of a file, None without one."""
     if mock is None:
         return None
-    from coordinator.conditions.wording import nearest
-    from coordinator.launch import SCRIPTED, load_object
+    from petrobot.coordinator.conditions.wording import nearest
+    from petrobot.coordinator.launch import SCRIPTED, load_object
 
     try:
         scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(mock)
     except OSError as fault:
-        raise CommandError(2, f"{mock}: {fault.strerror}; give --mock a file of scripted actions") from fault
+        raise CommandError(
+            2, f"{mock}: {fault.strerror}; give --mock a file of scripted actions"
+        ) from fault
     except Exception as fault:
         raise CommandError(2, str(fault)) from fault
     for name in scripted:
         if name not in directory.actions:
             key = f"actions.{name}"
             what = f"{directory.source} has no such action{nearest(name, directory.actions)}"
-            raise CommandError(2, f"{file_line(mock, key)}: {key}: {what}; name one of its actions, or drop it here")
+            raise CommandError(
+                2,
+                f"{file_line(mock, key)}: {key}: {what}; name one of its actions, or drop it here",
+            )
     return scripted
 
 
 def _timed(mission: Mission) -> Timeline:
-    from coordinator.record.timeline import Timeline
+    from petrobot.coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     mission.executor.observers.append(timeline)
     return timeline
 
 
-async def _launched(directory: Directory, mock: Path | None, member: Any, until: Callable[[], bool]) -> None:
-    from coordinator.launch import local_programs
-    from coordinator.supervisor import Supervisor
+async def _launched(
+    directory: Directory, mock: Path | None, member: Any, until: Callable[[], bool]
+) -> None:
+    from petrobot.coordinator.launch import local_programs
+    from petrobot.coordinator.supervisor import Supervisor
 
     programs = local_programs(directory, lockstep=True, mock=mock)
     async with Supervisor(programs, Path("runs/logs"), respawn=False):

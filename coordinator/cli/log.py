@@ -1,4 +1,5 @@
-"""Print a recorded run for people, or export it: JSON lines, XES for process mining, MCAP for Foxglove."""
+"""Print a recorded run for people, or export it: JSON lines, XES for process mining, MCAP for
+Foxglove."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from coordinator.cli import CommandError
-from coordinator.cli.replaying import Recorded, recorded
-from services.comm.whole_file import write_whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.replaying import Recorded, recorded
+from petrobot.services.comm.whole_file import write_whole
 
 EXAMPLE = "petrobot log last --format xes --out run.xes"
 
@@ -16,34 +17,49 @@ EXAMPLE = "petrobot log last --format xes --out run.xes"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
-    parser.add_argument("--format", choices=("text", "jsonl", "xes"), default="text", help="default: %(default)s")
-    parser.add_argument("--mcap", metavar="FILE", type=Path, help="write it as MCAP instead (needs the package mcap)")
-    parser.add_argument("--out", metavar="FILE", default="-", help="where to write it (default: standard output)")
+    parser.add_argument(
+        "--format", choices=("text", "jsonl", "xes"), default="text", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--mcap",
+        metavar="FILE",
+        type=Path,
+        help="write it as MCAP instead (needs the package mcap)",
+    )
+    parser.add_argument(
+        "--out", metavar="FILE", default="-", help="where to write it (default: standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Print or export."""
-    from coordinator.record.journal import JournalError
-    from coordinator.record.recording import ReplayError
+    from petrobot.coordinator.record.journal import JournalError
+    from petrobot.coordinator.record.recording import ReplayError
 
     found = recorded(options.run)
     try:
         if options.mcap is not None:
             _write_mcap(options.mcap, found)
             return 0
-        _write(options.out, _text(found) if options.format == "text" else _exported(options.format, found))
+        _write(
+            options.out,
+            _text(found) if options.format == "text" else _exported(options.format, found),
+        )
     except JournalError as fault:
         raise CommandError(2, str(fault)) from fault
     except ReplayError as fault:
         raise CommandError(1, str(fault)) from fault
     except OSError as fault:
-        text = f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that can be written"
+        text = (
+            f"{options.mcap or options.out}: {fault.strerror or fault}; name a file that "
+            "can be written"
+        )
         raise CommandError(2, text) from fault
     return 0
 
 
 def _write_mcap(path: Path, found: Recorded) -> None:
-    from coordinator.record.mcap_export import McapMissingError, write_mcap
+    from petrobot.coordinator.record.mcap_export import McapMissingError, write_mcap
 
     try:
         count = write_mcap(path, found.journal, found.engine.compiled.net, found.steps())
@@ -53,7 +69,7 @@ def _write_mcap(path: Path, found: Recorded) -> None:
 
 
 def _exported(form: str, found: Recorded) -> Iterator[str]:
-    from coordinator.record.export import jsonl, xes
+    from petrobot.coordinator.record.export import jsonl, xes
 
     return (jsonl if form == "jsonl" else xes)(found.journal, found.steps())
 
@@ -67,7 +83,14 @@ def _write(path: str, lines: Iterator[str]) -> None:
 
 
 def _text(found: Recorded) -> Iterator[str]:
-    from coordinator.engine import Corrected, Finished, Fired, Report, RunRecorded, StartRun
+    from petrobot.coordinator.engine import (
+        Corrected,
+        Finished,
+        Fired,
+        Report,
+        RunRecorded,
+        StartRun,
+    )
 
     header, net = found.journal.header, found.engine.compiled.net
     yield f"{header['mission']}  {header['date']}  {header['mode']}  seed {header['seed']}"
@@ -82,11 +105,16 @@ def _text(found: Recorded) -> Iterator[str]:
                 yield f"{when}started  {one.run:20} {one.action}"
             elif isinstance(one, RunRecorded):
                 why = f"  {one.cause}: {one.text}" if one.cause else ""
-                said = "provisional " * one.deferred + (one.status.value.upper() if one.status else "preempted")
+                said = "provisional " * one.deferred + (
+                    one.status.value.upper() if one.status else "preempted"
+                )
                 yield f"{when}ended    {one.run:20} {said}{why}"
             elif isinstance(one, Corrected):
                 why = f"  {one.cause}: {one.text}".rstrip(": ") if one.cause else ""
-                yield f"{when}judged   {one.run:20} {one.status.value.upper()}, was {one.was.value.upper()}{why}"
+                yield (
+                    f"{when}judged   {one.run:20} {one.status.value.upper()}, was "
+                    f"{one.was.value.upper()}{why}"
+                )
             elif isinstance(one, Report):
                 yield f"{when}{one.severity.value:8} {one.of:20} {one.text}"
             elif isinstance(one, Finished):

@@ -1,4 +1,5 @@
-"""Write a working skeleton with its test: of an action (a Python file), or of a task (a net of one action with an error branch)."""
+"""Write a working skeleton with its test: of an action (a Python file), or of a task (a net of one
+action with an error branch)."""
 
 from __future__ import annotations
 
@@ -7,15 +8,15 @@ import keyword
 import re
 from pathlib import Path
 
-from coordinator.cli import CommandError
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 EXAMPLE = "petrobot new action close_gripper --folder mylab"
 
 ACTION = '''\
 """The primitive action {name}: say here what it is for."""
 
-from services.action import Context, Result, error, failure, success
+from petrobot import Context, Result, error, failure, success
 
 
 async def {name}(ctx: Context, *, duration: float = 0.5, timeout: float = 2.0) -> Result:
@@ -33,7 +34,7 @@ ACTION_TEST = '''\
 """Tests of {name} on a simulated clock: seconds of the cell take a millisecond."""
 
 from {module} import {name}
-from services.rehearsal import rehearse
+from petrobot import rehearse
 
 
 def test_success():
@@ -127,11 +128,11 @@ schema = 1
 host = "127.0.0.1"
 port = 7399
 [actions.work]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "work"
 node = "robot"
 [actions.recover]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "recover"
 node = "robot"
 """
@@ -151,7 +152,7 @@ seconds = 0.2
 def test_an_error_is_recovered(tmp_path):
     (tmp_path / "services.toml").write_text(SERVICES)
     (tmp_path / "script.toml").write_text(SCRIPT)
-    command = [sys.executable, "-m", "coordinator", "run", str(HERE / "{name}.toml"), "--mode", "lockstep", "--json", "-"]
+    command = [sys.executable, "-m", "petrobot.coordinator", "run", str(HERE / "{name}.toml"), "--mode", "lockstep", "--json", "-"]
     given = ["--services", str(tmp_path / "services.toml"), "--mock", str(tmp_path / "script.toml")]
     done = subprocess.run([*command, *given], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -164,16 +165,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("what", choices=("action", "task"))
     parser.add_argument("name", help="a Python name, such as close_gripper")
-    parser.add_argument("--folder", type=Path, default=Path(), help="where to write it (default: here)")
+    parser.add_argument(
+        "--folder", type=Path, default=Path(), help="where to write it (default: here)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the files; none that exists is touched."""
     name = options.name
     if keyword.iskeyword(name):
-        raise CommandError(2, f"{name!r} is a word of Python itself (a keyword): choose another name")
+        raise CommandError(
+            2, f"{name!r} is a word of Python itself (a keyword): choose another name"
+        )
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise CommandError(2, f"{name!r} is no name for it: use small letters, digits and _, beginning with a letter")
+        raise CommandError(
+            2,
+            f"{name!r} is no name for it: use small letters, digits and _, beginning with a letter",
+        )
     folder: Path = options.folder
     if options.what == "action":
         module = f"{folder.name}.{name}" if folder.name else name
@@ -181,7 +189,8 @@ def run(options: argparse.Namespace) -> int:
         if not folder.name:
             files = {Path(f"{name}.py"): ACTION, Path(f"test_{name}.py"): ACTION_TEST}
         hint = (
-            f'place it in services.toml:\n  [actions.{name}]\n  run = "{module}:{name}"\n  task = "..."\n  node = "..."'
+            f'place it in services.toml:\n  [actions.{name}]\n  run = "{module}:{name}"\n '
+            ' task = "..."\n  node = "..."'
         )
     else:
         module = ""

@@ -1,11 +1,11 @@
-"""Launch one node of services.toml on this host (the same as python -m services NAME)."""
+"""Launch one node of services.toml on this host (the same as python -m petrobot.services NAME)."""
 
 from __future__ import annotations
 
 import argparse
 
-from coordinator.cli.becoming import become
-from coordinator.cli.loading import add_services_argument, services_path
+from petrobot.coordinator.cli.becoming import become
+from petrobot.coordinator.cli.loading import add_services_argument, services_path
 
 EXAMPLE = "petrobot node vision --services services.toml"
 
@@ -18,4 +18,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Become the node."""
-    become("services", options.name, "--services", str(services_path(options.services)))
+    become("petrobot.services", options.name, "--services", str(services_path(options.services)))

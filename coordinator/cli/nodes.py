@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.loading import add_services_argument, load_directory, write_json
-from services.comm.expiry import SOON
-from services.comm.quantities import number
+from petrobot.coordinator.cli.loading import add_services_argument, load_directory, write_json
+from petrobot.services.comm.expiry import SOON
+from petrobot.services.comm.quantities import number
 
 if TYPE_CHECKING:
-    from services.comm.directory import Directory
+    from petrobot.services.comm.directory import Directory
 
 EXAMPLE = "petrobot nodes --json -"
 
@@ -22,14 +22,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     add_services_argument(parser)
     parser.add_argument(
-        "--timeout", type=number(above=0.0), default=2.0, metavar="S", help="seconds to wait (default: %(default)s)"
+        "--timeout",
+        type=number(above=0.0),
+        default=2.0,
+        metavar="S",
+        help="seconds to wait (default: %(default)s)",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the answers as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the answers as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Ask; 0 when all are up, that is take calls, 3 otherwise."""
-    from coordinator.mission.asking import ask_all
+    from petrobot.coordinator.mission.asking import ask_all
 
     directory = load_directory(options.services)
     answers = asyncio.run(ask_all(directory, options.timeout))
@@ -46,8 +52,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _troubles(status: Mapping[str, Any]) -> dict[str, str]:
-    """What of a node that answers would not take a call now, and why: devices, and `actions` for those without a device."""
-    said = {name: (word, status["devices"].get(name, {})) for name, word in status["answers"].items()}
+    """What of a node that answers would not take a call now, and why: devices, and `actions` for
+    those without a device."""
+    said = {
+        name: (word, status["devices"].get(name, {})) for name, word in status["answers"].items()
+    }
     if "general" in status:
         said["actions"] = (status["general"]["answer"], status["general"])
     return {
@@ -58,11 +67,16 @@ def _troubles(status: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _stopped(directory: Directory, answers: Mapping[str, Any]) -> dict[str, list[str]]:
-    """By node the devices that an emergency stop holds: as it says itself, or as this host says of one that does not run."""
-    from coordinator.operator.emergency import still_stopped
-    from services.comm.latch import ALL, latch_of
+    """By node the devices that an emergency stop holds: as it says itself, or as this host says of
+    one that does not run."""
+    from petrobot.coordinator.operator.emergency import still_stopped
+    from petrobot.services.comm.latch import ALL, latch_of
 
-    told = {node: list(answer["status"].get("emergency", ())) for node, answer in answers.items() if answer["up"]}
+    told = {
+        node: list(answer["status"].get("emergency", ()))
+        for node, answer in answers.items()
+        if answer["up"]
+    }
     for node in still_stopped(directory):
         if node not in told:
             latched = latch_of(directory.source, node).stopped()
@@ -77,20 +91,38 @@ def _print(answers: dict[str, Any]) -> None:
 
     table = Table()
     certified = any("certificate_ends" in answer for answer in answers.values())
-    for column in ("node", "address", "", *(["certificate ends"] if certified else []), "offers", "devices"):
+    for column in (
+        "node",
+        "address",
+        "",
+        *(["certificate ends"] if certified else []),
+        "offers",
+        "devices",
+    ):
         table.add_column(column)
     for node, answer in answers.items():
         troubles = answer.get("not_ready", {})
-        state = "[green]up[/]" if answer["up"] else "[yellow]not ready[/]" if troubles else "[red]away[/]"
-        shown = _devices(answer.get("status", {}).get("devices", {}), answer.get("stopped", []), troubles)
+        state = (
+            "[green]up[/]"
+            if answer["up"]
+            else "[yellow]not ready[/]"
+            if troubles
+            else "[red]away[/]"
+        )
+        shown = _devices(
+            answer.get("status", {}).get("devices", {}), answer.get("stopped", []), troubles
+        )
         ends = [_ends(answer.get("certificate_ends", ""))] if certified else []
         offers = ", ".join(answer.get("offers", [answer.get("why", "")]))
         table.add_row(node, answer["address"], state, *ends, offers, shown)
     Console().print(table)
 
 
-def _devices(devices: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]) -> str:
-    """Names of devices, each with what is wrong with it: an emergency stop, why it takes no call, refusals, late cycles."""
+def _devices(
+    devices: Mapping[str, Any], stopped: Sequence[str], troubles: Mapping[str, str]
+) -> str:
+    """Names of devices, each with what is wrong with it: an emergency stop, why it takes no call,
+    refusals, late cycles."""
     from rich.markup import escape
 
     shown = []
@@ -115,4 +147,6 @@ def _ends(ends: str) -> str:
         return ""
     left = datetime.fromisoformat(ends) - datetime.now(UTC)
     day = ends.partition("T")[0]
-    return f"[red]{day}: in {max(left.days, 0)} days; petrobot keys --tls[/]" if left <= SOON else day
+    return (
+        f"[red]{day}: in {max(left.days, 0)} days; petrobot keys --tls[/]" if left <= SOON else day
+    )

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
+from petrobot.coordinator.cli import CommandError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from coordinator.task import Task
+    from petrobot.coordinator.task import Task
 
 
 def parameter_of(task: Task, name: str, text: str) -> Any:
-    """The value of a parameter from its text, of the same type as its default. Raises CommandError."""
+    """The value of a parameter from its text, of the same type as its default. Raises
+    CommandError."""
     if name not in task.parameters:
         known = ", ".join(task.parameters) or "none"
         raise CommandError(2, f"{task.name} has no parameter {name!r}; it has: {known}")
@@ -25,7 +26,9 @@ def parameter_of(task: Task, name: str, text: str) -> Any:
     try:
         return type(default)(text) if isinstance(default, int | float) else text
     except ValueError as fault:
-        raise CommandError(2, f"parameter {name}: {text!r} is no {type(default).__name__}") from fault
+        raise CommandError(
+            2, f"parameter {name}: {text!r} is no {type(default).__name__}"
+        ) from fault
 
 
 def pairs(option: str, texts: list[str]) -> Iterator[tuple[str, str]]:

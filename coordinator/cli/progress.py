@@ -1,4 +1,5 @@
-"""What a run shows in the terminal: which runs go on, how many are done, and the result as tables."""
+"""What a run shows in the terminal: which runs go on, how many are done, and the result as
+tables."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from coordinator.mission.mission import Mission
+    from petrobot.coordinator.mission.mission import Mission
 
 COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1
@@ -21,14 +22,18 @@ LONGEST_TABLE = 24
 WIDEST_TABLE = 9
 """Columns; wider tables are for --json and the report."""
 LAST_ERRORS = "last_errors"
-"""Key of a result under which the actions stand whose errors came last (`Mission.result`): a line each instead of a table."""
+"""Key of a result under which the actions stand whose errors came last (`Mission.result`): a line
+each instead of a table."""
 
 
 @contextmanager
 def live_progress() -> Iterator[Callable[[Mission, float], None]]:
-    """A line that follows the mission run; calls more often than every 0.1 s of wall time cost next to nothing."""
+    """A line that follows the mission run; calls more often than every 0.1 s of wall time cost next
+    to nothing."""
     shown = 0.0
-    with Live(Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+    with Live(
+        Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True
+    ) as live:
 
         def watch(mission: Mission, now: float) -> None:
             nonlocal shown
@@ -81,12 +86,19 @@ def _error(row: Mapping[str, Any]) -> str:
     """One action that ended in ERROR, in a line."""
     place = f" on {row['node']}" if row["node"] else ""
     why = ": ".join(filter(None, (row["cause"], row["text"])))
-    return f"{row['run']}, {row['action'] or 'no action'}{place} for {row['primitive_task']}: {why or 'it does not say why'}"
+    return (
+        f"{row['run']}, {row['action'] or 'no action'}{place} for "
+        f"{row['primitive_task']}: {why or 'it does not say why'}"
+    )
 
 
 def _table(title: str, rows: list[Mapping[str, Any]]) -> Table:
     left_out = max(0, len(rows) - LONGEST_TABLE)
-    table = Table(title=title, title_justify="left", caption=f"{left_out} more in --json" if left_out else None)
+    table = Table(
+        title=title,
+        title_justify="left",
+        caption=f"{left_out} more in --json" if left_out else None,
+    )
     columns = list(dict.fromkeys(key for row in rows for key in row))
     for column in columns:
         numeric = all(isinstance(row.get(column), int | float | None) for row in rows)

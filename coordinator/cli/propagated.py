@@ -1,4 +1,5 @@
-"""`learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through the task's net."""
+"""`learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through
+the task's net."""
 
 from __future__ import annotations
 
@@ -6,11 +7,11 @@ import argparse
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import load_task, write_json
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import load_task, write_json
 
 if TYPE_CHECKING:
-    from coordinator.experience.estimates_file import Kept
+    from petrobot.coordinator.experience.estimates_file import Kept
 
 
 def show_task(kept: Kept, options: argparse.Namespace) -> int:
@@ -27,9 +28,9 @@ def show_task(kept: Kept, options: argparse.Namespace) -> int:
 
 def figures(kept: Kept, name: str, context: str | None) -> dict[str, Any]:
     """Plain data: the parts, and the whole for one token in the runs place."""
-    from coordinator.analysis.stochastic import NoEstimate
-    from coordinator.experience.propagation import propagate
-    from coordinator.launch import with_runs
+    from petrobot.coordinator.analysis.stochastic import NoEstimate
+    from petrobot.coordinator.experience.propagation import propagate
+    from petrobot.coordinator.launch import with_runs
 
     task, _ = with_runs(load_task(name), 1)
     try:
@@ -38,7 +39,13 @@ def figures(kept: Kept, name: str, context: str | None) -> dict[str, Any]:
         raise CommandError(2, f"{task.name}: {fault}") from fault
     units = {p.cost for p in task.primitive_tasks.values() if p.name in found.parts}
     parts = [
-        {"primitive_task": p.primitive_task, "runs": p.runs, "R": p.reliability, "C": _known(p.cost), "J": _known(p.j)}
+        {
+            "primitive_task": p.primitive_task,
+            "runs": p.runs,
+            "R": p.reliability,
+            "C": _known(p.cost),
+            "J": _known(p.j),
+        }
         for p in found.parts.values()
     ]
     return {
@@ -65,10 +72,14 @@ def _print(found: dict[str, Any]) -> None:
     from rich.table import Table
 
     console = Console()
-    table = Table(title=found["task"], title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table = Table(
+        title=found["task"], title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0)
+    )
     table.show_edge = table.pad_edge = False
     for column in ("primitive task", "runs", "R", "C", "J"):
-        table.add_column(column, justify="left" if column == "primitive task" else "right", no_wrap=True)
+        table.add_column(
+            column, justify="left" if column == "primitive task" else "right", no_wrap=True
+        )
     for part in found["primitive_tasks"]:
         table.add_row(part["primitive_task"], *(_cell(part[k]) for k in ("runs", "R", "C", "J")))
     console.print(table)

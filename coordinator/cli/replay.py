@@ -1,12 +1,13 @@
-"""Derive every marking and instruction of a recorded run again, and fail on the first difference."""
+"""Derive every marking and instruction of a recorded run again, and fail on the first
+difference."""
 
 from __future__ import annotations
 
 import argparse
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import write_json
-from coordinator.cli.replaying import recorded
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.replaying import recorded
 
 EXAMPLE = "petrobot replay last"
 
@@ -14,13 +15,15 @@ EXAMPLE = "petrobot replay last"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("run", help="a run's id or folder, or `last`")
-    parser.add_argument("--json", metavar="FILE", help="write the outcome as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the outcome as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Replay; 0 when all is the same, 1 at a difference."""
-    from coordinator.record.journal import JournalError
-    from coordinator.record.recording import ReplayError
+    from petrobot.coordinator.record.journal import JournalError
+    from petrobot.coordinator.record.recording import ReplayError
 
     found = recorded(options.run)
     count, firings = 0, 0
@@ -43,5 +46,8 @@ def run(options: argparse.Namespace) -> int:
         write_json(options.json, outcome)
     if options.json != "-":
         tail = f"; a torn tail of {torn} bytes was dropped" if torn else ""
-        print(f"{outcome['run']}: {count} stimuli, {firings} firings, all derived again as they were{tail}")
+        print(
+            f"{outcome['run']}: {count} stimuli, {firings} firings, all derived again as "
+            f"they were{tail}"
+        )
     return 0

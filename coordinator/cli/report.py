@@ -1,4 +1,5 @@
-"""Write a report of a mission run or a campaign: one self-contained HTML page, and its pictures as SVG and PNG files."""
+"""Write a report of a mission run or a campaign: one self-contained HTML page, and its pictures as
+SVG and PNG files."""
 
 from __future__ import annotations
 
@@ -9,29 +10,39 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import load_task, pictures_of, write_json
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import load_task, pictures_of, write_json
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from coordinator.campaign.plan import Plan
-    from coordinator.campaign.rows import Row
-    from coordinator.cli.replaying import Recorded
-    from coordinator.record.recording import Step
-    from coordinator.report.observed_run import ObservedRun
-    from coordinator.task import Task
+    from petrobot.coordinator.campaign.plan import Plan
+    from petrobot.coordinator.campaign.rows import Row
+    from petrobot.coordinator.cli.replaying import Recorded
+    from petrobot.coordinator.record.recording import Step
+    from petrobot.coordinator.report.observed_run import ObservedRun
+    from petrobot.coordinator.task import Task
 
-EXAMPLE = "petrobot report campaigns/catch_ball-nikolic_fu-1 --against campaigns/catch_ball-fixed-1 --out report.html"
+EXAMPLE = (
+    "petrobot report campaigns/catch_ball-nikolic_fu-1 --against "
+    "campaigns/catch_ball-fixed-1 --out report.html"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "subject", metavar="RUN|CAMPAIGN", help="a recorded run (id, folder, last) or a campaign's folder"
+        "subject",
+        metavar="RUN|CAMPAIGN",
+        help="a recorded run (id, folder, last) or a campaign's folder",
     )
-    parser.add_argument("--against", metavar="CAMPAIGN", type=Path, help="compare with this campaign, throw by throw")
+    parser.add_argument(
+        "--against",
+        metavar="CAMPAIGN",
+        type=Path,
+        help="compare with this campaign, throw by throw",
+    )
     parser.add_argument(
         "--rho-of",
         metavar="CAMPAIGN",
@@ -39,14 +50,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="weigh costs as the actions of this campaign do (default: of the two)",
     )
     parser.add_argument(
-        "--out", metavar="FILE", type=Path, help="the page (default: report.html beside what it is about)"
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="the page (default: report.html beside what it is about)",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the comparison's numbers as JSON (- for standard output)")
+    parser.add_argument(
+        "--json",
+        metavar="FILE",
+        help="write the comparison's numbers as JSON (- for standard output)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Write page and pictures."""
-    from coordinator.campaign.plan import MANIFEST, CampaignError
+    from petrobot.coordinator.campaign.plan import MANIFEST, CampaignError
 
     folder = Path(options.subject)
     try:
@@ -63,8 +81,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -> None:
-    from coordinator.report.colours import standalone
-    from coordinator.report.raster import unavailable
+    from petrobot.coordinator.report.colours import standalone
+    from petrobot.coordinator.report.raster import unavailable
 
     beside = page.with_name(f"{page.stem}_pictures")
     missing = unavailable()
@@ -74,7 +92,9 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
         for name, svg in pictures.items():
             _draw(beside / name, standalone(svg), raster=not missing)
     except OSError as fault:
-        raise CommandError(2, f"{page}: {fault.strerror or fault}; give --out a file that can be written") from fault
+        raise CommandError(
+            2, f"{page}: {fault.strerror or fault}; give --out a file that can be written"
+        ) from fault
     if not quiet:
         print(f"report: {page}")
         print(f"pictures: {beside} ({len(pictures)} as SVG{'' if missing else ' and PNG'})")
@@ -84,7 +104,7 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
 
 def _draw(path: Path, svg: str, *, raster: bool) -> None:
     """A picture's files. A task's own picture that only browsers understand stays an SVG."""
-    from coordinator.report.raster import RasterError, png
+    from petrobot.coordinator.report.raster import RasterError, png
 
     write_whole(path.with_name(f"{path.name}.svg"), svg)
     if raster:
@@ -94,11 +114,15 @@ def _draw(path: Path, svg: str, *, raster: bool) -> None:
             print(f"{path}.svg: no PNG: {fault}", file=sys.stderr)
 
 
-# --- campaigns -----------------------------------------------------------------------------------------------------------
+# --- campaigns --------------------------------------------------------------------------------
 
 
 def _campaign(folder: Path, options: argparse.Namespace) -> tuple[str, dict[str, str], Path]:
-    from coordinator.report.campaign_page import CampaignReport, comparison_pictures, comparison_section
+    from petrobot.coordinator.report.campaign_page import (
+        CampaignReport,
+        comparison_pictures,
+        comparison_section,
+    )
 
     plan, task, rows = opened(folder)
     report = CampaignReport(plan, task, rows, _plots(folder))
@@ -111,7 +135,11 @@ def _campaign(folder: Path, options: argparse.Namespace) -> tuple[str, dict[str,
         report.pictures = {**pictures, **report.pictures}
         if options.json:
             write_json(options.json, found)
-    return report.html(more), {name: svg for name, (_, svg) in report.pictures.items()}, folder / "report.html"
+    return (
+        report.html(more),
+        {name: svg for name, (_, svg) in report.pictures.items()},
+        folder / "report.html",
+    )
 
 
 def _names(one: Path, other: Path) -> tuple[str, str]:
@@ -121,8 +149,8 @@ def _names(one: Path, other: Path) -> tuple[str, str]:
 
 def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
     """Plan, task and rows of a campaign. Raises CampaignError, and CommandError without rows."""
-    from coordinator.campaign.plan import read_manifest
-    from coordinator.campaign.table import TABLE, read_table
+    from petrobot.coordinator.campaign.plan import read_manifest
+    from petrobot.coordinator.campaign.table import TABLE, read_table
 
     plan = read_manifest(folder)
     rows = list(read_table(folder / TABLE))
@@ -132,8 +160,9 @@ def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
 
 
 def compared(one: Path, other: Path, rho_of: Path | None = None) -> dict[str, Any]:
-    """The numbers of a comparison of two campaigns' folders; rho is that of a third one's actions, if given."""
-    from coordinator.report.comparing import Weighting, compare
+    """The numbers of a comparison of two campaigns' folders; rho is that of a third one's actions,
+    if given."""
+    from petrobot.coordinator.report.comparing import Weighting, compare
 
     _, task, rows = opened(one)
     _, _, others = opened(other)
@@ -152,15 +181,15 @@ def _plots(folder: Path) -> dict[str, Any]:
     return found
 
 
-# --- runs ----------------------------------------------------------------------------------------------------------------
+# --- runs -------------------------------------------------------------------------------------
 
 
 def _run(name: str) -> tuple[str, dict[str, str], Path]:
-    from coordinator.cli.replaying import recorded
-    from coordinator.drawing import draw
-    from coordinator.record.runfolder import RESULT
-    from coordinator.record.timeline import Timeline
-    from coordinator.report.run_page import gantt_svg, own_pictures, report_html
+    from petrobot.coordinator.cli.replaying import recorded
+    from petrobot.coordinator.drawing import draw
+    from petrobot.coordinator.record.runfolder import RESULT
+    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.report.run_page import gantt_svg, own_pictures, report_html
 
     found = recorded(name)
     timeline, observed = Timeline(), _observer(found)
@@ -171,20 +200,37 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
         observed.step(step)
     folder = found.journal.path.parent
     result = _result_of(folder / RESULT, found.task)
-    drawn, net, measured = pictures_of(found.task, result), draw(found.task, error_branches=True), observed.pictures()
+    drawn, net, measured = (
+        pictures_of(found.task, result),
+        draw(found.task, error_branches=True),
+        observed.pictures(),
+    )
     headings = list(dict.fromkeys(heading for heading, _ in measured.values()))
-    sections = {heading: [svg for own, svg in measured.values() if own == heading] for heading in headings}
-    page = report_html({**result, "mission": found.journal.header["mission"]}, timeline, net, drawn, sections)
-    own = {f"own_{i}": svg for i, svg in enumerate([*own_pictures(result).values(), *drawn.values()], 1)}
-    pictures = {"gantt": gantt_svg(timeline), "net": net, **{name: svg for name, (_, svg) in measured.items()}, **own}
+    sections = {
+        heading: [svg for own, svg in measured.values() if own == heading] for heading in headings
+    }
+    page = report_html(
+        {**result, "mission": found.journal.header["mission"]}, timeline, net, drawn, sections
+    )
+    own = {
+        f"own_{i}": svg
+        for i, svg in enumerate([*own_pictures(result).values(), *drawn.values()], 1)
+    }
+    pictures = {
+        "gantt": gantt_svg(timeline),
+        "net": net,
+        **{name: svg for name, (_, svg) in measured.items()},
+        **own,
+    }
     return page, pictures, folder / "report.html"
 
 
 def _observer(found: Recorded) -> ObservedRun:
-    """What sees the run's actions; with the selector that learned in it, as far as its estimates file is still there."""
-    from coordinator.experience.estimates_file import EstimatesError
-    from coordinator.experience.learning_session import session_of
-    from coordinator.report.observed_run import ObservedRun
+    """What sees the run's actions; with the selector that learned in it, as far as its estimates
+    file is still there."""
+    from petrobot.coordinator.experience.estimates_file import EstimatesError
+    from petrobot.coordinator.experience.learning_session import session_of
+    from petrobot.coordinator.report.observed_run import ObservedRun
 
     try:
         session = session_of(found.task, found.journal.header)
@@ -195,8 +241,8 @@ def _observer(found: Recorded) -> ObservedRun:
 
 
 def _steps(found: Recorded) -> Iterator[Step]:
-    from coordinator.record.journal import JournalError
-    from coordinator.record.recording import ReplayError
+    from petrobot.coordinator.record.journal import JournalError
+    from petrobot.coordinator.record.recording import ReplayError
 
     try:
         yield from found.steps()

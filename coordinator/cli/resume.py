@@ -1,4 +1,5 @@
-"""Go on with a run whose coordinator was killed: marking restored, nodes asked for their runs, nothing done twice."""
+"""Go on with a run whose coordinator was killed: marking restored, nodes asked for their runs,
+nothing done twice."""
 
 from __future__ import annotations
 
@@ -11,42 +12,50 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import write_json
-from coordinator.cli.replaying import Recorded, recorded
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import write_json
+from petrobot.coordinator.cli.replaying import Recorded, recorded
 
 if TYPE_CHECKING:
-    from coordinator.mission.mission import Mission
-    from coordinator.mission.partners import Observer
-    from coordinator.record.timeline import Timeline
+    from petrobot.coordinator.mission.mission import Mission
+    from petrobot.coordinator.mission.partners import Observer
+    from petrobot.coordinator.record.timeline import Timeline
 
 EXAMPLE = "petrobot resume last --json out.json"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    from coordinator.cli.run import add_page_arguments
+    from petrobot.coordinator.cli.run import add_page_arguments
 
     parser.add_argument("run", help="a run's id or folder, or `last`")
-    parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
-    parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
+    )
+    parser.add_argument(
+        "--report", metavar="FOLDER", type=Path, help="leave a report in this folder"
+    )
     add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
 
 
 def run(options: argparse.Namespace) -> int:
     """Resume."""
-    from coordinator.cli.giving import give
-    from coordinator.mission.mission import MissionError
-    from coordinator.record.journal import JournalError
-    from coordinator.record.recording import ReplayError
-    from coordinator.record.runfolder import RESULT
-    from services.comm.cell import CellError
+    from petrobot.coordinator.cli.giving import give
+    from petrobot.coordinator.mission.mission import MissionError
+    from petrobot.coordinator.record.journal import JournalError
+    from petrobot.coordinator.record.recording import ReplayError
+    from petrobot.coordinator.record.runfolder import RESULT
+    from petrobot.services.comm.cell import CellError
 
     found = recorded(options.run)
     folder, mode = found.journal.path.parent, found.journal.header["mode"]
     if (result := _result_of(folder / RESULT)) is not None:
-        print(f"{options.run}: the run had ended, {result['status']}; its result is {folder / RESULT}", file=sys.stderr)
+        print(
+            f"{options.run}: the run had ended, {result['status']}; its result is "
+            f"{folder / RESULT}",
+            file=sys.stderr,
+        )
         if options.json:
             write_json(options.json, result)
         return _exit_code(result)
@@ -68,7 +77,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result_of(path: Path) -> dict[str, Any] | None:
-    """The result that a run has left; None if it has none yet, or only a part of one, which is then written again."""
+    """The result that a run has left; None if it has none yet, or only a part of one, which is then
+    written again."""
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError):
@@ -77,36 +87,46 @@ def _result_of(path: Path) -> dict[str, Any] | None:
 
 
 def _exit_code(result: Mapping[str, Any]) -> int:
-    """A supervisor that resumes whatever ends is told the same by each resume: 2 is for damage alone."""
+    """A supervisor that resumes whatever ends is told the same by each resume: 2 is for damage
+    alone."""
     return 0 if result["status"] == "success" else 1
 
 
-def _resume_lockstep(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline, dict[str, Any]]:
-    """Nodes that wait for their coordinator are joined; a cell that ended with it is made again from its seed."""
-    from coordinator.cli.giving import progress
-    from coordinator.cli.learning import resumed_selector, saved
-    from coordinator.cli.lockstep import JOINED, rejoin, retrace
+def _resume_lockstep(
+    found: Recorded, options: argparse.Namespace
+) -> tuple[Mission, Timeline, dict[str, Any]]:
+    """Nodes that wait for their coordinator are joined; a cell that ended with it is made again
+    from its seed."""
+    from petrobot.coordinator.cli.giving import progress
+    from petrobot.coordinator.cli.learning import resumed_selector, saved
+    from petrobot.coordinator.cli.lockstep import JOINED, rejoin, retrace
 
     selector, session = resumed_selector(found.task, found.journal.header)
     with saved(session) as learned, progress(options) as watch:
         if found.journal.header["cell"] == JOINED:
-            mission, timeline = rejoin(found, selector, [] if session is None else [session.selector], watch)
+            mission, timeline = rejoin(
+                found, selector, [] if session is None else [session.selector], watch
+            )
         else:
             mission, timeline = retrace(found, selector, watch)
     return mission, timeline, learned
 
 
-async def _resume(found: Recorded, options: argparse.Namespace) -> tuple[Mission, Timeline, dict[str, Any]]:
-    from coordinator.cli.learning import resumed_selector, saved
-    from coordinator.cli.run import drive
-    from coordinator.launch import resumed_mission
-    from coordinator.record.timeline import Timeline
+async def _resume(
+    found: Recorded, options: argparse.Namespace
+) -> tuple[Mission, Timeline, dict[str, Any]]:
+    from petrobot.coordinator.cli.learning import resumed_selector, saved
+    from petrobot.coordinator.cli.run import drive
+    from petrobot.coordinator.launch import resumed_mission
+    from petrobot.coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     now = asyncio.get_running_loop().time()
     selector, session = resumed_selector(found.task, found.journal.header)
     observers: list[Observer] = [timeline] if session is None else [timeline, session.selector]
-    mission, go_on = resumed_mission(found.directory, found.task, found.engine, found.journal, observers, now, selector)
+    mission, go_on = resumed_mission(
+        found.directory, found.task, found.engine, found.journal, observers, now, selector
+    )
     options.folder = found.journal.path.parent
     with saved(session) as learned:
         await drive(found.directory, mission, options, go_on)

@@ -1,4 +1,5 @@
-"""Run a task: in real time over the nodes of services.toml, or in lock step, where simulated time is exact."""
+"""Run a task: in real time over the nodes of services.toml, or in lock step, where simulated time
+is exact."""
 
 from __future__ import annotations
 
@@ -12,30 +13,35 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcon
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.departing import add_departing_arguments, depart
-from coordinator.cli.giving import give, progress
-from coordinator.cli.journaling import add_journal_arguments, journal_folder, new_store, tidy
-from coordinator.cli.learning import add_learning_arguments, opened, saved
-from coordinator.cli.loading import (
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.departing import add_departing_arguments, depart
+from petrobot.coordinator.cli.giving import give, progress
+from petrobot.coordinator.cli.journaling import (
+    add_journal_arguments,
+    journal_folder,
+    new_store,
+    tidy,
+)
+from petrobot.coordinator.cli.learning import add_learning_arguments, opened, saved
+from petrobot.coordinator.cli.loading import (
     add_services_argument,
     cell_path,
     load_directory,
     load_task,
     refuse_misplaced,
 )
-from coordinator.cli.lockstep import substitutes
-from coordinator.cli.page_port import add_page_port_argument, named_port
-from coordinator.cli.parameters import pairs, parameter_of
-from services.comm.quantities import whole
+from petrobot.coordinator.cli.lockstep import substitutes
+from petrobot.coordinator.cli.page_port import add_page_port_argument, named_port
+from petrobot.coordinator.cli.parameters import pairs, parameter_of
+from petrobot.services.comm.quantities import whole
 
 if TYPE_CHECKING:
-    from coordinator.launch import Setting
-    from coordinator.mission.mission import Mission
-    from coordinator.mission.realtime import RealtimeMission
-    from coordinator.record.timeline import Timeline
-    from coordinator.task import Task
-    from services.comm.directory import Directory
+    from petrobot.coordinator.launch import Setting
+    from petrobot.coordinator.mission.mission import Mission
+    from petrobot.coordinator.mission.realtime import RealtimeMission
+    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.task import Task
+    from petrobot.services.comm.directory import Directory
 
 MODES = ("realtime", "lockstep")
 SEED = 1
@@ -49,12 +55,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "task",
         nargs="?",
-        help="a task file, or the name of a task that comes with petrobot (with --from: that of the run)",
+        help="a task file, or the name of a task that comes with petrobot (with --from: that "
+        "of the run)",
     )
     parser.add_argument(
-        "--runs", type=whole(), metavar="N", help="how many runs (default: tokens in the task's runs place)"
+        "--runs",
+        type=whole(),
+        metavar="N",
+        help="how many runs (default: tokens in the task's runs place)",
     )
-    parser.add_argument("--mode", choices=MODES, help=f"default: {MODES[0]}, with --from {MODES[1]}")
+    parser.add_argument(
+        "--mode", choices=MODES, help=f"default: {MODES[0]}, with --from {MODES[1]}"
+    )
     parser.add_argument(
         "--seed",
         type=whole(0),
@@ -62,12 +74,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"of all chance in the run (default: {SEED}, with --from that of the run)",
     )
     parser.add_argument("--regime", metavar="NAME", help="the same as --set regime=NAME")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task")
     parser.add_argument(
-        "--use", action="append", default=[], metavar="TASK=ACTION", help="the action for a primitive task"
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the task"
     )
     parser.add_argument(
-        "--processes", type=int, choices=(1, 0), default=1, help="lock step: 1 for one process, 0 for one a node"
+        "--use",
+        action="append",
+        default=[],
+        metavar="TASK=ACTION",
+        help="the action for a primitive task",
+    )
+    parser.add_argument(
+        "--processes",
+        type=int,
+        choices=(1, 0),
+        default=1,
+        help="lock step: 1 for one process, 0 for one a node",
     )
     parser.add_argument(
         "--join",
@@ -75,13 +97,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="lock step, one process a node: the nodes wait already (`petrobot up --lockstep`)",
     )
     parser.add_argument(
-        "--up", action="store_true", help="launch the nodes of this host for this run, and end them after it"
+        "--up",
+        action="store_true",
+        help="launch the nodes of this host for this run, and end them after it",
     )
-    parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
+    parser.add_argument(
+        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
+    )
     add_learning_arguments(parser)
     add_departing_arguments(parser)
-    parser.add_argument("--json", metavar="FILE", help="write the result as JSON (- for standard output)")
-    parser.add_argument("--report", metavar="FOLDER", type=Path, help="leave a report in this folder")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the result as JSON (- for standard output)"
+    )
+    parser.add_argument(
+        "--report", metavar="FOLDER", type=Path, help="leave a report in this folder"
+    )
     add_journal_arguments(parser)
     add_page_arguments(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
@@ -92,17 +122,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
     """Whether and where the operator's page is served while a real-time run goes on."""
     parser.add_argument(
-        "--no-page", action="store_true", help="serve no operator's page; the command line still steers the run"
+        "--no-page",
+        action="store_true",
+        help="serve no operator's page; the command line still steers the run",
     )
     add_page_port_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
-    from coordinator.launch import mission_id
-    from coordinator.mission.mission import MissionError
-    from coordinator.record.journal import JournalError
-    from services.comm.directory import DirectoryError
+    from petrobot.coordinator.launch import mission_id
+    from petrobot.coordinator.mission.mission import MissionError
+    from petrobot.coordinator.record.journal import JournalError
+    from petrobot.services.comm.directory import DirectoryError
 
     if options.departs is not None:
         return depart(options)
@@ -110,15 +142,22 @@ def run(options: argparse.Namespace) -> int:
         raise CommandError(2, "give a task, or with --from a recorded run")
     if options.going:
         raise CommandError(2, "--going goes with --from")
-    options.mode, options.seed = options.mode or MODES[0], SEED if options.seed is None else options.seed
+    options.mode, options.seed = (
+        options.mode or MODES[0],
+        SEED if options.seed is None else options.seed,
+    )
     task = load_task(options.task)
     options.services = cell_path(options.services, options.task, task)
     directory = load_directory(options.services)
     if options.join and (options.mode != "lockstep" or options.processes != 0):
-        raise CommandError(2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always")
+        raise CommandError(
+            2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always"
+        )
     _refuse_unfit(task, directory)
     if (options.mode == "lockstep" or options.up) and not options.join:
-        refuse_misplaced(directory, everywhere=options.mode == "lockstep", scripted=options.mock is not None)
+        refuse_misplaced(
+            directory, everywhere=options.mode == "lockstep", scripted=options.mock is not None
+        )
     substitutes(options.mock, directory)  # refuses a script for actions that there are not
     setting = _setting(task, directory, options)
     _warn(task, options)
@@ -137,7 +176,9 @@ def run(options: argparse.Namespace) -> int:
     except DirectoryError as fault:
         raise CommandError(2, str(fault)) from fault
     except JournalError as fault:
-        raise CommandError(1 if options.folder is not None and options.folder.exists() else 2, str(fault)) from fault
+        raise CommandError(
+            1 if options.folder is not None and options.folder.exists() else 2, str(fault)
+        ) from fault
     result = {**mission.result(options.mode, time.perf_counter() - begun), **learned}
     give(result, task, timeline, options, options.folder)
     tidy(options)
@@ -145,7 +186,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_unfit(task: Task, directory: Directory) -> None:
-    from coordinator.check import check
+    from petrobot.coordinator.check import check
 
     offers = {action: entry.node for action, entry in directory.actions.items()}
     report = check(task, offers, source=str(directory.source))
@@ -156,31 +197,38 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
 
 
 def _warn(task: Task, options: argparse.Namespace) -> None:
-    """Say what a short look at the state space finds against running it: whoever runs it all the same may want to see that."""
-    from coordinator.analysis.report import analyse
-    from coordinator.analysis.space import Limits
+    """Say what a short look at the state space finds against running it: whoever runs it all the
+    same may want to see that."""
+    from petrobot.coordinator.analysis.report import analyse
+    from petrobot.coordinator.analysis.space import Limits
 
     if options.quiet:
         return
     limits = Limits(states=MOST_STATES, seconds=LONGEST, clock=time.monotonic)
     for name, verdict in analyse(task, limits=limits).objections.items():
-        told = f"warning: {task.name}: {name.replace('_', ' ')}: {verdict.reason} (petrobot check {options.task} says more)"
+        told = (
+            f"warning: {task.name}: {name.replace('_', ' ')}: {verdict.reason} (petrobot "
+            f"check {options.task} says more)"
+        )
         print(told, file=sys.stderr)
 
 
 def _refuse_stopped(directory: Directory) -> None:
     """A run whose devices obey nobody would end at once, having done nothing."""
-    from coordinator.operator.emergency import still_stopped
+    from petrobot.coordinator.operator.emergency import still_stopped
 
     stopped = still_stopped(directory)
     if stopped:
-        text = f"{', '.join(stopped)}: an emergency stop still holds the devices; once the cell is safe: petrobot estop --clear"
+        text = (
+            f"{', '.join(stopped)}: an emergency stop still holds the devices; once the "
+            "cell is safe: petrobot estop --clear"
+        )
         raise CommandError(2, text)
 
 
 def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:
-    from coordinator.launch import Setting
-    from coordinator.mission.partners import FirstAlternative
+    from petrobot.coordinator.launch import Setting
+    from petrobot.coordinator.mission.partners import FirstAlternative
 
     given = dict(pairs("--set", options.set))
     if options.regime is not None:
@@ -191,9 +239,13 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
         known = task.primitive_tasks.get(primitive)
         if known is None or action not in known.alternatives:
             choices = ", ".join(known.alternatives) if known else ", ".join(task.primitive_tasks)
-            raise CommandError(2, f"--use {primitive}={action}: not known to {task.name}; choose among {choices}")
+            raise CommandError(
+                2, f"--use {primitive}={action}: not known to {task.name}; choose among {choices}"
+            )
         if action not in directory.actions:
-            raise CommandError(2, f"--use {primitive}={action}: {directory.source} places no action {action}")
+            raise CommandError(
+                2, f"--use {primitive}={action}: {directory.source} places no action {action}"
+            )
     options.learning = opened(task, directory, chosen, options)
     learning = {} if options.learning is None else {"learning": options.learning.beginning()}
     options.chosen_by = {"chosen": chosen, **learning}
@@ -201,12 +253,14 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
     return Setting(task, parameters, options.runs, options.seed, selector)
 
 
-# --- lock step ---------------------------------------------------------------------------------------------------------
+# --- lock step --------------------------------------------------------------------------------
 
 
-def _run_lockstep(directory: Directory, setting: Setting, options: argparse.Namespace) -> tuple[Mission, Timeline]:
-    from coordinator.cli.lockstep import begin
-    from services.comm.cell import CellError
+def _run_lockstep(
+    directory: Directory, setting: Setting, options: argparse.Namespace
+) -> tuple[Mission, Timeline]:
+    from petrobot.coordinator.cli.lockstep import begin
+    from petrobot.services.comm.cell import CellError
 
     with progress(options) as watch:
         try:
@@ -215,14 +269,14 @@ def _run_lockstep(directory: Directory, setting: Setting, options: argparse.Name
             raise CommandError(3, str(fault)) from fault
 
 
-# --- real time ---------------------------------------------------------------------------------------------------------
+# --- real time --------------------------------------------------------------------------------
 
 
 async def _run_realtime(
     directory: Directory, setting: Setting, options: argparse.Namespace
 ) -> tuple[Mission, Timeline]:
-    from coordinator.launch import realtime_mission
-    from coordinator.record.timeline import Timeline
+    from petrobot.coordinator.launch import realtime_mission
+    from petrobot.coordinator.record.timeline import Timeline
 
     timeline = Timeline()
     identity: str = options.identity
@@ -230,7 +284,9 @@ async def _run_realtime(
     assert folder is not None
     options.folder = folder / identity
     now = asyncio.get_running_loop().time()
-    store = new_store(directory, setting, options, options.folder, identity, now, **options.chosen_by)
+    store = new_store(
+        directory, setting, options, options.folder, identity, now, **options.chosen_by
+    )
     mission = realtime_mission(directory, setting, identity, store)
     mission.executor.observers.append(timeline)
     await drive(directory, mission, options)
@@ -238,12 +294,19 @@ async def _run_realtime(
 
 
 async def drive(
-    directory: Directory, mission: Mission, options: argparse.Namespace, begin: Callable[[float], None] | None = None
+    directory: Directory,
+    mission: Mission,
+    options: argparse.Namespace,
+    begin: Callable[[float], None] | None = None,
 ) -> None:
     """Run a mission in real time over its nodes, launching those of this host first if asked to."""
-    from coordinator.mission.realtime import RealtimeMission, UnreachableError, credentials_of
-    from coordinator.supervisor import LaunchError
-    from services.comm.security import KeyFileError
+    from petrobot.coordinator.mission.realtime import (
+        RealtimeMission,
+        UnreachableError,
+        credentials_of,
+    )
+    from petrobot.coordinator.supervisor import LaunchError
+    from petrobot.services.comm.security import KeyFileError
 
     try:
         async with _nodes(directory, options):
@@ -264,14 +327,14 @@ async def drive(
 @asynccontextmanager
 async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIterator[None]:
     """The operator's page, or with --no-page his protocol alone, while the mission run goes on."""
-    from coordinator.cli.loading import SHIPPED
-    from coordinator.cli.serve import OWN_TASKS
-    from coordinator.hmi.journals import JournalHistory
-    from coordinator.hmi.server import start_page
-    from coordinator.mission.partners import FirstAlternative
-    from coordinator.operator.door_file import Door, door_open
-    from coordinator.operator.operation import Operation
-    from coordinator.operator.station import offered
+    from petrobot.coordinator.cli.loading import SHIPPED
+    from petrobot.coordinator.cli.serve import OWN_TASKS
+    from petrobot.coordinator.hmi.journals import JournalHistory
+    from petrobot.coordinator.hmi.server import start_page
+    from petrobot.coordinator.mission.partners import FirstAlternative
+    from petrobot.coordinator.operator.door_file import Door, door_open
+    from petrobot.coordinator.operator.operation import Operation
+    from petrobot.coordinator.operator.station import offered
 
     selector = shell.mission.executor.selector
     assert isinstance(selector, FirstAlternative)
@@ -284,14 +347,22 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
             tasks_folder=OWN_TASKS,
             shipped=SHIPPED,
             port=options.page_port,
-            offers=lambda: offered(directory, lambda action, node: callers[node].up and action in callers[node].offers),
+            offers=lambda: offered(
+                directory, lambda action, node: callers[node].up and action in callers[node].offers
+            ),
             history=history,
             page=not options.no_page,
         )
     if not options.no_page:
         print(f"page: {page.url}", file=sys.stderr, flush=True)
     executor = shell.mission.executor
-    door = Door(executor.mission, page.base, page.token, os.getpid(), str(executor.directory.source.resolve()))
+    door = Door(
+        executor.mission,
+        page.base,
+        page.token,
+        os.getpid(),
+        str(executor.directory.source.resolve()),
+    )
     try:
         with door_open(options.folder, door):
             yield
@@ -303,13 +374,15 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
 def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:
     if not getattr(options, "up", False):
         return nullcontext()
-    from coordinator.launch import local_programs
-    from coordinator.supervisor import Supervisor
+    from petrobot.coordinator.launch import local_programs
+    from petrobot.coordinator.supervisor import Supervisor
 
     return Supervisor(local_programs(directory, mock=options.mock), Path("runs/logs"), notice=print)
 
 
-async def _watched(running: Any, mission: Mission, watch: Callable[[Mission, float], None] | None) -> None:
+async def _watched(
+    running: Any, mission: Mission, watch: Callable[[Mission, float], None] | None
+) -> None:
     task = asyncio.ensure_future(running)
     while not task.done():
         if watch is not None:

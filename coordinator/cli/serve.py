@@ -1,4 +1,5 @@
-"""Serve the operator's page and stay: draw tasks, start them over the nodes, as often as wanted, until Ctrl-C."""
+"""Serve the operator's page and stay: draw tasks, start them over the nodes, as often as wanted,
+until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -10,15 +11,15 @@ from contextlib import AbstractAsyncContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
-from coordinator.cli.lockstep import substitutes
-from coordinator.cli.page_port import add_page_port_argument, named_port
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
+from petrobot.coordinator.cli.lockstep import substitutes
+from petrobot.coordinator.cli.page_port import add_page_port_argument, named_port
 
 if TYPE_CHECKING:
-    from coordinator.hmi.server import Page
-    from coordinator.operator.station import Station
-    from services.comm.directory import Directory
+    from petrobot.coordinator.hmi.server import Page
+    from petrobot.coordinator.operator.station import Station
+    from petrobot.services.comm.directory import Directory
 
 EXAMPLE = "petrobot serve --up"
 OWN_TASKS = Path("tasks")
@@ -33,12 +34,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         type=Path,
         default=OWN_TASKS,
-        help="your own tasks, made when first needed; those that come with petrobot are offered, too (%(default)s)",
+        help="your own tasks, made when first needed; those that come with petrobot are "
+        "offered, too (%(default)s)",
     )
     parser.add_argument(
-        "--up", action="store_true", help="launch the nodes of this host, and end them with this command"
+        "--up",
+        action="store_true",
+        help="launch the nodes of this host, and end them with this command",
     )
-    parser.add_argument("--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones")
+    parser.add_argument(
+        "--mock", metavar="FILE", type=Path, help="with --up: replace actions by scripted ones"
+    )
     add_page_port_argument(parser)
     parser.add_argument(
         "--estimates",
@@ -47,24 +53,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=ESTIMATES,
         help="where runs that learn keep what they learned, one file a name (%(default)s)",
     )
-    parser.add_argument("--journal", metavar="FOLDER", type=Path, help="where runs are kept (default: runs)")
+    parser.add_argument(
+        "--journal", metavar="FOLDER", type=Path, help="where runs are kept (default: runs)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     if options.mock is not None and not options.up:
-        raise CommandError(2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`")
+        raise CommandError(
+            2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`"
+        )
     directory = load_directory(options.services)
     substitutes(options.mock, directory)  # refuses a script for actions that there are not
     return asyncio.run(_serve(directory, options))
 
 
 async def _serve(directory: Directory, options: argparse.Namespace) -> int:
-    from coordinator.hmi.store import TaskStore
-    from coordinator.mission.realtime import credentials_of
-    from coordinator.operator.station import Station
-    from coordinator.record.runfolder import DEFAULT
-    from coordinator.supervisor import LaunchError
+    from petrobot.coordinator.hmi.store import TaskStore
+    from petrobot.coordinator.mission.realtime import credentials_of
+    from petrobot.coordinator.operator.station import Station
+    from petrobot.coordinator.record.runfolder import DEFAULT
+    from petrobot.coordinator.supervisor import LaunchError
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -73,7 +83,9 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     runs = options.journal or DEFAULT
     try:
         async with _nodes(directory, runs, options):
-            station = Station(directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates)
+            station = Station(
+                directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates
+            )
             try:
                 await station.look()
                 await _page(station, runs, options, stop)
@@ -84,10 +96,12 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     return 0
 
 
-async def _page(station: Station, runs: Path, options: argparse.Namespace, stop: asyncio.Event) -> None:
+async def _page(
+    station: Station, runs: Path, options: argparse.Namespace, stop: asyncio.Event
+) -> None:
     """The page, until told to stop; a run that goes on then is aborted before the page goes."""
-    from coordinator.hmi.journals import JournalHistory
-    from coordinator.hmi.server import start_page
+    from petrobot.coordinator.hmi.journals import JournalHistory
+    from petrobot.coordinator.hmi.server import start_page
 
     with named_port(options.page_port):
         page = await start_page(
@@ -109,15 +123,19 @@ async def _page(station: Station, runs: Path, options: argparse.Namespace, stop:
 
 
 def _doors(directory: Directory, page: Page) -> Any:
-    from coordinator.operator.door_file import Door
+    from petrobot.coordinator.operator.door_file import Door
 
-    return lambda run: Door(run, page.base, page.token, os.getpid(), str(directory.source.resolve()))
+    return lambda run: Door(
+        run, page.base, page.token, os.getpid(), str(directory.source.resolve())
+    )
 
 
-def _nodes(directory: Directory, runs: Path, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:
+def _nodes(
+    directory: Directory, runs: Path, options: argparse.Namespace
+) -> AbstractAsyncContextManager[Any]:
     if not options.up:
         return nullcontext()
-    from coordinator.launch import local_programs
-    from coordinator.supervisor import Supervisor
+    from petrobot.coordinator.launch import local_programs
+    from petrobot.coordinator.supervisor import Supervisor
 
     return Supervisor(local_programs(directory, mock=options.mock), runs / "logs", notice=print)

@@ -1,4 +1,5 @@
-"""Draw a task as SVG: places, transitions, tokens and events; error branches are hidden unless asked for."""
+"""Draw a task as SVG: places, transitions, tokens and events; error branches are hidden unless
+asked for."""
 
 from __future__ import annotations
 
@@ -6,13 +7,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import load_task, task_path
-from services.comm.whole_file import write_whole
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import load_task, task_path
+from petrobot.services.comm.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from coordinator.drawing import Overlay
-    from coordinator.task import Task
+    from petrobot.coordinator.drawing import Overlay
+    from petrobot.coordinator.task import Task
 
 EXAMPLE = "petrobot show catch_ball --errors --out catch_ball.svg"
 
@@ -21,10 +22,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("task", help="a task file, or the name of a task that comes with petrobot")
     parser.add_argument("--errors", action="store_true", help="draw the error branches too")
-    parser.add_argument("--inside", metavar="MACRO", default="", help="draw what is inside a macro place")
-    parser.add_argument("--graph", action="store_true", help="draw the reachability graph instead (of any net file)")
-    parser.add_argument("--heat", action="store_true", help="colour the action places by their share of the mean time")
-    parser.add_argument("--out", metavar="FILE", default="-", help="where to write the SVG (default: standard output)")
+    parser.add_argument(
+        "--inside", metavar="MACRO", default="", help="draw what is inside a macro place"
+    )
+    parser.add_argument(
+        "--graph", action="store_true", help="draw the reachability graph instead (of any net file)"
+    )
+    parser.add_argument(
+        "--heat",
+        action="store_true",
+        help="colour the action places by their share of the mean time",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        default="-",
+        help="where to write the SVG (default: standard output)",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -42,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _net(options: argparse.Namespace) -> str:
-    from coordinator.drawing import draw
+    from petrobot.coordinator.drawing import draw
 
     task = load_task(options.task)
     overlay = _heat(task) if options.heat else None
@@ -53,22 +67,28 @@ def _net(options: argparse.Namespace) -> str:
 
 
 def _heat(task: Task) -> Overlay:
-    """The forecast's bottleneck: how much of the mean time each action place takes. Raises CommandError."""
-    from coordinator.analysis.report import analyse, heat
-    from coordinator.drawing import Overlay
+    """The forecast's bottleneck: how much of the mean time each action place takes. Raises
+    CommandError."""
+    from petrobot.coordinator.analysis.report import analyse, heat
+    from petrobot.coordinator.drawing import Overlay
 
     analysis = analyse(task, view="gspn")
     shares = heat(analysis)
     if not shares:
-        raise CommandError(2, f"{task.name}: no heat without a forecast: {'; '.join(analysis.notes)}")
+        raise CommandError(
+            2, f"{task.name}: no heat without a forecast: {'; '.join(analysis.notes)}"
+        )
     most = max(shares, key=lambda place: shares[place])
-    told = f"Warm: share of the mean time by the forecast; the bottleneck is {most} with {100 * shares[most]:.0f} %."
+    told = (
+        f"Warm: share of the mean time by the forecast; the bottleneck is {most} with "
+        f"{100 * shares[most]:.0f} %."
+    )
     return Overlay(heat=shares, legend=told)
 
 
 def _graph(name: str) -> str:
-    from coordinator.analysis.commands import graph_command
-    from coordinator.taskfile import load
+    from petrobot.coordinator.analysis.commands import graph_command
+    from petrobot.coordinator.taskfile import load
 
     outcome = graph_command(task_path(name), load)
     if outcome.code:

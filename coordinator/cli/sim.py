@@ -1,11 +1,11 @@
-"""Launch the simulated laboratory on this host (the same as python -m sim)."""
+"""Launch the simulated laboratory on this host (the same as python -m petrobot.sim)."""
 
 from __future__ import annotations
 
 import argparse
 
-from coordinator.cli.becoming import become
-from coordinator.cli.loading import add_services_argument, services_path
+from petrobot.coordinator.cli.becoming import become
+from petrobot.coordinator.cli.loading import add_services_argument, services_path
 
 EXAMPLE = "petrobot sim --services services.toml"
 
@@ -17,4 +17,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Become the laboratory."""
-    become("sim", "--services", str(services_path(options.services)))
+    become("petrobot.sim", "--services", str(services_path(options.services)))

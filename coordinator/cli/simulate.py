@@ -4,23 +4,38 @@ from __future__ import annotations
 
 import argparse
 
-from coordinator.cli.loading import task_path
-from services.comm.quantities import number, whole
+from petrobot.coordinator.cli.loading import task_path
+from petrobot.services.comm.quantities import number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("file", help="a net or task file, or the name of a task that comes with petrobot")
     parser.add_argument(
-        "--rates", metavar="FILE", help="a rates file, or the word unit, for a net without rates of its own"
+        "file", help="a net or task file, or the name of a task that comes with petrobot"
     )
-    parser.add_argument("--replicas", type=whole(), default=1000, metavar="N", help="how often (default: %(default)s)")
     parser.add_argument(
-        "--horizon", type=number(above=0.0), metavar="S", help="simulated seconds; a net that never ends needs it"
+        "--rates",
+        metavar="FILE",
+        help="a rates file, or the word unit, for a net without rates of its own",
     )
-    parser.add_argument("--seed", type=whole(0), default=1, metavar="S", help="default: %(default)s")
+    parser.add_argument(
+        "--replicas",
+        type=whole(),
+        default=1000,
+        metavar="N",
+        help="how often (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--horizon",
+        type=number(above=0.0),
+        metavar="S",
+        help="simulated seconds; a net that never ends needs it",
+    )
+    parser.add_argument(
+        "--seed", type=whole(0), default=1, metavar="S", help="default: %(default)s"
+    )
     parser.add_argument(
         "--what-if",
         "-w",
@@ -29,16 +44,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="CHANGE",
         help="as of `petrobot analyse` (may be repeated)",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the answer as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Simulate."""
     import numpy as np
 
-    from coordinator.analysis.commands import simulate_command
-    from coordinator.cli.analyse import give
-    from coordinator.taskfile import load
+    from petrobot.coordinator.analysis.commands import simulate_command
+    from petrobot.coordinator.cli.analyse import give
+    from petrobot.coordinator.taskfile import load
 
     random = np.random.default_rng(options.seed)
     given = {"rates": options.rates, "replicas": options.replicas, "horizon": options.horizon}

@@ -9,13 +9,13 @@ from collections.abc import Awaitable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
-from coordinator.cli.lockstep import substitutes
-from services.comm.quantities import number
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
+from petrobot.coordinator.cli.lockstep import substitutes
+from petrobot.services.comm.quantities import number
 
 if TYPE_CHECKING:
-    from services.comm.directory import Directory
+    from petrobot.services.comm.directory import Directory
 
 EXAMPLE = "petrobot up --services services.toml"
 
@@ -23,7 +23,12 @@ EXAMPLE = "petrobot up --services services.toml"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     add_services_argument(parser)
-    parser.add_argument("--logs", type=Path, default=Path("runs/logs"), help="folder of the nodes' logs (%(default)s)")
+    parser.add_argument(
+        "--logs",
+        type=Path,
+        default=Path("runs/logs"),
+        help="folder of the nodes' logs (%(default)s)",
+    )
     parser.add_argument(
         "--lockstep",
         action="store_true",
@@ -34,9 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=number(least=0.0),
         default=600.0,
         metavar="S",
-        help="lock step: how long a coordinator that died is waited for (%(default)g s of wall time)",
+        help="lock step: how long a coordinator that died is waited for (%(default)g s of "
+        "wall time)",
     )
-    parser.add_argument("--mock", metavar="FILE", type=Path, help="replace actions by scripted ones")
+    parser.add_argument(
+        "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
+    )
     parser.add_argument("--no-respawn", action="store_true", help="leave a node that died dead")
 
 
@@ -49,8 +57,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 async def _up(directory: Directory, options: argparse.Namespace) -> int:
-    from coordinator.launch import local_programs
-    from coordinator.supervisor import LaunchError, Supervisor
+    from petrobot.coordinator.launch import local_programs
+    from petrobot.coordinator.supervisor import LaunchError, Supervisor
 
     programs = local_programs(
         directory, lockstep=options.lockstep, mock=options.mock, awaited=options.await_coordinator
@@ -60,7 +68,9 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     stop = asyncio.Event()
     for each in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(each, stop.set)
-    respawn = not (options.no_respawn or options.lockstep)  # a member that died has left its cell for good
+    respawn = not (
+        options.no_respawn or options.lockstep
+    )  # a member that died has left its cell for good
     supervisor = Supervisor(programs, options.logs, respawn=respawn, notice=print)
     try:
         async with supervisor:
@@ -75,8 +85,12 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
 
 
 async def _until(stop: asyncio.Event, ended: Awaitable[None] | None) -> None:
-    """Until Ctrl-C, or until all nodes have ended by themselves, as members of a lock-step cell do."""
-    waiting = [asyncio.ensure_future(stop.wait()), *([] if ended is None else [asyncio.ensure_future(ended)])]
+    """Until Ctrl-C, or until all nodes have ended by themselves, as members of a lock-step cell
+    do."""
+    waiting = [
+        asyncio.ensure_future(stop.wait()),
+        *([] if ended is None else [asyncio.ensure_future(ended)]),
+    ]
     _, pending = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
     for task in pending:
         task.cancel()

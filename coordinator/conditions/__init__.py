@@ -1,6 +1,7 @@
-"""Conditions of tasks: the expression language, what can be proved about sets of conditions, and how faults are worded."""
+"""Conditions of tasks: the expression language, what can be proved about sets of conditions, and
+how faults are worded."""
 
-from coordinator.conditions.language import (
+from petrobot.coordinator.conditions.language import (
     And,
     Compare,
     ConditionError,
@@ -15,8 +16,15 @@ from coordinator.conditions.language import (
     rename,
     walk,
 )
-from coordinator.conditions.regions import Answer, Domain, Verdict, covering, exclusive, kind_faults
-from coordinator.conditions.wording import Fault, Severity
+from petrobot.coordinator.conditions.regions import (
+    Answer,
+    Domain,
+    Verdict,
+    covering,
+    exclusive,
+    kind_faults,
+)
+from petrobot.coordinator.conditions.wording import Fault, Severity
 
 __all__ = [
     "And",

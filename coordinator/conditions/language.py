@@ -4,10 +4,12 @@
     conjunction = negation { "and" negation }
     negation    = "not" negation | comparison
     comparison  = operand [ ( "==" | "!=" | "<" | "<=" | ">" | ">=" ) operand ]
-    operand     = number | string | "true" | "false" | "none" | name { "." name } | "(" expression ")"
+    operand     = number | string | "true" | "false" | "none" | name { "." name } | "(" expression
+                ")"
 
-There is no arithmetic, no call and no truth value but true and false: a condition that meets a value of another kind has
-no truth value and says so with `ConditionFault`. Equality is by kind (1 is not true); order is for numbers alone.
+There is no arithmetic, no call and no truth value but true and false: a condition that meets a
+value of another kind has no truth value and says so with `ConditionFault`. Equality is by kind (1
+is not true); order is for numbers alone.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ class ConditionError(ValueError):
 
 
 class ConditionFault(Exception):  # noqa: N818 - not a bug: the values at hand give the condition no truth value
-    """A condition has no truth value for the values at hand (a name was never written, or holds another kind)."""
+    """A condition has no truth value for the values at hand (a name was never written, or holds
+    another kind)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +118,8 @@ class Expression:
         return frozenset(n.name for n in walk(self.tree) if isinstance(n, Name))
 
     def holds(self, values: Mapping[str, Any]) -> bool:
-        """Whether the condition is true for the values. Raises ConditionFault when it has no truth value."""
+        """Whether the condition is true for the values. Raises ConditionFault when it has no truth
+        value."""
         return _truth(_value(self.tree, values), self.tree)
 
     def __str__(self) -> str:
@@ -123,14 +127,17 @@ class Expression:
 
 
 def parse(text: str) -> Expression:
-    """The condition written in the text. Raises ConditionError with the exact position of the fault."""
+    """The condition written in the text. Raises ConditionError with the exact position of the
+    fault."""
     return Expression(text, _Parser(text).whole())
 
 
 def rename(expression: Expression, names: Mapping[str, str]) -> Expression:
     """The same condition with other names in place of those in the mapping."""
     text, end = "", 0
-    for node in sorted((n for n in walk(expression.tree) if isinstance(n, Name)), key=lambda n: n.at):
+    for node in sorted(
+        (n for n in walk(expression.tree) if isinstance(n, Name)), key=lambda n: n.at
+    ):
         text += expression.text[end : node.at] + names.get(node.name, node.name)
         end = node.at + len(node.name)
     return parse(text + expression.text[end:])
@@ -169,7 +176,9 @@ def is_number(value: Any) -> bool:
 def order(left: Any, right: Any, sign: str) -> bool:
     """`left sign right` for two numbers. Raises ConditionFault for anything else."""
     if not (is_number(left) and is_number(right)):
-        raise ConditionFault(f"{left!r} {sign} {right!r} has no truth value: only numbers are ordered")
+        raise ConditionFault(
+            f"{left!r} {sign} {right!r} has no truth value: only numbers are ordered"
+        )
     if sign == "<":
         return bool(left < right)
     if sign == "<=":
@@ -221,7 +230,11 @@ class _Parser:
         tree = self.disjunction()
         kind, text, at = self.tokens[self.next]
         if kind != "end":
-            raise self.fault(f"{text!r} is not expected here (one comparison may not follow another; use and / or)", at)
+            raise self.fault(
+                f"{text!r} is not expected here (one comparison may not follow another; use "
+                "and / or)",
+                at,
+            )
         return tree
 
     def disjunction(self) -> Node:
@@ -268,7 +281,12 @@ class _Parser:
         if text == "(":
             return self.parenthesis(at)
         self.next -= 1
-        raise self.fault("a value or a name is missing" if kind == "end" else f"{text!r} is no value and no name", at)
+        raise self.fault(
+            "a value or a name is missing"
+            if kind == "end"
+            else f"{text!r} is no value and no name",
+            at,
+        )
 
     def number(self, text: str, at: int) -> int | float:
         if len(text) > _DIGITS:
@@ -316,7 +334,14 @@ def _tokens(source: str) -> Iterator[tuple[str, str, int]]:
 
 
 def _explain(sign: str) -> str:
-    hints = {"=": "comparison is written ==", "&": "write and", "|": "write or", "!": "write not, or != to compare"}
+    hints = {
+        "=": "comparison is written ==",
+        "&": "write and",
+        "|": "write or",
+        "!": "write not, or != to compare",
+    }
     if sign in "\"'":
         return "this string is not closed"
-    return f"{sign!r} has no meaning in a condition" + (f" ({hints[sign]})" if sign in hints else "")
+    return f"{sign!r} has no meaning in a condition" + (
+        f" ({hints[sign]})" if sign in hints else ""
+    )

@@ -1,9 +1,11 @@
-"""Which values conditions can meet: kinds of names, and exclusivity and coverage decided by regions of values.
+"""Which values conditions can meet: kinds of names, and exclusivity and coverage decided by regions
+of values.
 
-Conditions only compare. So the values of a name fall into finitely many regions that no condition tells apart (the
-literals and the gaps between them), and trying one value of each region for every name decides a question exactly: the
-small-model property of equality and of (dense or integer) order. Names compared with each other share their regions and
-get as many distinct values in each gap as there are such names.
+Conditions only compare. So the values of a name fall into finitely many regions that no condition
+tells apart (the literals and the gaps between them), and trying one value of each region for every
+name decides a question exactly: the small-model property of equality and of (dense or integer)
+order. Names compared with each other share their regions and get as many distinct values in each
+gap as there are such names.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from itertools import pairwise, product
 from math import ceil, floor, prod
 from typing import Any
 
-from coordinator.conditions.language import (
+from petrobot.coordinator.conditions.language import (
     And,
     Compare,
     ConditionFault,
@@ -28,7 +30,7 @@ from coordinator.conditions.language import (
     is_number,
     walk,
 )
-from coordinator.conditions.wording import nearest
+from petrobot.coordinator.conditions.wording import nearest
 
 LIMIT = 50_000
 """Assignments that are tried before the answer is `UNKNOWN`."""
@@ -36,7 +38,8 @@ LIMIT = 50_000
 
 @dataclass(frozen=True, slots=True)
 class Domain:
-    """What a name can be: kind `bool`, `int`, `float`, `str` or `any`, and the possible values of a `str` if they are few."""
+    """What a name can be: kind `bool`, `int`, `float`, `str` or `any`, and the possible values of a
+    `str` if they are few."""
 
     kind: str
     values: tuple[str, ...] = ()
@@ -61,7 +64,8 @@ class Verdict:
 
 
 def kind_faults(expression: Expression, domains: Mapping[str, Domain]) -> list[str]:
-    """Why the condition could never have a truth value: unknown names and operands of the wrong kind, with positions."""
+    """Why the condition could never have a truth value: unknown names and operands of the wrong
+    kind, with positions."""
     faults: list[str] = []
     kind = _kind(expression.tree, domains, faults)
     if kind not in ("bool", "?"):
@@ -75,11 +79,14 @@ def exclusive(conditions: Sequence[Expression | None], domains: Mapping[str, Dom
 
 
 def covering(conditions: Sequence[Expression | None], domains: Mapping[str, Domain]) -> Verdict:
-    """Whether all values make at least one of the conditions true, once every name has been written."""
+    """Whether all values make at least one of the conditions true, once every name has been
+    written."""
     return _decide(conditions, domains, lambda truths: not any(truths))
 
 
-def _decide(conditions: Sequence[Expression | None], domains: Mapping[str, Domain], bad: Any) -> Verdict:
+def _decide(
+    conditions: Sequence[Expression | None], domains: Mapping[str, Domain], bad: Any
+) -> Verdict:
     real = [c for c in conditions if c is not None]
     choices = _regions(real, domains)
     if prod(len(c) for c in choices.values()) > LIMIT:
@@ -98,7 +105,9 @@ def _holds(condition: Expression, values: Mapping[str, Any]) -> bool:
         return False
 
 
-def _regions(conditions: Iterable[Expression], domains: Mapping[str, Domain]) -> dict[str, list[Any]]:
+def _regions(
+    conditions: Iterable[Expression], domains: Mapping[str, Domain]
+) -> dict[str, list[Any]]:
     """One value of each region, for each name."""
     comparisons = [n for c in conditions for n in walk(c.tree) if isinstance(n, Compare)]
     names = sorted({name for c in conditions for name in c.names})
@@ -150,7 +159,9 @@ def _integers(numbers: Sequence[float], least: int | None, together: int) -> lis
     """Integers at the literals and up to `together` in each gap beside and between them."""
     found: set[int] = {least} if least is not None else set()
     for n in numbers or [0]:
-        found |= {ceil(n) + i for i in range(together + 1)} | {floor(n) - i for i in range(together + 1)}
+        found |= {ceil(n) + i for i in range(together + 1)} | {
+            floor(n) - i for i in range(together + 1)
+        }
     return sorted(n for n in found if least is None or n >= least)
 
 
@@ -170,7 +181,9 @@ def _kind(node: Node, domains: Mapping[str, Domain], faults: list[str]) -> str:
         return _literal_kind(node.value)
     if isinstance(node, Name):
         if node.name not in domains:
-            faults.append(f"{node.name!r} is unknown at column {node.at + 1}{nearest(node.name, domains)}")
+            faults.append(
+                f"{node.name!r} is unknown at column {node.at + 1}{nearest(node.name, domains)}"
+            )
             return "?"
         kind = domains[node.name].kind
         return "number" if kind in ("int", "float") else kind
@@ -180,7 +193,9 @@ def _kind(node: Node, domains: Mapping[str, Domain], faults: list[str]) -> str:
     for part in _operands(node):
         kind = _kind(part, domains, faults)
         if kind not in ("bool", "?"):
-            faults.append(f"the operand at column {part.at + 1} is a {kind}, neither true nor false")
+            faults.append(
+                f"the operand at column {part.at + 1} is a {kind}, neither true nor false"
+            )
     return "bool"
 
 
@@ -205,7 +220,8 @@ def _compare_kinds(node: Compare, domains: Mapping[str, Domain], faults: list[st
             possible = domains[side.name].values
             if possible and other.value not in possible:
                 faults.append(
-                    f"{side.name!r} is never {other.value!r} at column {other.at + 1}{nearest(other.value, possible)}"
+                    f"{side.name!r} is never {other.value!r} at column "
+                    f"{other.at + 1}{nearest(other.value, possible)}"
                 )
 
 

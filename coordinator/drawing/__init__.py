@@ -1,11 +1,12 @@
-"""A task or an ordinary net as a picture: SVG text, readable in light and dark, error branches folded unless asked for."""
+"""A task or an ordinary net as a picture: SVG text, readable in light and dark, error branches
+folded unless asked for."""
 
 from __future__ import annotations
 
-from coordinator.drawing.scene import Overlay, scene_of_net, scene_of_task
-from coordinator.drawing.svg import render
-from coordinator.net import Marking, Net
-from coordinator.task import Task
+from petrobot.coordinator.drawing.scene import Overlay, scene_of_net, scene_of_task
+from petrobot.coordinator.drawing.svg import render
+from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.task import Task
 
 __all__ = ["Overlay", "draw"]
 
@@ -21,10 +22,10 @@ def draw(
 ) -> str:
     """SVG of the model.
 
-    A task is drawn as its file has it: macro places stay folded, and so do error branches unless `error_branches`; a
-    badge on a place counts its hidden exits. `marking` (of `Task.net`, or of the net) replaces the initial tokens; `overlay`
-    colours nodes and numbers the firings of a path. `inside` opens a macro place, named as in the flat task: ValueError if
-    there is none.
+    A task is drawn as its file has it: macro places stay folded, and so do error branches unless
+    `error_branches`; a badge on a place counts its hidden exits. `marking` (of `Task.net`, or of
+    the net) replaces the initial tokens; `overlay` colours nodes and numbers the firings of a path.
+    `inside` opens a macro place, named as in the flat task: ValueError if there is none.
     """
     scene = (
         scene_of_net(model, marking, title)

@@ -1,7 +1,8 @@
-"""Layers along the flow of tokens: circles cut, every node in a column, arcs as steps from column to column.
+"""Layers along the flow of tokens: circles cut, every node in a column, arcs as steps from column
+to column.
 
-The method is that of Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981): an arc over several columns is led by a way point
-in each column between, which takes part in the ordering like a node.
+The method is that of Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981): an arc over several
+columns is led by a way point in each column between, which takes part in the ordering like a node.
 """
 
 from __future__ import annotations
@@ -28,9 +29,13 @@ class Layers:
 
     def __init__(self, names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> None:
         kept = set(without_circles(names, edges, sources))
-        self.forward = [(a, b) if (a, b) in kept else (b, a) for a, b in dict.fromkeys(edges) if a != b]
+        self.forward = [
+            (a, b) if (a, b) in kept else (b, a) for a, b in dict.fromkeys(edges) if a != b
+        ]
         self.column = _columns(names, self.forward)
-        self.columns: list[list[Spot]] = [[] for _ in range(max(self.column.values(), default=0) + 1)]
+        self.columns: list[list[Spot]] = [
+            [] for _ in range(max(self.column.values(), default=0) + 1)
+        ]
         self.next: dict[Spot, list[Spot]] = {}
         self.before: dict[Spot, list[Spot]] = {}
         for name in names:
@@ -80,15 +85,21 @@ class Layers:
         self.columns = best
 
     def _sweep(self, forward: bool) -> None:
-        """Sort by the mean of neighbours, column by column, then exchange neighbours where that helps."""
-        inward, columns = (self.before, self.columns[1:]) if forward else (self.next, self.columns[-2::-1])
+        """Sort by the mean of neighbours, column by column, then exchange neighbours where that
+        helps."""
+        inward, columns = (
+            (self.before, self.columns[1:]) if forward else (self.next, self.columns[-2::-1])
+        )
         for column in columns:
             self._sort(column, inward)
         self._exchange()
 
     def _sort(self, column: list[Spot], inward: Mapping[Spot, Sequence[Spot]]) -> None:
         row = self._rows()
-        mean = {s: sum(row[n] for n in inward[s]) / len(inward[s]) if inward[s] else row[s] for s in column}
+        mean = {
+            s: sum(row[n] for n in inward[s]) / len(inward[s]) if inward[s] else row[s]
+            for s in column
+        }
         column.sort(key=lambda s: mean[s])
 
     def _exchange(self) -> None:
@@ -132,8 +143,11 @@ class Layers:
         return total
 
 
-def without_circles(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> list[Edge]:
-    """The edges without those that lead back to a node on the way (depth first, without recursion)."""
+def without_circles(
+    names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
+) -> list[Edge]:
+    """The edges without those that lead back to a node on the way (depth first, without
+    recursion)."""
     following: dict[str, list[str]] = {n: [] for n in names}
     for a, b in edges:
         following[a].append(b)
@@ -159,7 +173,8 @@ def without_circles(names: Sequence[str], edges: Sequence[Edge], sources: Sequen
 
 
 def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
-    """Columns by the longest way from the beginnings, then each node as near to its neighbours as it can be."""
+    """Columns by the longest way from the beginnings, then each node as near to its neighbours as
+    it can be."""
     before: dict[str, list[str]] = {n: [] for n in names}
     after: dict[str, list[str]] = {n: [] for n in names}
     for a, b in edges:

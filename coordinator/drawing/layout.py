@@ -1,4 +1,5 @@
-"""Where the nodes stand: given positions are kept, missing ones come from layers along the flow of tokens."""
+"""Where the nodes stand: given positions are kept, missing ones come from layers along the flow of
+tokens."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from coordinator.drawing.layers import Edge, Layers, Spot
+from petrobot.coordinator.drawing.layers import Edge, Layers, Spot
 
 Point = tuple[float, float]
 
@@ -17,7 +18,8 @@ _BESIDE_NODE = 58.0
 _BESIDE_ARC = 24.0
 _SETTLINGS = 20
 _STRAIGHT = (1.0, 3.0, 9.0)
-"""How much a step wants to be level: between nodes, from a node to a way point, between way points."""
+"""How much a step wants to be level: between nodes, from a node to a way point, between way
+points."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +30,11 @@ class Layout:
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
 
 
-def lay_out(wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]) -> Layout:
-    """A position for every node. `sources` are the nodes from which the flow begins (the marked places)."""
+def lay_out(
+    wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]
+) -> Layout:
+    """A position for every node. `sources` are the nodes from which the flow begins (the marked
+    places)."""
     given = {name: at for name, at in wanted.items() if at is not None}
     if len(given) == len(wanted):
         return Layout(given)
@@ -38,13 +43,23 @@ def lay_out(wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: 
     return _layered(list(wanted), edges, sources)
 
 
-def _fill_in(names: Sequence[str], given: Mapping[str, Point], edges: Sequence[Edge]) -> dict[str, Point]:
+def _fill_in(
+    names: Sequence[str], given: Mapping[str, Point], edges: Sequence[Edge]
+) -> dict[str, Point]:
     """The missing nodes near their neighbours, each at the next free spot."""
     at = dict(given)
     for name in names:
         if name not in at:
-            near = [at[b if a == name else a] for a, b in edges if name in (a, b) and (b if a == name else a) in at]
-            centre = _mean(near) if near else (MARGIN, max((y for _, y in at.values()), default=0.0) + ROW)
+            near = [
+                at[b if a == name else a]
+                for a, b in edges
+                if name in (a, b) and (b if a == name else a) in at
+            ]
+            centre = (
+                _mean(near)
+                if near
+                else (MARGIN, max((y for _, y in at.values()), default=0.0) + ROW)
+            )
             at[name] = _free_spot(centre, list(at.values()))
     return at
 
@@ -59,7 +74,11 @@ def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
             for dy in range(-ring, ring + 1)
             if max(abs(dx), abs(dy)) == ring
         ]
-        free = [s for s in spots if all(abs(s[0] - x) >= COLUMN * 0.7 or abs(s[1] - y) >= ROW * 0.7 for x, y in taken)]
+        free = [
+            s
+            for s in spots
+            if all(abs(s[0] - x) >= COLUMN * 0.7 or abs(s[1] - y) >= ROW * 0.7 for x, y in taken)
+        ]
         if free:
             return min(free, key=lambda s: (s[0] - centre[0]) ** 2 + (s[1] - centre[1]) ** 2)
         ring += 1
@@ -75,12 +94,17 @@ def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
 
     return Layout(
         {name: at(name, layers.column[name]) for name in names},
-        {(a, b): [at(p, p[2]) for p in layers.way(a, b)] for a, b in edges if all(p in row for p in layers.way(a, b))},
+        {
+            (a, b): [at(p, p[2]) for p in layers.way(a, b)]
+            for a, b in edges
+            if all(p in row for p in layers.way(a, b))
+        },
     )
 
 
 def _settled(layers: Layers) -> dict[Spot, float]:
-    """Heights: every spot as level with its neighbours as its distance from those above and below it allows."""
+    """Heights: every spot as level with its neighbours as its distance from those above and below
+    it allows."""
     row: dict[Spot, float] = {}
     for column in layers.columns:
         heights = [0.0]
@@ -110,7 +134,8 @@ def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float,
 
 
 def _spaced(column: Sequence[Spot], wishes: Sequence[tuple[float, float]]) -> list[float]:
-    """The heights nearest to the wishes (least squares) that keep distance: pooled adjacent violators on shifted wishes."""
+    """The heights nearest to the wishes (least squares) that keep distance: pooled adjacent
+    violators on shifted wishes."""
     offset = [0.0]
     for above, below in pairwise(column):
         offset.append(offset[-1] + _apart(above, below))

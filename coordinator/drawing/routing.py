@@ -1,4 +1,5 @@
-"""Ways of arcs around nodes, and places for words that cover neither nodes nor arcs nor each other."""
+"""Ways of arcs around nodes, and places for words that cover neither nodes nor arcs nor each
+other."""
 
 from __future__ import annotations
 
@@ -9,8 +10,8 @@ from functools import partial
 from itertools import pairwise
 from math import hypot, inf
 
-from coordinator.drawing.layout import Point
-from coordinator.drawing.scene import RADIUS, Arc, Node, Scene
+from petrobot.coordinator.drawing.layout import Point
+from petrobot.coordinator.drawing.scene import RADIUS, Arc, Node, Scene
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom."""
@@ -48,7 +49,9 @@ class Way:
     def pieces(self, end: Point | None = None) -> list[tuple[Point, Point, Point]]:
         """Its quadratic pieces: start, control and end of each."""
         knots = [((a[0] + b[0]) / 2, (a[1] + b[1]) / 2) for a, b in pairwise(self.controls)]
-        return list(zip([self.start, *knots], self.controls, [*knots, end or self.end], strict=True))
+        return list(
+            zip([self.start, *knots], self.controls, [*knots, end or self.end], strict=True)
+        )
 
     def point(self, s: float) -> Point:
         """The point at s, 0 at the start and 1 at the end."""
@@ -78,7 +81,8 @@ class Words:
 
 
 def route(scene: Scene) -> list[Way]:
-    """A way for each arc: as the layout leads it, else the least bent one that passes other nodes and ways of its two ends."""
+    """A way for each arc: as the layout leads it, else the least bent one that passes other nodes
+    and ways of its two ends."""
     arcs = scene.arcs
     pairs: dict[frozenset[str], set[float]] = {}
     count = Counter(frozenset((a.source, a.target)) for a in arcs)
@@ -94,15 +98,25 @@ def route(scene: Scene) -> list[Way]:
 
 
 def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> Way:
-    """The way of least cost; the candidates come least bent first, so that the search ends as soon as none can be better."""
+    """The way of least cost; the candidates come least bent first, so that the search ends as soon
+    as none can be better."""
     led = scene.through.get((arc.source, arc.target), ())
     best, least = None, inf
-    candidates = [(0.0, partial(_led, points=led)), (0.5, partial(_led, points=led, level=_LEVEL))] if led else []
-    for cost_at_least, make in [*candidates, *((abs(bend), partial(_way, bend=bend)) for bend in _BENDS)]:
+    candidates = (
+        [(0.0, partial(_led, points=led)), (0.5, partial(_led, points=led, level=_LEVEL))]
+        if led
+        else []
+    )
+    for cost_at_least, make in [
+        *candidates,
+        *((abs(bend), partial(_way, bend=bend)) for bend in _BENDS),
+    ]:
         if best is not None and least <= cost_at_least:
             break
         way = make(scene.nodes, arc)
-        cost = _cost(scene.nodes, way, used, twins) + (cost_at_least if len(way.controls) > 1 else 0.0)
+        cost = _cost(scene.nodes, way, used, twins) + (
+            cost_at_least if len(way.controls) > 1 else 0.0
+        )
         if best is None or cost < least:
             best, least = way, cost
     assert best is not None
@@ -118,9 +132,11 @@ def _way(nodes: Mapping[str, Node], arc: Arc, bend: float) -> Way:
 
 
 def _led(nodes: Mapping[str, Node], arc: Arc, points: Sequence[Point], level: float = 0.0) -> Way:
-    """The way by the layout's points; what lies on a line between its neighbours is left out, so that straight is straight.
+    """The way by the layout's points; what lies on a line between its neighbours is left out, so
+    that straight is straight.
 
-    With `level` it runs level for so long on both sides of each point, and cuts no corner over what stands beside it.
+    With `level` it runs level for so long on both sides of each point, and cuts no corner over what
+    stands beside it.
     """
     if level:
         step = level if nodes[arc.target].at[0] > nodes[arc.source].at[0] else -level
@@ -154,7 +170,11 @@ def _cost(nodes: Mapping[str, Node], way: Way, used: set[float], twins: bool) ->
     points = way.points
     left, right = min(x for x, _ in points) - _REACH, max(x for x, _ in points) + _REACH
     top, bottom = min(y for _, y in points) - _REACH, max(y for _, y in points) + _REACH
-    near = [n for n in nodes.values() if left < n.at[0] < right and top < n.at[1] < bottom and n.name not in ends]
+    near = [
+        n
+        for n in nodes.values()
+        if left < n.at[0] < right and top < n.at[1] < bottom and n.name not in ends
+    ]
     hits = sum(any(_near(node, p) for p in points) for node in near)
     sense = 1.0 if way.arc.source < way.arc.target else -1.0
     alone = len(way.controls) == 1
@@ -168,11 +188,14 @@ def _near(node: Node, p: Point) -> bool:
 
 
 def place_words(nodes: Mapping[str, Node], ways: Sequence[Way]) -> list[Words]:
-    """Words beside each node where they cover least: nodes and other words count most, then arcs."""
+    """Words beside each node where they cover least: nodes and other words count most, then
+    arcs."""
     solid = [_around(n) for n in nodes.values()]
     curves = [w.points for w in ways]
     placed: list[Words] = []
-    for node in sorted(nodes.values(), key=lambda n: (not n.is_place, -max(map(len, n.lines), default=0))):
+    for node in sorted(
+        nodes.values(), key=lambda n: (not n.is_place, -max(map(len, n.lines), default=0))
+    ):
         region = _region(node)
         others = [b for b in solid if _touch(b, region) and b != _around(node)]
         others += [w.box for w in placed if _touch(w.box, region)]
@@ -200,10 +223,16 @@ def _holds(box: Box, p: Point) -> bool:
 
 def badge_spot(node: Node, ways: Sequence[Way]) -> Point:
     """The corner of a place that is farthest from the ends of its arcs."""
-    ends = [w.start for w in ways if w.arc.source == node.name] + [w.end for w in ways if w.arc.target == node.name]
+    ends = [w.start for w in ways if w.arc.source == node.name] + [
+        w.end for w in ways if w.arc.target == node.name
+    ]
     reach = RADIUS * 0.8
-    corners = [(node.at[0] + sx * reach, node.at[1] + sy * reach) for sy in (-1, 1) for sx in (1, -1)]
-    return max(corners, key=lambda c: min((hypot(c[0] - x, c[1] - y) for x, y in ends), default=0.0) // 4)
+    corners = [
+        (node.at[0] + sx * reach, node.at[1] + sy * reach) for sy in (-1, 1) for sx in (1, -1)
+    ]
+    return max(
+        corners, key=lambda c: min((hypot(c[0] - x, c[1] - y) for x, y in ends), default=0.0) // 4
+    )
 
 
 def text_width(text: str) -> float:

@@ -1,17 +1,18 @@
-"""What there is to draw: nodes with their words, arcs with their ends, before anything has a place on the paper."""
+"""What there is to draw: nodes with their words, arcs with their ends, before anything has a place
+on the paper."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from coordinator.conditions.wording import listed
-from coordinator.drawing.layers import Edge
-from coordinator.drawing.layout import Point, lay_out
-from coordinator.drawing.sheet import Sheet, sheet_of
-from coordinator.net import Marking, Net
-from coordinator.task import End, Kind, Place, Scope, Task, Transition
-from coordinator.task.macros import macros_around
+from petrobot.coordinator.conditions.wording import listed
+from petrobot.coordinator.drawing.layers import Edge
+from petrobot.coordinator.drawing.layout import Point, lay_out
+from petrobot.coordinator.drawing.sheet import Sheet, sheet_of
+from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
+from petrobot.coordinator.task.macros import macros_around
 
 RADIUS = 21.0
 BAR = (4.0, 21.0)
@@ -22,7 +23,8 @@ TURNS = 4
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A place or a transition. `style` are its CSS classes; `lines` stand beside it, `hint` is its tooltip."""
+    """A place or a transition. `style` are its CSS classes; `lines` stand beside it, `hint` is its
+    tooltip."""
 
     name: str
     is_place: bool
@@ -50,16 +52,20 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """What is told over a drawing: a halo for each place or transition (0 to 1), and a path of firings, numbered."""
+    """What is told over a drawing: a halo for each place or transition (0 to 1), and a path of
+    firings, numbered."""
 
     heat: Mapping[str, float] = field(default_factory=dict)
     path: Sequence[str] = ()
     legend: str = ""
 
     def on(self, node: Node, shown: Mapping[str, str]) -> Node:
-        """The node with what is told of it; what lies inside a macro place (by `shown`) is told of that place."""
+        """The node with what is told of it; what lies inside a macro place (by `shown`) is told of
+        that place."""
         heat = [h for name, h in self.heat.items() if node.name == shown.get(name, name)]
-        turns = [str(i) for i, name in enumerate(self.path, 1) if node.name == shown.get(name, name)]
+        turns = [
+            str(i) for i, name in enumerate(self.path, 1) if node.name == shown.get(name, name)
+        ]
         if not heat and not turns:
             return node
         share = min(1.0, sum(heat)) if heat else None
@@ -102,12 +108,17 @@ class Scene:
 def scene_of_task(
     task: Task, error_branches: bool, marking: Marking | None, title: str | None, inside: str = ""
 ) -> Scene:
-    """The scene of a task as its file has it, or of the inside of a macro place. Raises ValueError when there is none."""
+    """The scene of a task as its file has it, or of the inside of a macro place. Raises ValueError
+    when there is none."""
     sheet = sheet_of(task, inside, error_branches, marking)
     arcs = tuple(_joined_arcs(sheet))
     drawn: dict[str, Place | Transition] = {**sheet.places, **sheet.transitions}
     wanted = {n: _given(e.x, e.y) if n not in sheet.border else None for n, e in drawn.items()}
-    layout = lay_out(wanted, [(a.source, a.target) for a in arcs], [n for n in sheet.places if sheet.tokens.get(n)])
+    layout = lay_out(
+        wanted,
+        [(a.source, a.target) for a in arcs],
+        [n for n in sheet.places if sheet.tokens.get(n)],
+    )
     at = layout.at
     nodes = {n: _place_node(sheet, p, at[n]) for n, p in sheet.places.items()}
     nodes |= {n: _transition_node(sheet, t, at, arcs) for n, t in sheet.transitions.items()}
@@ -127,7 +138,10 @@ def _elsewhere(sheet: Sheet) -> dict[str, str]:
     net = sheet.task
     shown = {sheet.prefix + name: here for name, here in sheet.shown.items()}
     for name, t in net.flat.transitions.items():
-        around = next((m for m in macros_around(t.macro, net.places) if m in sheet.places), name.partition(".")[0])
+        around = next(
+            (m for m in macros_around(t.macro, net.places) if m in sheet.places),
+            name.partition(".")[0],
+        )
         shown[sheet.prefix + name] = name if name in sheet.transitions else around
     for name in net.flat.places:
         head = name.partition(".")[0]
@@ -145,7 +159,9 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
     tokens = marking or net.initial
     wanted: dict[str, Point | None] = dict.fromkeys((*net.places, *net.transitions))
     layout = lay_out(
-        wanted, [(a.source, a.target) for a in arcs], [p for p, n in zip(net.places, tokens, strict=True) if n]
+        wanted,
+        [(a.source, a.target) for a in arcs],
+        [p for p, n in zip(net.places, tokens, strict=True) if n],
     )
     at = layout.at
     nodes = {
@@ -153,7 +169,9 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
         for p, n in zip(net.places, tokens, strict=True)
     }
     nodes |= {
-        t: Node(t, False, at[t], "transition", (t,), f"transition {t}", upright=_upright(t, at, arcs))
+        t: Node(
+            t, False, at[t], "transition", (t,), f"transition {t}", upright=_upright(t, at, arcs)
+        )
         for t in net.transitions
     }
     return Scene(title or "Petri net", net.describe(tokens), nodes, tuple(arcs), layout.through)
@@ -164,7 +182,8 @@ def _given(x: float | None, y: float | None) -> Point | None:
 
 
 def _joined_arcs(sheet: Sheet) -> Iterable[Arc]:
-    """The sheet's arcs; those that end in one macro place in the same way are drawn as one, with their weights summed."""
+    """The sheet's arcs; those that end in one macro place in the same way are drawn as one, with
+    their weights summed."""
     joined: dict[tuple[str, str, str], Arc] = {}
     for t in sheet.transitions.values():
         for arc in _task_arcs(sheet, t):
@@ -179,7 +198,13 @@ def _task_arcs(sheet: Sheet, t: Transition) -> Iterable[Arc]:
     shown = sheet.shown
     for a in t.inputs:
         if a.place in shown:
-            yield Arc(shown[a.place], t.name, a.weight, a.end.value if a.end is not None else "plain", style)
+            yield Arc(
+                shown[a.place],
+                t.name,
+                a.weight,
+                a.end.value if a.end is not None else "plain",
+                style,
+            )
     for i in t.inhibitors:
         if i.place in shown:
             yield Arc(shown[i.place], t.name, i.threshold, "inhibitor", style)
@@ -191,13 +216,17 @@ def _task_arcs(sheet: Sheet, t: Transition) -> Iterable[Arc]:
 def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
     task = sheet.task
     exits = [task.transitions[t] for t in sheet.folded & set(task.transitions)]
-    inside = {n for n in task.places if p.name in (n, *macros_around(task.places[n].macro, task.places))}
+    inside = {
+        n for n in task.places if p.name in (n, *macros_around(task.places[n].macro, task.places))
+    }
     hidden = sum(t.macro not in inside and any(a.place in inside for a in t.inputs) for t in exits)
     what = {
         Kind.ACTION: f"action place, primitive task {p.task}",
         Kind.RESOURCE: "resource place",
         Kind.CONTROL: "control place: the operator may change its tokens",
-        Kind.MACRO: f"macro place, subnet {p.subnet}" if p.subnet else f"macro place of {listed(inside - {p.name})}",
+        Kind.MACRO: f"macro place, subnet {p.subnet}"
+        if p.subnet
+        else f"macro place of {listed(inside - {p.name})}",
     }[p.kind]
     lines = [p.label or p.name]
     if p.kind is Kind.ACTION and p.task != p.name:
@@ -208,7 +237,9 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
     return Node(p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden)
 
 
-def _transition_node(sheet: Sheet, t: Transition, at: Mapping[str, Point], arcs: Iterable[Arc]) -> Node:
+def _transition_node(
+    sheet: Sheet, t: Transition, at: Mapping[str, Point], arcs: Iterable[Arc]
+) -> Node:
     task = sheet.task
     style = "transition" + (" error" if t.name in task.error_elements else "")
     style += " outside" if t.name in sheet.border else ""
@@ -217,11 +248,20 @@ def _transition_node(sheet: Sheet, t: Transition, at: Mapping[str, Point], arcs:
         hint += f", priority {t.priority}"
     if t.weight is not None:
         hint += f", weight {t.weight:g}"
-    return Node(t.name, False, at[t.name], style, event_lines(task, t), hint, upright=_upright(t.name, at, arcs))
+    return Node(
+        t.name,
+        False,
+        at[t.name],
+        style,
+        event_lines(task, t),
+        hint,
+        upright=_upright(t.name, at, arcs),
+    )
 
 
 def event_lines(task: Task, t: Transition) -> tuple[str, ...]:
-    """The words at a transition: what must happen, with the prefixes int and ext of the paper's figures."""
+    """The words at a transition: what must happen, with the prefixes int and ext of the paper's
+    figures."""
     lines: list[str] = []
     for name in t.events:
         lines.append(f"{'ext' if task.events[name].scope is Scope.EXTERNAL else 'int'} {name}")

@@ -6,9 +6,17 @@ from collections.abc import Iterator, Sequence
 from math import atan2, cos, hypot, sin
 from xml.sax.saxutils import escape
 
-from coordinator.drawing.layout import Point
-from coordinator.drawing.routing import FONT, LINE, Way, Words, badge_spot, place_words, route
-from coordinator.drawing.scene import RADIUS, Node, Scene
+from petrobot.coordinator.drawing.layout import Point
+from petrobot.coordinator.drawing.routing import (
+    FONT,
+    LINE,
+    Way,
+    Words,
+    badge_spot,
+    place_words,
+    route,
+)
+from petrobot.coordinator.drawing.scene import RADIUS, Node, Scene
 
 _MARGIN = 24.0
 _DOTS: dict[int, tuple[Point, ...]] = {
@@ -95,7 +103,9 @@ def render(scene: Scene) -> str:
     lines += [line for w in words for line in _words(w)]
     lines += [line for way in ways if way.arc.weight > 1 for line in _weight(way)]
     if scene.legend:
-        lines += _text(scene.legend, left + _MARGIN / 2, top + height - _MARGIN / 2, "start", "legend")
+        lines += _text(
+            scene.legend, left + _MARGIN / 2, top + height - _MARGIN / 2, "start", "legend"
+        )
     return "\n".join([*lines, "</svg>", ""])
 
 
@@ -106,7 +116,9 @@ def _description(scene: Scene) -> str:
     return f"{scene.text}. {count}. Tokens: {marked or 'none'}."
 
 
-def _frame(scene: Scene, ways: Sequence[Way], words: Sequence[Words]) -> tuple[float, float, float, float]:
+def _frame(
+    scene: Scene, ways: Sequence[Way], words: Sequence[Words]
+) -> tuple[float, float, float, float]:
     """Left, top, width and height that hold everything."""
     points = [
         (n.at[0] + sx * (n.half[0] + 8), n.at[1] + sy * (n.half[1] + 8))
@@ -129,11 +141,17 @@ def _node(node: Node, badge: Point) -> Iterator[str]:
         yield f'<circle class="{node.style}" cx="{x:g}" cy="{y:g}" r="{RADIUS:g}"/>'
         if "action" in node.style.split() or "macro" in node.style.split():
             ring = "ring" if "action" in node.style.split() else node.style
-            yield f'<circle class="{ring}" style="fill:none" cx="{x:g}" cy="{y:g}" r="{RADIUS - 4:g}"/>'
+            yield (
+                f'<circle class="{ring}" style="fill:none" cx="{x:g}" cy="{y:g}" '
+                f'r="{RADIUS - 4:g}"/>'
+            )
         yield from _tokens(node)
         yield from _badge(node, badge)
     else:
-        yield f'<rect class="{node.style}" x="{x - w:g}" y="{y - h:g}" width="{2 * w:g}" height="{2 * h:g}" rx="1"/>'
+        yield (
+            f'<rect class="{node.style}" x="{x - w:g}" y="{y - h:g}" width="{2 * w:g}" '
+            f'height="{2 * h:g}" rx="1"/>'
+        )
     yield "</g>"
 
 
@@ -143,16 +161,25 @@ def _told(node: Node) -> Iterator[str]:
     if node.heat is not None:
         shape = f'width="{2 * w + 20:g}" height="{2 * h + 20:g}" rx="{w + 10:g}"'
         opacity = 0.06 + 0.84 * node.heat
-        yield f'<rect class="warm" fill-opacity="{opacity:.2f}" x="{x - w - 10:g}" y="{y - h - 10:g}" {shape}/>'
+        yield (
+            f'<rect class="warm" fill-opacity="{opacity:.2f}" x="{x - w - 10:g}" '
+            f'y="{y - h - 10:g}" {shape}/>'
+        )
     if node.turns:
-        yield f'<rect class="fired" x="{x - w - 4:g}" y="{y - h - 4:g}" width="{2 * w + 8:g}" height="{2 * h + 8:g}" rx="5"/>'
+        yield (
+            f'<rect class="fired" x="{x - w - 4:g}" y="{y - h - 4:g}" '
+            f'width="{2 * w + 8:g}" height="{2 * h + 8:g}" rx="5"/>'
+        )
         yield from _text(node.turns, x + w + 8, y - h - 4, "start", "turn")
 
 
 def _tokens(node: Node) -> Iterator[str]:
     x, y = node.at
     if node.tokens > 4:
-        yield f'<text class="count" x="{x:g}" y="{y + 4.5:g}" text-anchor="middle">{node.tokens}</text>'
+        yield (
+            f'<text class="count" x="{x:g}" y="{y + 4.5:g}" '
+            f'text-anchor="middle">{node.tokens}</text>'
+        )
         return
     for dx, dy in _DOTS.get(node.tokens, ()):
         yield f'<circle class="token" cx="{x + dx:g}" cy="{y + dy:g}" r="4.2"/>'
@@ -163,7 +190,10 @@ def _badge(node: Node, spot: Point) -> Iterator[str]:
         x, y = spot
         what = f"{node.hidden} error exit{'s' * (node.hidden > 1)} hidden"
         yield f'<g><title>{what}</title><circle class="badge" cx="{x:g}" cy="{y:g}" r="7.5"/>'
-        yield f'<text class="badge-text" x="{x:g}" y="{y + 3.5:g}" text-anchor="middle">{node.hidden}</text></g>'
+        yield (
+            f'<text class="badge-text" x="{x:g}" y="{y + 3.5:g}" '
+            f'text-anchor="middle">{node.hidden}</text></g>'
+        )
 
 
 def _arc(way: Way) -> Iterator[str]:
@@ -178,7 +208,9 @@ def _arc(way: Way) -> Iterator[str]:
         bx, by = x2 - 4.5 * cos(direction), y2 - 4.5 * sin(direction)
         yield f'<circle class="bar {style}" cx="{bx:.1f}" cy="{by:.1f}" r="4.5"/>'
         return
-    wings = [(x2 - 10 * cos(direction + s * 0.4), y2 - 10 * sin(direction + s * 0.4)) for s in (-1, 1)]
+    wings = [
+        (x2 - 10 * cos(direction + s * 0.4), y2 - 10 * sin(direction + s * 0.4)) for s in (-1, 1)
+    ]
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in ((x2, y2), *wings))
     yield f'<polygon class="head {style}" points="{points}"/>'
 
@@ -203,7 +235,8 @@ def _weight(way: Way) -> Iterator[str]:
 
 
 def _text(text: str, x: float, y: float, anchor: str, style: str) -> Iterator[str]:
-    """A text on a halo of the page's colour (two elements: not every renderer knows paint-order)."""
+    """A text on a halo of the page's colour (two elements: not every renderer knows
+    paint-order)."""
     where = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
     yield f'<text class="halo {style}" aria-hidden="true" {where}>{escape(text)}</text>'
     yield f'<text class="{style}" {where}>{escape(text)}</text>'

@@ -1,7 +1,8 @@
-"""The interpreted net as a pure machine: stimulus in, instructions out. Its semantics stand in docs/semantics.md."""
+"""The interpreted net as a pure machine: stimulus in, instructions out. Its semantics stand in
+docs/semantics.md."""
 
-from coordinator.conditions.wording import Severity
-from coordinator.engine.instructions import (
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine.instructions import (
     ORDERS,
     ArmTimer,
     CancelRun,
@@ -23,17 +24,17 @@ from coordinator.engine.instructions import (
     StartRun,
     Subject,
 )
-from coordinator.engine.machine import Engine
-from coordinator.engine.plain import (
+from petrobot.coordinator.engine.machine import Engine
+from petrobot.coordinator.engine.plain import (
     instruction_from_plain,
     point_from_plain,
     state_from_plain,
     stimulus_from_plain,
     to_plain,
 )
-from coordinator.engine.state import Mode, Phase, Run, State, Timer
-from coordinator.engine.step import Policy
-from coordinator.engine.stimuli import (
+from petrobot.coordinator.engine.state import Mode, Phase, Run, State, Timer
+from petrobot.coordinator.engine.step import Policy
+from petrobot.coordinator.engine.stimuli import (
     OPERATOR,
     Abort,
     AddTokens,

@@ -1,4 +1,5 @@
-"""A task made ready for execution: places and transitions by index, and who has to be looked at when what has changed."""
+"""A task made ready for execution: places and transitions by index, and who has to be looked at
+when what has changed."""
 
 from __future__ import annotations
 
@@ -6,14 +7,26 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.conditions import Expression
-from coordinator.net import Arcs, Net
-from coordinator.task import Counts, Early, End, Event, Input, Kind, PrimitiveTask, Scope, Task, Transition
-from coordinator.task.consistency import faults, is_pulse
-from coordinator.task.timeless import endless
+from petrobot.coordinator.conditions import Expression
+from petrobot.coordinator.net import Arcs, Net
+from petrobot.coordinator.task import (
+    Counts,
+    Early,
+    End,
+    Event,
+    Input,
+    Kind,
+    PrimitiveTask,
+    Scope,
+    Task,
+    Transition,
+)
+from petrobot.coordinator.task.consistency import faults, is_pulse
+from petrobot.coordinator.task.timeless import endless
 
 FIRINGS_OF_A_FINITE_NET: Final = 1_000_000
-"""Firings without a stimulus of a net that must come to an end by itself: no laboratory has so many tokens; half a minute."""
+"""Firings without a stimulus of a net that must come to an end by itself: no laboratory has so many
+tokens; half a minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +39,8 @@ class ActionArc:
     end: End
     counts: Counts
     takes_done: bool
-    """A preempt arc of declared higher priority also takes a run that has ended but whose token is still there."""
+    """A preempt arc of declared higher priority also takes a run that has ended but whose token is
+    still there."""
     raised: tuple[str, ...]
     """Internal events that the run taken must have raised."""
 
@@ -92,16 +106,26 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
     """The compiled form. Raises ValueError with all faults when the description is inconsistent."""
     found = faults(task)
     if found:
-        raise ValueError(f"task {task.name!r} cannot be executed:\n" + "\n".join(f"  {f}" for f in found))
+        raise ValueError(
+            f"task {task.name!r} cannot be executed:\n" + "\n".join(f"  {f}" for f in found)
+        )
     flat, net = task.flat, task.net
     exits = tuple(_exit(flat, net, t) for t in flat.transitions.values())
-    touching = tuple(tuple(x.index for x in exits if _touches(x, p)) for p in range(len(net.places)))
+    touching = tuple(
+        tuple(x.index for x in exits if _touches(x, p)) for p in range(len(net.places))
+    )
     return Compiled(
         task=flat,
         net=net,
         exits=exits,
-        action_places={p.name: net.place_index[p.name] for p in flat.places.values() if p.kind is Kind.ACTION},
-        primitives={p.name: flat.primitive_tasks[p.task] for p in flat.places.values() if p.kind is Kind.ACTION},
+        action_places={
+            p.name: net.place_index[p.name] for p in flat.places.values() if p.kind is Kind.ACTION
+        },
+        primitives={
+            p.name: flat.primitive_tasks[p.task]
+            for p in flat.places.values()
+            if p.kind is Kind.ACTION
+        },
         touching=touching,
         timed=tuple(tuple(t for t in ts if exits[t].after is not None) for ts in touching),
         reading=_index((x.index, sorted(x.when.names)) for x in exits if x.when is not None),
@@ -113,8 +137,9 @@ def compile_task(task: Task, devices: Mapping[str, str]) -> Compiled:
 
 
 def _firing_limit(flat: Task, net: Net) -> int:
-    """A net whose firings must come to an end may take its time; one that might go on for ever gets what each of its
-    transitions could do once with every token that it has at the beginning, or that one firing makes."""
+    """A net whose firings must come to an end may take its time; one that might go on for ever gets
+    what each of its transitions could do once with every token that it has at the beginning, or
+    that one firing makes."""
     if not endless(flat):
         return FIRINGS_OF_A_FINITE_NET
     tokens = sum(net.initial) + sum(weight for arcs in net.produce for _, weight in arcs)
@@ -141,7 +166,9 @@ def _touches(x: Exit, place: int) -> bool:
 def _exit(task: Task, net: Net, t: Transition) -> Exit:
     index = net.transition_index[t.name]
     events = [task.events[e] for e in t.events]
-    actions = tuple(_action_arc(task, net, t, a, a.end, events) for a in t.inputs if a.end is not None)
+    actions = tuple(
+        _action_arc(task, net, t, a, a.end, events) for a in t.inputs if a.end is not None
+    )
     heard = {e for a in actions for e in a.raised}
     plain = tuple((net.place_index[a.place], a.weight) for a in t.inputs if a.end is None)
     consumed = dict(net.consume[index])
@@ -158,7 +185,9 @@ def _exit(task: Task, net: Net, t: Transition) -> Exit:
         takes=net.consume[index],
         inhibit=net.inhibit[index],
         produce=tuple((p, w, places[p].kind is Kind.ACTION) for p, w in sorted(produced.items())),
-        room=tuple((p, g, limit) for p, g in gains.items() if g > 0 and (limit := limits[p]) is not None),
+        room=tuple(
+            (p, g, limit) for p, g in gains.items() if g > 0 and (limit := limits[p]) is not None
+        ),
         pulse=next((e.name for e in events if is_pulse(e)), ""),
         flags=tuple(e.name for e in events if e.scope is Scope.EXTERNAL and not is_pulse(e)),
         when=t.when,
@@ -171,10 +200,14 @@ def _exit(task: Task, net: Net, t: Transition) -> Exit:
     )
 
 
-def _action_arc(task: Task, net: Net, t: Transition, arc: Input, end: End, events: list[Event]) -> ActionArc:
+def _action_arc(
+    task: Task, net: Net, t: Transition, arc: Input, end: End, events: list[Event]
+) -> ActionArc:
     primitive = task.places[arc.place].task
     rivals = [
-        u for u in task.transitions.values() if any(a.place == arc.place and a.end is End.NORMAL for a in u.inputs)
+        u
+        for u in task.transitions.values()
+        if any(a.place == arc.place and a.end is End.NORMAL for a in u.inputs)
     ]
     return ActionArc(
         place=net.place_index[arc.place],
@@ -182,6 +215,7 @@ def _action_arc(task: Task, net: Net, t: Transition, arc: Input, end: End, event
         weight=arc.weight,
         end=end,
         counts=arc.counts or Counts.NONE,
-        takes_done=end is End.PREEMPT and t.priority > max((u.priority for u in rivals), default=t.priority),
+        takes_done=end is End.PREEMPT
+        and t.priority > max((u.priority for u in rivals), default=t.priority),
         raised=tuple(e.name for e in events if e.scope is Scope.INTERNAL and e.by == primitive),
     )

@@ -1,15 +1,16 @@
-"""One maximal step: which of the fireable transitions fire together, and how conflicts among them are settled."""
+"""One maximal step: which of the fireable transitions fire together, and how conflicts among them
+are settled."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from coordinator.conditions.wording import Severity
-from coordinator.engine.compiled import Exit
-from coordinator.engine.draft import Draft
-from coordinator.engine.firing import Claims, Match, eligible_runs, match
-from coordinator.task import End
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine.compiled import Exit
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import Claims, Match, eligible_runs, match
+from petrobot.coordinator.task import End
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,10 +21,14 @@ class Draw:
     weights: tuple[float, ...]
 
 
-def choose_step(draft: Draft, pulse: str, choices: Sequence[str], only: Sequence[str] | None) -> list[Match] | Draw:
-    """The transitions that fire together on the marking as it is, in an order in which each can fire after the others.
+def choose_step(
+    draft: Draft, pulse: str, choices: Sequence[str], only: Sequence[str] | None
+) -> list[Match] | Draw:
+    """The transitions that fire together on the marking as it is, in an order in which each can
+    fire after the others.
 
-    `choices` are the outcomes of earlier draws for this same step. Looks at the dirty transitions and forgets them.
+    `choices` are the outcomes of earlier draws for this same step. Looks at the dirty transitions
+    and forgets them.
     """
     fireable = [found for x in _marked(draft, pulse, only) if (found := match(draft, x, pulse))]
     draft.dirty.clear()
@@ -33,7 +38,8 @@ def choose_step(draft: Draft, pulse: str, choices: Sequence[str], only: Sequence
 
 
 def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[Exit]:
-    """The dirty transitions that the pulse may serve and whose input places hold enough: a cheap sieve before `match`."""
+    """The dirty transitions that the pulse may serve and whose input places hold enough: a cheap
+    sieve before `match`."""
     exits, marking = draft.compiled.exits, draft.marking
     for t in sorted(draft.dirty):
         x = exits[t]
@@ -58,7 +64,10 @@ def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> 
             contest = sorted([head, *rivals], key=_rank_and_place)
             if all(m.exit.weight is not None for m in contest):
                 if not choices:
-                    return Draw(tuple(m.exit.name for m in contest), tuple(m.exit.weight or 0.0 for m in contest))
+                    return Draw(
+                        tuple(m.exit.name for m in contest),
+                        tuple(m.exit.weight or 0.0 for m in contest),
+                    )
                 drawn = choices.pop(0)
                 head = next((m for m in contest if m.exit.name == drawn), head)
             else:
@@ -70,7 +79,8 @@ def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> 
 
 
 def _rank(m: Match) -> tuple[int, bool]:
-    """Declared priority first; then a run's end before its preemption, unless weights are declared."""
+    """Declared priority first; then a run's end before its preemption, unless weights are
+    declared."""
     return (-m.exit.priority, m.exit.preempts and m.exit.weight is None)
 
 
@@ -79,7 +89,8 @@ def _rank_and_place(m: Match) -> tuple[int, bool, int]:
 
 
 def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
-    """The first by rank, unless it would bar the way (inhibitor, room) of another that does not bar its own."""
+    """The first by rank, unless it would bar the way (inhibitor, room) of another that does not bar
+    its own."""
     head, passed = rest[0], set[int]()
     while True:
         passed.add(head.exit.index)
@@ -103,8 +114,11 @@ def _bars(draft: Draft, pulse: str, claims: Claims, first: Match, then: Match) -
     return match(draft, then.exit, pulse, taken) is None
 
 
-def _rivals(draft: Draft, pulse: str, head: Match, rest: list[Match], claims: Claims) -> list[Match]:
-    """Those that cannot all fire beside `head`: each bars the other, or together they ask for more than there is."""
+def _rivals(
+    draft: Draft, pulse: str, head: Match, rest: list[Match], claims: Claims
+) -> list[Match]:
+    """Those that cannot all fire beside `head`: each bars the other, or together they ask for more
+    than there is."""
     scarce = _scarce(draft, rest, claims) & _demands(head).keys()
     return [
         m
@@ -139,5 +153,8 @@ def _scarce(draft: Draft, rest: list[Match], claims: Claims) -> set[tuple[int, s
 
 def _report(draft: Draft, contest: list[Match]) -> None:
     names = ", ".join(m.exit.name for m in contest)
-    text = f"nothing settles the conflict of {names}; {contest[0].exit.name} fires, being first in the file"
+    text = (
+        f"nothing settles the conflict of {names}; {contest[0].exit.name} fires, being "
+        "first in the file"
+    )
     draft.report(Severity.WARNING, "undecided", text, names)

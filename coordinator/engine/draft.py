@@ -1,13 +1,14 @@
-"""A state being changed by one stimulus: the working copy, the instructions so far, and what has to be looked at again."""
+"""A state being changed by one stimulus: the working copy, the instructions so far, and what has to
+be looked at again."""
 
 from __future__ import annotations
 
-from coordinator.conditions.wording import Severity
-from coordinator.engine.compiled import Compiled
-from coordinator.engine.instructions import Instruction, Report
-from coordinator.engine.state import LIVE, Mode, Phase, Run, State
-from coordinator.net import Marking
-from coordinator.task import Value
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine.compiled import Compiled
+from petrobot.coordinator.engine.instructions import Instruction, Report
+from petrobot.coordinator.engine.state import LIVE, Mode, Phase, Run, State
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import Value
 
 
 class Draft:
@@ -39,7 +40,9 @@ class Draft:
         self.backlog = list(state.backlog)
         self.breakpoints = state.breakpoints
         self.overrides = state.overrides
-        self.deferred = state.deferred  # like `early` replaced when it changes, which is seldom: it may grow long
+        self.deferred = (
+            state.deferred
+        )  # like `early` replaced when it changes, which is seldom: it may grow long
         self.early = state.early
         self.told: set[str] = set(state.told)
         self.ending = state.ending
@@ -159,6 +162,8 @@ class Draft:
         else:
             present = self.tokens[new.place]
             self.tokens[new.place] = (
-                (new,) if len(present) == 1 else tuple(new if r.id == new.id else r for r in present)
+                (new,)
+                if len(present) == 1
+                else tuple(new if r.id == new.id else r for r in present)
             )
         self.touch(self.compiled.action_places[new.place])

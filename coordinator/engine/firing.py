@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from itertools import product
 from typing import NamedTuple
 
-from coordinator.conditions import ConditionFault
-from coordinator.conditions.wording import Severity
-from coordinator.engine.compiled import ActionArc, Exit
-from coordinator.engine.draft import Draft
-from coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
-from coordinator.engine.state import ACTIVE, LIVE, Phase, Run
-from coordinator.task import Counts, End, Status, Value
+from petrobot.coordinator.conditions import ConditionFault
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine.compiled import ActionArc, Exit
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
+from petrobot.coordinator.engine.state import ACTIVE, LIVE, Phase, Run
+from petrobot.coordinator.task import Counts, End, Status, Value
 
 
 class Match(NamedTuple):
@@ -61,7 +61,8 @@ _NOTHING = Claims()
 
 
 def match(draft: Draft, x: Exit, pulse: str, claims: Claims = _NOTHING) -> Match | None:
-    """How the transition can fire beside what was claimed, with the pulse that has just come; None if it cannot."""
+    """How the transition can fire beside what was claimed, with the pulse that has just come; None
+    if it cannot."""
     if (x.pulse and x.pulse != pulse) or x.never or not _marking_allows(draft, x, claims):
         return None
     for f in x.flags:
@@ -82,25 +83,34 @@ def match(draft: Draft, x: Exit, pulse: str, claims: Claims = _NOTHING) -> Match
 
 
 def arcs_satisfied(draft: Draft, x: Exit) -> tuple[Run, ...] | None:
-    """The runs that the transition would take if its events came now; None while its arcs are not satisfied."""
+    """The runs that the transition would take if its events came now; None while its arcs are not
+    satisfied."""
     if not _marking_allows(draft, x, _NOTHING):
         return None
     eligible = [eligible_runs(draft, arc, _NOTHING, heard=False) for arc in x.actions]
     if any(len(runs) < arc.weight for arc, runs in zip(x.actions, eligible, strict=True)):
         return None
-    return tuple(r for arc, runs in zip(x.actions, eligible, strict=True) for r in runs[: arc.weight])
+    return tuple(
+        r for arc, runs in zip(x.actions, eligible, strict=True) for r in runs[: arc.weight]
+    )
 
 
 def token_enabled(draft: Draft, x: Exit) -> bool:
-    """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its runs do."""
+    """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its
+    runs do."""
     return _marking_allows(draft, x, _NOTHING)
 
 
 def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = True) -> list[Run]:
-    """Runs that the arc may take, first come first: ended ones by their end, others by their start."""
+    """Runs that the arc may take, first come first: ended ones by their end, others by their
+    start."""
     runs = [r for r in draft.tokens.get(arc.name, ()) if _fits(arc, r) and r.id not in claims.runs]
     if heard and arc.raised:
-        runs = [r for r in runs if all(e in r.raised and (r.id, e) not in claims.raised for e in arc.raised)]
+        runs = [
+            r
+            for r in runs
+            if all(e in r.raised and (r.id, e) not in claims.raised for e in arc.raised)
+        ]
     if len(runs) > 1 and arc.end in (End.NORMAL, End.ERROR):
         runs.sort(key=lambda r: r.ended)
     return runs
@@ -124,11 +134,14 @@ def fire(draft: Draft, fireable: Match, cause: str) -> None:
     draft.firings += 1
     draft.timeless += 1
     draft.told.discard(x.name)
-    draft.instructions.insert(at, Fired(draft.firings, x.name, before, draft.snapshot(), cause, taken))
+    draft.instructions.insert(
+        at, Fired(draft.firings, x.name, before, draft.snapshot(), cause, taken)
+    )
 
 
 def cancel(draft: Draft, run: Run, counts: Counts, reason: str) -> None:
-    """The run's token is gone: a run that has begun is stopping until it is known to have stopped."""
+    """The run's token is gone: a run that has begun is stopping until it is known to have
+    stopped."""
     draft.leave(run)
     if run.phase not in ACTIVE:
         return
@@ -158,7 +171,8 @@ def _take_runs(draft: Draft, fireable: Match) -> Iterator[Run]:
 
 
 def _forget_lost(draft: Draft, fired: Exit) -> None:
-    """Between taking and giving: timers and latches whose transitions have lost their tokens are forgotten."""
+    """Between taking and giving: timers and latches whose transitions have lost their tokens are
+    forgotten."""
     if draft.timers:
         disarm(draft, fired.name)
         for name in list(draft.timers):
@@ -172,7 +186,8 @@ def _forget_lost(draft: Draft, fired: Exit) -> None:
 
 
 def forget_flags(draft: Draft) -> None:
-    """Drop latched events that nothing waits for any more, unless they are declared `early = "keep"`."""
+    """Drop latched events that nothing waits for any more, unless they are declared `early =
+    "keep"`."""
     for flag in tuple(draft.flags):
         if flag not in draft.compiled.kept and not awaited(draft, flag):
             draft.flags.discard(flag)
@@ -192,7 +207,9 @@ def _marking_allows(draft: Draft, x: Exit, claims: Claims) -> bool:
     for p, k in x.inhibit:
         if draft.occupied(p) + claims.change.get(p, 0) >= k:
             return False
-    return not x.room or all(draft.occupied(p) + claims.change.get(p, 0) + gain <= limit for p, gain, limit in x.room)
+    return not x.room or all(
+        draft.occupied(p) + claims.change.get(p, 0) + gain <= limit for p, gain, limit in x.room
+    )
 
 
 def _fits(arc: ActionArc, run: Run) -> bool:
@@ -204,9 +221,12 @@ def _fits(arc: ActionArc, run: Run) -> bool:
 
 
 def _selections(x: Exit, eligible: list[list[Run]]) -> Iterator[tuple[tuple[Run, ...], ...]]:
-    """Which runs to take: the first ones, or every choice where the condition depends on the run."""
+    """Which runs to take: the first ones, or every choice where the condition depends on the
+    run."""
     if not x.judges_runs:
-        yield tuple([tuple(runs[: arc.weight]) for arc, runs in zip(x.actions, eligible, strict=True)])
+        yield tuple(
+            [tuple(runs[: arc.weight]) for arc, runs in zip(x.actions, eligible, strict=True)]
+        )
         return
     windows = [
         [tuple(runs[i : i + arc.weight]) for i in range(len(runs) - arc.weight + 1)]

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from coordinator.conditions.wording import Severity as Severity
-from coordinator.net import Marking
-from coordinator.task import Counts, Executed, Status, Value
+from petrobot.coordinator.conditions.wording import Severity as Severity
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import Counts, Executed, Status, Value
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,8 @@ class StartRun:
 
 @dataclass(frozen=True, slots=True)
 class CancelRun:
-    """Stop a run; to be answered by `StopConfirmed`, `StopFailed` or, when it ended by itself meanwhile, `RunEnded`."""
+    """Stop a run; to be answered by `StopConfirmed`, `StopFailed` or, when it ended by itself
+    meanwhile, `RunEnded`."""
 
     run: str
     counts: Counts
@@ -60,8 +61,9 @@ class Subject(StrEnum):
 class Choose:
     """Choose one of the alternatives; to be answered by `Chosen` with the same key.
 
-    For an action, `of` is the primitive task and the key is the run's id: a selector decides. For a conflict, `of` are
-    the transitions' names and the answer is drawn by the weights from a generator keyed by (seed, key).
+    For an action, `of` is the primitive task and the key is the run's id: a selector decides. For a
+    conflict, `of` are the transitions' names and the answer is drawn by the weights from a
+    generator keyed by (seed, key).
     """
 
     key: str
@@ -103,7 +105,8 @@ class ReleaseTimer:
 
 @dataclass(frozen=True, slots=True)
 class Fired:
-    """Record: a transition fired. `cause` is the kind of stimulus (or `stability`: it needed nothing more)."""
+    """Record: a transition fired. `cause` is the kind of stimulus (or `stability`: it needed
+    nothing more)."""
 
     number: int
     transition: str
@@ -116,7 +119,8 @@ class Fired:
 
 @dataclass(frozen=True, slots=True)
 class Marked:
-    """Record: the operator changed the tokens of a control place, or the mission run began at another marking (no `place`)."""
+    """Record: the operator changed the tokens of a control place, or the mission run began at
+    another marking (no `place`)."""
 
     place: str
     before: Marking
@@ -125,7 +129,8 @@ class Marked:
 
 @dataclass(frozen=True, slots=True)
 class RunRecorded:
-    """Record for the estimates: how a run that began ended. Status None is a censored run: it only lasted so long."""
+    """Record for the estimates: how a run that began ended. Status None is a censored run: it only
+    lasted so long."""
 
     run: str
     place: str
@@ -142,7 +147,8 @@ class RunRecorded:
 
 @dataclass(frozen=True, slots=True)
 class Corrected:
-    """Record for the estimates: a deferred verdict replaces the status of a run that was recorded before."""
+    """Record for the estimates: a deferred verdict replaces the status of a run that was recorded
+    before."""
 
     run: str
     place: str
@@ -155,7 +161,8 @@ class Corrected:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Something that people should know. `key` is a fixed word for programs, `of` the element that it is about."""
+    """Something that people should know. `key` is a fixed word for programs, `of` the element that
+    it is about."""
 
     severity: Severity
     key: str
@@ -179,7 +186,8 @@ class Resumed:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """Record: the mission run is over. SUCCESS: `final` was reached. ERROR: given up, dead, or aborted."""
+    """Record: the mission run is over. SUCCESS: `final` was reached. ERROR: given up, dead, or
+    aborted."""
 
     status: Status
     reason: str
@@ -206,5 +214,15 @@ Instruction = (
     | Finished
 )
 
-ORDERS = (StartRun, CancelRun, HoldRun, ReleaseRun, Choose, ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
+ORDERS = (
+    StartRun,
+    CancelRun,
+    HoldRun,
+    ReleaseRun,
+    Choose,
+    ArmTimer,
+    DisarmTimer,
+    HoldTimer,
+    ReleaseTimer,
+)
 """The instructions that someone has to carry out; all others are records."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from coordinator.conditions.wording import Severity
-from coordinator.engine import operator, runs
-from coordinator.engine.compiled import compile_task
-from coordinator.engine.departing import set_out
-from coordinator.engine.draft import Draft
-from coordinator.engine.firing import awaited
-from coordinator.engine.instructions import (
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine import operator, runs
+from petrobot.coordinator.engine.compiled import compile_task
+from petrobot.coordinator.engine.departing import set_out
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import awaited
+from petrobot.coordinator.engine.instructions import (
     ArmTimer,
     CancelRun,
     Choose,
@@ -21,9 +21,9 @@ from coordinator.engine.instructions import (
     StartRun,
     Subject,
 )
-from coordinator.engine.state import ACTIVE, Mode, Phase, Run, State, Suspended
-from coordinator.engine.step import Policy, abort, settle
-from coordinator.engine.stimuli import (
+from petrobot.coordinator.engine.state import ACTIVE, Mode, Phase, Run, State, Suspended
+from petrobot.coordinator.engine.step import Policy, abort, settle
+from petrobot.coordinator.engine.stimuli import (
     Abort,
     AddTokens,
     Begin,
@@ -49,8 +49,8 @@ from coordinator.engine.stimuli import (
     VariableChanged,
     Verdict,
 )
-from coordinator.engine.timers import elapse, hold_timers_of
-from coordinator.task import Counts, Memory, Scope, Task, VariableType
+from petrobot.coordinator.engine.timers import elapse, hold_timers_of
+from petrobot.coordinator.task import Counts, Memory, Scope, Task, VariableType
 
 _AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
 _ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints, Override)
@@ -60,11 +60,13 @@ _BEFORE_THE_BEGIN = (Begin, SetBreakpoints, Override)
 class Engine:
     """A task compiled for execution. Immutable: all that changes is in the `State`.
 
-    `devices` names the device of each action that uses one. Two runs never have one device at once; an action of a
-    primitive task with `start = "at_once"` is excepted.
+    `devices` names the device of each action that uses one. Two runs never have one device at once;
+    an action of a primitive task with `start = "at_once"` is excepted.
     """
 
-    def __init__(self, task: Task, devices: Mapping[str, str] | None = None, policy: Policy | None = None) -> None:
+    def __init__(
+        self, task: Task, devices: Mapping[str, str] | None = None, policy: Policy | None = None
+    ) -> None:
         """Compile. Raises ValueError with every fault of an inconsistent task."""
         self.task = task
         self.policy = policy or Policy()
@@ -99,7 +101,8 @@ class Engine:
         return State(self.compiled.net.initial, self.compiled.task.initial_variables())
 
     def handle(self, state: State, stimulus: Stimulus) -> tuple[State, tuple[Instruction, ...]]:
-        """The next state and what is to be done. Pure; a stimulus that makes no sense is reported and changes nothing."""
+        """The next state and what is to be done. Pure; a stimulus that makes no sense is reported
+        and changes nothing."""
         draft = Draft(self.compiled, state)
         self._take(draft, stimulus)
         while draft.backlog and not _waits_for_draw(draft):
@@ -107,11 +110,13 @@ class Engine:
         return draft.freeze(), tuple(draft.instructions)
 
     def awaits(self, state: State, event: str) -> bool:
-        """Whether tokens enable a transition that waits for the event: any other pulse would change nothing."""
+        """Whether tokens enable a transition that waits for the event: any other pulse would change
+        nothing."""
         return awaited(Draft(self.compiled, state), event)
 
     def outstanding(self, state: State) -> tuple[Instruction, ...]:
-        """The orders that are still in force, for whoever takes over a state: choices, runs, cancels, holds, timers."""
+        """The orders that are still in force, for whoever takes over a state: choices, runs,
+        cancels, holds, timers."""
         draft = Draft(self.compiled, state)
         for run in [r for rs in state.tokens.values() for r in rs] + list(state.stopping.values()):
             self._order_again(draft, run)
@@ -124,7 +129,9 @@ class Engine:
         waiting = state.suspended
         if waiting is not None and waiting.key:
             names = waiting.alternatives
-            draft.emit(Choose(waiting.key, Subject.CONFLICT, ", ".join(names), names, waiting.weights))
+            draft.emit(
+                Choose(waiting.key, Subject.CONFLICT, ", ".join(names), names, waiting.weights)
+            )
         return tuple(draft.instructions)
 
     def _order_again(self, draft: Draft, run: Run) -> None:
@@ -133,11 +140,17 @@ class Engine:
             draft.emit(Choose(run.id, Subject.ACTION, primitive.name, primitive.alternatives))
         elif run.phase in ACTIVE:
             deadline = primitive.deadline
-            draft.emit(StartRun(run.id, run.place, primitive.name, run.action, run.arguments, deadline))
-            if draft.mode is Mode.PAUSED:  # whether or not its node had answered: it may have been released since
+            draft.emit(
+                StartRun(run.id, run.place, primitive.name, run.action, run.arguments, deadline)
+            )
+            if (
+                draft.mode is Mode.PAUSED
+            ):  # whether or not its node had answered: it may have been released since
                 draft.emit(HoldRun(run.id))
         elif run.phase in (Phase.STOPPING, Phase.STUCK):
-            draft.emit(CancelRun(run.id, run.counts or Counts.NONE, run.reason, primitive.stop_within))
+            draft.emit(
+                CancelRun(run.id, run.counts or Counts.NONE, run.reason, primitive.stop_within)
+            )
 
     def _take(self, draft: Draft, stimulus: Stimulus) -> None:
         kind = type(stimulus)
@@ -147,7 +160,11 @@ class Engine:
             _note(draft, "not_begun", f"{kind.__name__} came before the mission run began")
         elif draft.mode is Mode.FINISHED and not isinstance(stimulus, _AFTER_THE_END):
             _note(draft, "finished", f"{kind.__name__} came after the mission run had ended")
-        elif _waits_for_draw(draft) and kind is not Chosen and not isinstance(stimulus, _ALWAYS_HEARD):
+        elif (
+            _waits_for_draw(draft)
+            and kind is not Chosen
+            and not isinstance(stimulus, _ALWAYS_HEARD)
+        ):
             draft.backlog.append(stimulus)
         else:
             self._handlers[kind](draft, stimulus)
@@ -161,8 +178,15 @@ class Engine:
         if stimulus.point is not None:
             set_out(draft, stimulus.point)
         for name, value in stimulus.parameters.items():
-            if name not in task.parameters or not VariableType.of(task.parameters[name]).admits(value):
-                _warn(draft, "bad_parameter", f"{name} = {value!r} is no parameter of {task.name}; ignored", name)
+            if name not in task.parameters or not VariableType.of(task.parameters[name]).admits(
+                value
+            ):
+                _warn(
+                    draft,
+                    "bad_parameter",
+                    f"{name} = {value!r} is no parameter of {task.name}; ignored",
+                    name,
+                )
             else:
                 draft.write(name, value)
         for name, value in stimulus.variables.items():
@@ -183,7 +207,10 @@ class Engine:
         run = draft.find(stimulus.run)
         if run is None or run.phase not in (*ACTIVE, Phase.STOPPING, Phase.STUCK):
             _note(
-                draft, "unknown_run", f"{stimulus.run} ended ({stimulus.status}), but it was not going on", stimulus.run
+                draft,
+                "unknown_run",
+                f"{stimulus.run} ended ({stimulus.status}), but it was not going on",
+                stimulus.run,
             )
         elif run.phase in ACTIVE:
             runs.end_run(draft, run, stimulus)
@@ -196,10 +223,20 @@ class Engine:
         run, event = draft.find(stimulus.run), self.compiled.task.events.get(stimulus.event)
         if run is None or run.phase not in ACTIVE:
             _note(
-                draft, "unknown_run", f"{stimulus.run} raised {stimulus.event}, but it was not going on", stimulus.run
+                draft,
+                "unknown_run",
+                f"{stimulus.run} raised {stimulus.event}, but it was not going on",
+                stimulus.run,
             )
-        elif event is None or event.scope is not Scope.INTERNAL or event.by != self.compiled.primitives[run.place].name:
-            text = f"{run.id} raised {stimulus.event!r}, which is no internal event of its primitive task; ignored"
+        elif (
+            event is None
+            or event.scope is not Scope.INTERNAL
+            or event.by != self.compiled.primitives[run.place].name
+        ):
+            text = (
+                f"{run.id} raised {stimulus.event!r}, which is no internal event of its "
+                "primitive task; ignored"
+            )
             _warn(draft, "unknown_event", text, stimulus.event)
         else:
             draft.put(run, raised=run.raised | {stimulus.event})
@@ -218,7 +255,9 @@ class Engine:
     def _occur(self, draft: Draft, name: str, cause: str) -> None:
         event = self.compiled.task.events.get(name)
         if event is None or event.scope is not Scope.EXTERNAL:
-            _warn(draft, "unknown_event", f"{name!r} is no external event of the task; ignored", name)
+            _warn(
+                draft, "unknown_event", f"{name!r} is no external event of the task; ignored", name
+            )
         elif event.memory is Memory.PULSE:
             draft.dirty.update(self.compiled.waiting.get(name, ()))
             settle(draft, self.policy, cause, pulse=name)
@@ -227,7 +266,12 @@ class Engine:
             draft.dirty.update(self.compiled.waiting.get(name, ()))
             settle(draft, self.policy, cause)
         else:
-            _note(draft, "early_event", f"{name} came when nothing waited for it; it is forgotten", name)
+            _note(
+                draft,
+                "early_event",
+                f"{name} came when nothing waited for it; it is forgotten",
+                name,
+            )
 
     def _timer_fired(self, draft: Draft, stimulus: TimerFired) -> None:
         if elapse(draft, stimulus.key):
@@ -246,7 +290,10 @@ class Engine:
         if run is None or run.phase is not Phase.CHOOSING:
             _note(draft, "no_choice", f"no choice is open on {stimulus.key}", stimulus.key)
         elif stimulus.alternative not in self.compiled.primitives[run.place].alternatives:
-            text = f"{stimulus.alternative!r} is no alternative of {self.compiled.primitives[run.place].name}"
+            text = (
+                f"{stimulus.alternative!r} is no alternative of "
+                f"{self.compiled.primitives[run.place].name}"
+            )
             _warn(draft, "bad_choice", text, stimulus.key)
         elif _waits_for_draw(draft):
             draft.backlog.append(stimulus)
@@ -262,13 +309,20 @@ class Engine:
         draft.suspended = None
         draft.touch_all()
         choices = (*waiting.choices, stimulus.alternative)
-        step = Suspended(waiting.pulse, waiting.cause, choices, passed=waiting.passed, only=waiting.only)
+        step = Suspended(
+            waiting.pulse, waiting.cause, choices, passed=waiting.passed, only=waiting.only
+        )
         settle(draft, self.policy, waiting.cause, step=step)
 
     def _stop_confirmed(self, draft: Draft, stimulus: StopConfirmed) -> None:
         run = draft.stopping.get(stimulus.run)
         if run is None:
-            _note(draft, "unknown_run", f"{stimulus.run} is said to have stopped, but was not stopping", stimulus.run)
+            _note(
+                draft,
+                "unknown_run",
+                f"{stimulus.run} is said to have stopped, but was not stopping",
+                stimulus.run,
+            )
             return
         runs.confirm_stop(draft, run, stimulus)
         settle(draft, self.policy, "StopConfirmed")
@@ -276,7 +330,12 @@ class Engine:
     def _stop_failed(self, draft: Draft, stimulus: StopFailed) -> None:
         run = draft.stopping.get(stimulus.run)
         if run is None or run.phase is Phase.STUCK:
-            _note(draft, "unknown_run", f"{stimulus.run} is said not to stop, but was not stopping", stimulus.run)
+            _note(
+                draft,
+                "unknown_run",
+                f"{stimulus.run} is said not to stop, but was not stopping",
+                stimulus.run,
+            )
             return
         runs.fail_stop(draft, run, stimulus)
         settle(draft, self.policy, "StopFailed")

@@ -1,17 +1,24 @@
-"""The operator's hand on the net: tokens in control places, forced exits, pause, step and breakpoints as stimuli."""
+"""The operator's hand on the net: tokens in control places, forced exits, pause, step and
+breakpoints as stimuli."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from coordinator.conditions.wording import Severity, nearest
-from coordinator.engine.draft import Draft
-from coordinator.engine.firing import Match, arcs_satisfied, fire
-from coordinator.engine.instructions import Marked
-from coordinator.engine.state import LIVE, Mode, Phase, Run
-from coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
-from coordinator.engine.stimuli import AddTokens, ForceExit, Override, RemoveTokens, SetBreakpoints
-from coordinator.task import Counts, End, Kind
+from petrobot.coordinator.conditions.wording import Severity, nearest
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import Match, arcs_satisfied, fire
+from petrobot.coordinator.engine.instructions import Marked
+from petrobot.coordinator.engine.state import LIVE, Mode, Phase, Run
+from petrobot.coordinator.engine.step import MOVING, Policy, pause, release, resume, settle
+from petrobot.coordinator.engine.stimuli import (
+    AddTokens,
+    ForceExit,
+    Override,
+    RemoveTokens,
+    SetBreakpoints,
+)
+from petrobot.coordinator.task import Counts, End, Kind
 
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
@@ -21,7 +28,11 @@ def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:
         return
     capacity = draft.compiled.net.capacity[p]
     if capacity is not None and draft.marking[p] + command.tokens > capacity:
-        refuse(draft, f"{command.place} holds {draft.marking[p]} tokens and at most {capacity}", command.place)
+        refuse(
+            draft,
+            f"{command.place} holds {draft.marking[p]} tokens and at most {capacity}",
+            command.place,
+        )
         return
     _mark(draft, p, command.tokens)
     settle(draft, policy, "AddTokens")
@@ -49,13 +60,19 @@ def set_breakpoints(draft: Draft, command: SetBreakpoints) -> None:
 
 
 def override(draft: Draft, command: Override) -> None:
-    """Fix the alternative of a primitive task, or free it; whoever answers a `Choose` looks here first."""
+    """Fix the alternative of a primitive task, or free it; whoever answers a `Choose` looks here
+    first."""
     name, action = command.primitive_task, command.action
     primitives = draft.compiled.task.primitive_tasks
     if name not in primitives:
         refuse(draft, f"{name!r} is no primitive task{nearest(name, primitives)}", name)
     elif action and action not in primitives[name].alternatives:
-        refuse(draft, f"{action!r} is no alternative of {name}{nearest(action, primitives[name].alternatives)}", name)
+        refuse(
+            draft,
+            f"{action!r} is no alternative of "
+            f"{name}{nearest(action, primitives[name].alternatives)}",
+            name,
+        )
     else:
         kept = {task: chosen for task, chosen in draft.overrides.items() if task != name}
         draft.overrides = {**kept, name: action} if action else kept
@@ -92,12 +109,15 @@ def single_step(draft: Draft, policy: Policy) -> None:
 
 
 def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
-    """Fire a transition whatever its runs do, its events, time and condition; runs that go on count none."""
+    """Fire a transition whatever its runs do, its events, time and condition; runs that go on count
+    none."""
     index = draft.compiled.net.transition_index.get(command.transition)
     if index is None:
         known = draft.compiled.net.transitions
         refuse(
-            draft, f"{command.transition!r} is no transition{nearest(command.transition, known)}", command.transition
+            draft,
+            f"{command.transition!r} is no transition{nearest(command.transition, known)}",
+            command.transition,
         )
         return
     x = draft.compiled.exits[index]
@@ -107,7 +127,11 @@ def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
     runs = tuple(tuple(_forced_runs(draft, a.name, a.end)[: a.weight]) for a in x.actions)
     enough = all(len(taken) == a.weight for taken, a in zip(runs, x.actions, strict=True))
     if not x.actions or not enough or not _others_allow(draft, index):
-        why = "it leaves no action place" if not x.actions else "a token that it needs is missing, or a place is full"
+        why = (
+            "it leaves no action place"
+            if not x.actions
+            else "a token that it needs is missing, or a place is full"
+        )
         refuse(draft, f"{x.name} cannot be forced: {why}", x.name)
         return
     _fire_forced(draft, Match(x, runs))

@@ -1,7 +1,9 @@
-"""States, stimuli and instructions as plain data and back, for journals, snapshots and the operator's protocol.
+"""States, stimuli and instructions as plain data and back, for journals, snapshots and the
+operator's protocol.
 
-A record becomes a mapping of its fields; a field at its default is left out. Stimuli and instructions carry their class
-name as `kind`. Reading checks every field against its annotation and refuses what does not fit with a ValueError.
+A record becomes a mapping of its fields; a field at its default is left out. Stimuli and
+instructions carry their class name as `kind`. Reading checks every field against its annotation and
+refuses what does not fit with a ValueError.
 """
 
 from __future__ import annotations
@@ -13,9 +15,9 @@ from enum import StrEnum
 from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from coordinator.engine.instructions import Instruction
-from coordinator.engine.state import State
-from coordinator.engine.stimuli import Point, Stimulus
+from petrobot.coordinator.engine.instructions import Instruction
+from petrobot.coordinator.engine.state import State
+from petrobot.coordinator.engine.stimuli import Point, Stimulus
 
 Reader = Callable[[Any, str], Any]
 _KINDS: Mapping[str, type] = {c.__name__: c for c in (*get_args(Stimulus), *get_args(Instruction))}
@@ -28,7 +30,8 @@ def to_plain(record: State | Stimulus | Instruction | Point) -> dict[str, Any]:
 
 
 def state_from_plain(data: Mapping[str, Any]) -> State:
-    """The state that `to_plain` described. Raises ValueError naming the first field that does not fit."""
+    """The state that `to_plain` described. Raises ValueError naming the first field that does not
+    fit."""
     state: State = _reader(State)(data, "state")
     return state
 
@@ -81,7 +84,9 @@ def _tagged(union: Any, data: Any) -> Any:
         raise ValueError("a record needs its `kind`")
     cls = _KINDS.get(data["kind"])
     if cls not in get_args(union):
-        raise ValueError(f"{data['kind']!r} is none of {', '.join(c.__name__ for c in get_args(union))}")
+        raise ValueError(
+            f"{data['kind']!r} is none of {', '.join(c.__name__ for c in get_args(union))}"
+        )
     return _reader(cls)({k: v for k, v in data.items() if k != "kind"}, data["kind"])
 
 
@@ -112,7 +117,9 @@ def _container_reader(origin: Any, args: tuple[Any, ...]) -> Reader:
     item = _reader(args[-1] if origin not in (tuple,) else args[0])
     if issubclass(origin, Mapping):
         return lambda value, where: {
-            k: item(v, f"{where}.{k}") for k, v in _of(value, Mapping, where).items() if _of(k, str, where) is k
+            k: item(v, f"{where}.{k}")
+            for k, v in _of(value, Mapping, where).items()
+            if _of(k, str, where) is k
         }
     return lambda value, where: origin(
         [item(v, f"{where}[{i}]") for i, v in enumerate(_of(value, list | tuple, where))]
@@ -121,7 +128,9 @@ def _container_reader(origin: Any, args: tuple[Any, ...]) -> Reader:
 
 def _record_reader(cls: Any) -> Reader:
     hints = get_type_hints(cls)
-    required = {f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING}
+    required = {
+        f.name for f in fields(cls) if f.default is MISSING and f.default_factory is MISSING
+    }
 
     def read(value: Any, where: str) -> Any:
         data = _of(value, Mapping, where)

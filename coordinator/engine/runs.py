@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from coordinator.conditions.wording import Severity
-from coordinator.engine.draft import Draft
-from coordinator.engine.firing import verdict_variables
-from coordinator.engine.instructions import Choose, Corrected, RunRecorded, StartRun, Subject
-from coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Early, Phase, Run
-from coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
-from coordinator.task import Counts, Executed, Reference, Start, Status, Value
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import verdict_variables
+from petrobot.coordinator.engine.instructions import (
+    Choose,
+    Corrected,
+    RunRecorded,
+    StartRun,
+    Subject,
+)
+from petrobot.coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Early, Phase, Run
+from petrobot.coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
+from petrobot.coordinator.task import Counts, Executed, Reference, Start, Status, Value
 
 
 def admit(draft: Draft) -> bool:
-    """Bring waiting runs as far as they can go, first come first served; True if one of them ended in ERROR at once."""
+    """Bring waiting runs as far as they can go, first come first served; True if one of them ended
+    in ERROR at once."""
     waiting = [r for runs in draft.tokens.values() for r in runs if r.phase in UNSTARTED]
     if not waiting:
         return False
@@ -46,7 +53,8 @@ def _translated(draft: Draft, run: Run, action: str) -> Run:
 
 
 def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
-    """A run that went on is done: what it wrote and why it ended are known before anything fires."""
+    """A run that went on is done: what it wrote and why it ended are known before anything
+    fires."""
     draft.end_order += 1
     done = draft.put(
         run,
@@ -61,7 +69,10 @@ def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
     for name, value in verdict_variables(done).items():
         draft.write(name, value)
     if end.deferred:
-        draft.deferred = {**draft.deferred, run.id: Deferred(run.place, run.action, end.status, end.cause)}
+        draft.deferred = {
+            **draft.deferred,
+            run.id: Deferred(run.place, run.action, end.status, end.cause),
+        }
     _record(draft, run, end.status, end, cancelled=False)
     early = _take_early(draft, run)
     if early is not None:
@@ -69,10 +80,13 @@ def end_run(draft: Draft, run: Run, end: RunEnded) -> None:
 
 
 def end_stopping(draft: Draft, run: Run, end: RunEnded) -> None:
-    """A result that came after the cancel: recorded, moves nothing, its writes are dropped; the run has stopped."""
+    """A result that came after the cancel: recorded, moves nothing, its writes are dropped; the run
+    has stopped."""
     _forget(draft, run)
     counted = run.counts or Counts.NONE
-    status = None if counted is Counts.NONE or end.executed is Executed.NO else Status(counted.value)
+    status = (
+        None if counted is Counts.NONE or end.executed is Executed.NO else Status(counted.value)
+    )
     text = f"{run.reason}; it had ended with {end.status}" + (f", {end.cause}" if end.cause else "")
     _record(draft, run, status, replace(end, text=text), cancelled=True)
 
@@ -81,20 +95,31 @@ def confirm_stop(draft: Draft, run: Run, stop: StopConfirmed) -> None:
     """A cancelled run has stopped: its device is free."""
     _forget(draft, run)
     counted = run.counts or Counts.NONE
-    status = None if counted is Counts.NONE or stop.executed is Executed.NO else Status(counted.value)
-    end = RunEnded(run.id, Status.ERROR, "cancelled", run.reason, stop.executed, seconds=stop.seconds)
+    status = (
+        None if counted is Counts.NONE or stop.executed is Executed.NO else Status(counted.value)
+    )
+    end = RunEnded(
+        run.id, Status.ERROR, "cancelled", run.reason, stop.executed, seconds=stop.seconds
+    )
     _record(draft, run, status, end, cancelled=True)
 
 
 def fail_stop(draft: Draft, run: Run, stop: StopFailed) -> None:
-    """A cancelled run could not be stopped: its device stays fenced, and runs that wait for it end in ERROR."""
+    """A cancelled run could not be stopped: its device stays fenced, and runs that wait for it end
+    in ERROR."""
     draft.put(run, phase=Phase.STUCK)
     text = f"{run.id} could not be stopped{': ' + stop.text if stop.text else ''}"
-    draft.report(Severity.ERROR, "stuck_run", f"{text}; its device {run.device or '(none)'} stays fenced", run.id)
+    draft.report(
+        Severity.ERROR,
+        "stuck_run",
+        f"{text}; its device {run.device or '(none)'} stays fenced",
+        run.id,
+    )
 
 
 def correct(draft: Draft, verdict: Verdict) -> None:
-    """A deferred verdict: once, and for the estimates alone. It may come from another node, and overtake the run's end."""
+    """A deferred verdict: once, and for the estimates alone. It may come from another node, and
+    overtake the run's end."""
     known = draft.deferred.get(verdict.run)
     if known is not None:
         draft.deferred = {run: open_ for run, open_ in draft.deferred.items() if run != verdict.run}
@@ -155,7 +180,9 @@ def _write_results(draft: Draft, run: Run, end: RunEnded) -> None:
         value = end.values.get(name)
         declared = task.variables[variable].type
         if not declared.admits(value) or name not in end.values:
-            was = f"gave {value!r}, which is no {declared}" if name in end.values else "gave nothing"
+            was = (
+                f"gave {value!r}, which is no {declared}" if name in end.values else "gave nothing"
+            )
             text = f"{run.id} ({run.action}) {was} for {name!r}; variable {variable} is none now"
             draft.report(Severity.WARNING, "bad_value", text, run.id)
             value = None
@@ -163,18 +190,23 @@ def _write_results(draft: Draft, run: Run, end: RunEnded) -> None:
 
 
 def _has_server(draft: Draft, place: str) -> bool:
-    going = sum(r.phase in ACTIVE or r.phase in (Phase.CHOOSING, Phase.WAITING) for r in draft.tokens[place])
+    going = sum(
+        r.phase in ACTIVE or r.phase in (Phase.CHOOSING, Phase.WAITING) for r in draft.tokens[place]
+    )
     going += sum(r.place == place and r.phase is Phase.STOPPING for r in draft.stopping.values())
     return going < (draft.compiled.task.places[place].servers or 1)
 
 
 def _choose(draft: Draft, run: Run, alternatives: tuple[str, ...]) -> None:
     draft.put(run, phase=Phase.CHOOSING)
-    draft.emit(Choose(run.id, Subject.ACTION, draft.compiled.primitives[run.place].name, alternatives))
+    draft.emit(
+        Choose(run.id, Subject.ACTION, draft.compiled.primitives[run.place].name, alternatives)
+    )
 
 
 def _start(draft: Draft, run: Run) -> bool:
-    """Start the run if its device is free; True if the runtime ended it because the device is fenced for good."""
+    """Start the run if its device is free; True if the runtime ended it because the device is
+    fenced for good."""
     holders = [] if run.at_once or not run.device else _holders(draft, run)
     if holders:
         draft.replace_run(run)
@@ -184,17 +216,24 @@ def _start(draft: Draft, run: Run) -> bool:
         return True
     if holders:
         return False
-    arguments = {name: _argument(draft, value) for name, value in draft.compiled.task.places[run.place].args.items()}
+    arguments = {
+        name: _argument(draft, value)
+        for name, value in draft.compiled.task.places[run.place].args.items()
+    }
     draft.put(run, phase=Phase.STARTING, arguments=arguments)
     primitive = draft.compiled.primitives[run.place]
-    draft.emit(StartRun(run.id, run.place, primitive.name, run.action, arguments, primitive.deadline))
+    draft.emit(
+        StartRun(run.id, run.place, primitive.name, run.action, arguments, primitive.deadline)
+    )
     return False
 
 
 def _holders(draft: Draft, run: Run) -> list[Run]:
     """Other runs that have the run's device."""
     going = [r for runs in draft.tokens.values() for r in runs if r.phase in ACTIVE]
-    return [r for r in (*going, *draft.stopping.values()) if r.device == run.device and r.id != run.id]
+    return [
+        r for r in (*going, *draft.stopping.values()) if r.device == run.device and r.id != run.id
+    ]
 
 
 def _argument(draft: Draft, value: Value) -> Value:

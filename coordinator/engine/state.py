@@ -1,4 +1,5 @@
-"""The engine's state: marking, runs, latches, variables, timers. A value: never changed, only replaced."""
+"""The engine's state: marking, runs, latches, variables, timers. A value: never changed, only
+replaced."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from coordinator.engine.stimuli import Stimulus
-from coordinator.net import Marking
-from coordinator.task import Counts, Status, Value
+from petrobot.coordinator.engine.stimuli import Stimulus
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import Counts, Status, Value
 
 
 class Mode(StrEnum):
@@ -52,7 +53,8 @@ LIVE = UNSTARTED | ACTIVE
 
 @dataclass(frozen=True)
 class Run:
-    """One execution of an action, from the token that entered its place until it is known to have stopped."""
+    """One execution of an action, from the token that entered its place until it is known to have
+    stopped."""
 
     id: str
     place: str
@@ -78,7 +80,8 @@ class Run:
     """Why it was cancelled."""
 
     def changed(self, **changes: object) -> Run:
-        """A copy with some fields changed. Like `dataclasses.replace`, at a fraction of its time: it is the hot path."""
+        """A copy with some fields changed. Like `dataclasses.replace`, at a fraction of its time:
+        it is the hot path."""
         copy = object.__new__(Run)
         copy.__dict__.update(self.__dict__)
         copy.__dict__.update(changes)
@@ -98,7 +101,8 @@ class Timer:
 
 @dataclass(frozen=True, slots=True)
 class Suspended:
-    """A step that waits for a draw, a breakpoint or the operator's next step, with the pulse that made it fireable."""
+    """A step that waits for a draw, a breakpoint or the operator's next step, with the pulse that
+    made it fireable."""
 
     pulse: str
     cause: str

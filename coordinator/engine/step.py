@@ -1,4 +1,5 @@
-"""From a stimulus to a stable marking: maximal steps, breakpoints, admission of runs, and the end of the mission run."""
+"""From a stimulus to a stable marking: maximal steps, breakpoints, admission of runs, and the end
+of the mission run."""
 
 from __future__ import annotations
 
@@ -6,12 +7,19 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.conditions import ConditionFault
-from coordinator.conditions.wording import Severity
-from coordinator.engine.conflicts import Draw, choose_step
-from coordinator.engine.draft import Draft
-from coordinator.engine.firing import Match, cancel, fire, forget_flags, token_enabled, verdict_variables
-from coordinator.engine.instructions import (
+from petrobot.coordinator.conditions import ConditionFault
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine.conflicts import Draw, choose_step
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import (
+    Match,
+    cancel,
+    fire,
+    forget_flags,
+    token_enabled,
+    verdict_variables,
+)
+from petrobot.coordinator.engine.instructions import (
     Choose,
     Finished,
     HoldRun,
@@ -20,10 +28,15 @@ from coordinator.engine.instructions import (
     Resumed,
     Subject,
 )
-from coordinator.engine.runs import admit
-from coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
-from coordinator.engine.timers import disarm_all, hold_timers, refresh_timers, release_timers
-from coordinator.task import Counts, End, Status
+from petrobot.coordinator.engine.runs import admit
+from petrobot.coordinator.engine.state import ACTIVE, UNSTARTED, Mode, Phase, Run, Suspended
+from petrobot.coordinator.engine.timers import (
+    disarm_all,
+    hold_timers,
+    refresh_timers,
+    release_timers,
+)
+from petrobot.coordinator.task import Counts, End, Status
 
 MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 
@@ -33,17 +46,23 @@ class Policy:
     """How the engine treats tasks that do not behave."""
 
     firing_limit: int | None = None
-    """Firings without time after which it pauses, as `RECORDED` runs did; None: end in ERROR after `Compiled.firing_limit`."""
+    """Firings without time after which it pauses, as `RECORDED` runs did; None: end in ERROR after
+    `Compiled.firing_limit`."""
     end_when_dead: bool = True
-    """End in ERROR when nothing can ever happen again; else only report it and leave it to the operator."""
+    """End in ERROR when nothing can ever happen again; else only report it and leave it to the
+    operator."""
 
 
 RECORDED: Final = Policy(firing_limit=1000)
-"""How the engine treated the runs in journals whose header does not say that they end in ERROR instead."""
+"""How the engine treated the runs in journals whose header does not say that they end in ERROR
+instead."""
 
 
-def settle(draft: Draft, policy: Policy, cause: str, pulse: str = "", step: Suspended | None = None) -> None:
-    """Fire what the stimulus made fireable (or go on with a suspended step), then until stable, then start runs."""
+def settle(
+    draft: Draft, policy: Policy, cause: str, pulse: str = "", step: Suspended | None = None
+) -> None:
+    """Fire what the stimulus made fireable (or go on with a suspended step), then until stable,
+    then start runs."""
     if draft.mode in MOVING and draft.suspended is None:
         current = step or Suspended(pulse, cause)
         while True:
@@ -97,7 +116,11 @@ def release(draft: Draft) -> None:
 
 def abort(draft: Draft, reason: str) -> None:
     """Cancel every run; the mission run ends when all have stopped."""
-    draft.mode, draft.suspended, draft.ending = Mode.ABORTING, None, f"aborted: {reason}" if reason else "aborted"
+    draft.mode, draft.suspended, draft.ending = (
+        Mode.ABORTING,
+        None,
+        f"aborted: {reason}" if reason else "aborted",
+    )
     draft.backlog.clear()
     for run in draft.live():
         cancel(draft, run, Counts.NONE, draft.ending)
@@ -136,7 +159,9 @@ def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
         current.passed,
         current.only,
     )
-    draft.emit(Choose(key, Subject.CONFLICT, ", ".join(draw.alternatives), draw.alternatives, draw.weights))
+    draft.emit(
+        Choose(key, Subject.CONFLICT, ", ".join(draw.alternatives), draw.alternatives, draw.weights)
+    )
 
 
 def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
@@ -145,7 +170,9 @@ def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
     hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
     if not hit:
         return False
-    draft.suspended = Suspended(current.pulse, current.cause, current.choices, passed=tuple(names), only=current.only)
+    draft.suspended = Suspended(
+        current.pulse, current.cause, current.choices, passed=tuple(names), only=current.only
+    )
     pause(draft, f"breakpoint before {hit[0]}")
     return True
 
@@ -163,7 +190,9 @@ def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> Non
 def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: list[Match]) -> bool:
     """Pause after a token entered a place with a breakpoint; give up when firings take no end."""
     places = draft.compiled.net.places
-    entered = [places[p] for m in step for p, _, _ in m.exit.produce if places[p] in draft.breakpoints]
+    entered = [
+        places[p] for m in step for p, _, _ in m.exit.produce if places[p] in draft.breakpoints
+    ]
     if entered:
         pause(draft, f"breakpoint at {entered[0]}")
         return True
@@ -173,7 +202,8 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
     text = f"{draft.timeless} transitions fired without time passing, last {step[-1].exit.name}"
     draft.report(Severity.ERROR, "timeless", text, step[-1].exit.name)
     if policy.firing_limit is None:
-        # Continued, it would fire for ever again: not even an operator could do more than edit the task.
+        # Continued, it would fire for ever again: not even an operator could do more than edit the
+        # task.
         abort(draft, text)
     else:
         pause(draft, "firings without time")
@@ -181,14 +211,18 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
 
 
 def _explain_waiting(draft: Draft) -> None:
-    """Runs that are done and whose every exit has a false condition have nowhere to go: say so once."""
+    """Runs that are done and whose every exit has a false condition have nowhere to go: say so
+    once."""
     if draft.mode not in MOVING or draft.suspended is not None:
         return
     for runs in draft.tokens.values():
         for run in runs:
             if run.phase is Phase.DONE and run.id not in draft.told and _nowhere_to_go(draft, run):
                 how = f"{run.status}{', ' + run.cause if run.cause else ''}"
-                text = f"{run.id} has finished ({how}) and has nowhere to go: the conditions of all its exits are false"
+                text = (
+                    f"{run.id} has finished ({how}) and has nowhere to go: the conditions "
+                    "of all its exits are false"
+                )
                 draft.report_once(Severity.ERROR, "nowhere_to_go", text, run.id)
 
 
@@ -196,7 +230,10 @@ def _nowhere_to_go(draft: Draft, run: Run) -> bool:
     wanted = End.ERROR if run.status is Status.ERROR else End.NORMAL
     values = draft.variables | verdict_variables(run)
     for x in draft.compiled.exits:
-        if not any(a.name == run.place and (a.end is wanted or a.takes_done) for a in x.actions) or x.never:
+        if (
+            not any(a.name == run.place and (a.end is wanted or a.takes_done) for a in x.actions)
+            or x.never
+        ):
             continue
         try:
             if x.when is None or x.pulse or x.flags or x.when.holds(values):
@@ -223,7 +260,9 @@ class _Tokens(Mapping[str, int]):
 
 
 def _end_if_over(draft: Draft, policy: Policy) -> None:
-    if draft.suspended is not None or any(r.phase is not Phase.STUCK for r in draft.stopping.values()):
+    if draft.suspended is not None or any(
+        r.phase is not Phase.STUCK for r in draft.stopping.values()
+    ):
         return
     if draft.mode is Mode.ABORTING:
         _finish(draft, Status.ERROR, draft.ending)
@@ -240,7 +279,10 @@ def _end_if_over(draft: Draft, policy: Policy) -> None:
 def _end_if_dead(draft: Draft, policy: Policy) -> None:
     if draft.timers or any(token_enabled(draft, x) for x in draft.compiled.exits):
         return
-    text = f"no transition can ever fire again in {draft.compiled.net.describe(draft.snapshot())}, which is not final"
+    text = (
+        "no transition can ever fire again in "
+        f"{draft.compiled.net.describe(draft.snapshot())}, which is not final"
+    )
     draft.report_once(Severity.ERROR, "dead", text, "dead")
     if policy.end_when_dead:
         _finish(draft, Status.ERROR, text)

@@ -1,4 +1,5 @@
-"""Stimuli: everything that can happen to the engine. All carry plain data, so that a journal can hold them."""
+"""Stimuli: everything that can happen to the engine. All carry plain data, so that a journal can
+hold them."""
 
 from __future__ import annotations
 
@@ -6,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from coordinator.task import Executed, Status, Value
+from petrobot.coordinator.task import Executed, Status, Value
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """A token in an action place where a mission run begins: its run begins anew, or is over with a status."""
+    """A token in an action place where a mission run begins: its run begins anew, or is over with a
+    status."""
 
     place: str
     status: Status | None = None
@@ -27,7 +29,8 @@ class Point:
     marking: Mapping[str, int] = field(default_factory=dict)
     """Tokens by resource and control place; places that are not named hold none."""
     standing: tuple[Standing, ...] = ()
-    """The tokens of action places: those whose runs are over first, in the order in which they ended, then by age."""
+    """The tokens of action places: those whose runs are over first, in the order in which they
+    ended, then by age."""
     variables: Mapping[str, Value] = field(default_factory=dict)
     flags: frozenset[str] = frozenset()
     """Latched external events that have come and wait."""
@@ -35,7 +38,8 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """The mission run begins. Given parameters replace the task's defaults; `variables` are what global memory holds.
+    """The mission run begins. Given parameters replace the task's defaults; `variables` are what
+    global memory holds.
 
     With a `point` it begins there and not at the task's initial marking.
     """
@@ -80,7 +84,8 @@ class RunRaised:
 
 @dataclass(frozen=True, slots=True)
 class EventOccurred:
-    """An external event. `number` counts up by source from 1 so that none is taken twice; 0 stands outside that order."""
+    """An external event. `number` counts up by source from 1 so that none is taken twice; 0 stands
+    outside that order."""
 
     event: str
     source: str = ""
@@ -105,7 +110,8 @@ class VariableChanged:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """The answer to a `Choose`: one of its alternatives, and why (`draw 0.31`, `selector: lowest J`, `operator`)."""
+    """The answer to a `Choose`: one of its alternatives, and why (`draw 0.31`, `selector: lowest
+    J`, `operator`)."""
 
     key: str
     alternative: str
@@ -114,7 +120,8 @@ class Chosen:
 
 @dataclass(frozen=True, slots=True)
 class StopConfirmed:
-    """A cancelled run is known to have stopped (or never to have begun: `executed` is then `no`)."""
+    """A cancelled run is known to have stopped (or never to have begun: `executed` is then
+    `no`)."""
 
     run: str
     executed: Executed = Executed.YES
@@ -123,7 +130,8 @@ class StopConfirmed:
 
 @dataclass(frozen=True, slots=True)
 class StopFailed:
-    """A cancelled run could not be stopped in its time; its device stays fenced until a later `StopConfirmed`."""
+    """A cancelled run could not be stopped in its time; its device stays fenced until a later
+    `StopConfirmed`."""
 
     run: str
     text: str = ""
@@ -170,19 +178,22 @@ class Resume:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Operator: one firing, now or, if nothing can fire yet, as soon as something can; then paused again."""
+    """Operator: one firing, now or, if nothing can fire yet, as soon as something can; then paused
+    again."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetBreakpoints:
-    """Operator: pause before these transitions fire and after tokens enter these places (replaces the earlier set)."""
+    """Operator: pause before these transitions fire and after tokens enter these places (replaces
+    the earlier set)."""
 
     names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """Operator: this alternative of a primitive task is run from now on; empty: the choice is free again."""
+    """Operator: this alternative of a primitive task is run from now on; empty: the choice is free
+    again."""
 
     primitive_task: str
     action: str = ""
@@ -213,7 +224,8 @@ class RaiseEvent:
 
 @dataclass(frozen=True, slots=True)
 class ForceExit:
-    """Operator: fire a transition out of an action place whatever its run does, its event, time and condition.
+    """Operator: fire a transition out of an action place whatever its run does, its event, time and
+    condition.
 
     A run that still goes on is cancelled and counts none.
     """
@@ -253,5 +265,16 @@ Stimulus = (
     | Abort
 )
 
-OPERATOR = (Pause, Resume, Step, SetBreakpoints, Override, AddTokens, RemoveTokens, RaiseEvent, ForceExit, Abort)
+OPERATOR = (
+    Pause,
+    Resume,
+    Step,
+    SetBreakpoints,
+    Override,
+    AddTokens,
+    RemoveTokens,
+    RaiseEvent,
+    ForceExit,
+    Abort,
+)
 """The stimuli that only the operator who holds the controls may send."""

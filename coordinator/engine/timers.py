@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from coordinator.engine.compiled import Exit
-from coordinator.engine.draft import Draft
-from coordinator.engine.firing import arcs_satisfied, disarm
-from coordinator.engine.instructions import ArmTimer, HoldTimer, ReleaseTimer
-from coordinator.engine.state import ACTIVE, Mode, Timer
+from petrobot.coordinator.engine.compiled import Exit
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import arcs_satisfied, disarm
+from petrobot.coordinator.engine.instructions import ArmTimer, HoldTimer, ReleaseTimer
+from petrobot.coordinator.engine.state import ACTIVE, Mode, Timer
 
 
 def refresh_timers(draft: Draft) -> None:
@@ -33,7 +33,8 @@ def disarm_all(draft: Draft) -> None:
 
 
 def hold_timers(draft: Draft) -> None:
-    """The net is paused: timers stop, but for those of runs that have not said yet whether they hold."""
+    """The net is paused: timers stop, but for those of runs that have not said yet whether they
+    hold."""
     for name, timer in list(draft.timers.items()):
         if not timer.held and not timer.elapsed and not _concerns_active(draft, timer):
             draft.timers[name] = replace(timer, held=True)

@@ -1,1 +1,2 @@
-"""What runs have taught: the file it is kept in, the selector that learns from it, and what it means for a task."""
+"""What runs have taught: the file it is kept in, the selector that learns from it, and what it
+means for a task."""

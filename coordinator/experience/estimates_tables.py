@@ -1,4 +1,5 @@
-"""The tables of an estimates file: what is in them, and the statements that read and change them."""
+"""The tables of an estimates file: what is in them, and the statements that read and change
+them."""
 
 from __future__ import annotations
 
@@ -10,23 +11,26 @@ from contextlib import suppress
 from math import inf
 from typing import Any
 
-from coordinator.learning.estimate import Key, Tally
-from coordinator.learning.estimate import merge as merge_tallies
-from coordinator.learning.joining import joined, trials
-from coordinator.learning.learning import corrected
-from coordinator.learning.objective import Question
-from coordinator.learning.passage import Flow, PassageKey
-from coordinator.learning.passage import merge as merge_flows
-from coordinator.learning.records import Correction
+from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.estimate import merge as merge_tallies
+from petrobot.coordinator.learning.joining import joined, trials
+from petrobot.coordinator.learning.learning import corrected
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.passage import Flow, PassageKey
+from petrobot.coordinator.learning.passage import merge as merge_flows
+from petrobot.coordinator.learning.records import Correction
 
 SCHEMA = 2
-"""1 had no table `question`. Files of schema 1 are read as they are, and become 2 when something is written to them."""
+"""1 had no table `question`. Files of schema 1 are read as they are, and become 2 when something is
+written to them."""
 APPLICATION = 0x70657472
 """"petr": SQLite's application_id of these files."""
 CHOICE = "choice of "
-"""Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not its estimates."""
+"""Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not
+its estimates."""
 COUNTED = "counted "
-"""Before a mission run's id in the table `about`: the origin under which its runs were counted when it was interrupted."""
+"""Before a mission run's id in the table `about`: the origin under which its runs were counted when
+it was interrupted."""
 CAMPAIGN = "campaign/"
 """Begins the names of campaigns' origins."""
 
@@ -59,7 +63,8 @@ def schema(db: sqlite3.Connection) -> int:
 
 
 def migrate(db: sqlite3.Connection) -> None:
-    """From schema 1. A campaign's own origin is closed from now on; what had been added to it before cannot be told apart."""
+    """From schema 1. A campaign's own origin is closed from now on; what had been added to it
+    before cannot be told apart."""
     db.execute(QUESTION)
     origin = fact(db, "origin")
     if origin.startswith(CAMPAIGN):
@@ -89,7 +94,8 @@ def add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> N
 
 
 def correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
-    """A verdict on a run that an origin's sums have counted already; left alone if they have not."""
+    """A verdict on a run that an origin's sums have counted already; left alone if they have
+    not."""
     key = Key(correction.primitive_task, correction.action, correction.context)
     with suppress(KeyError):  # the run is not among this origin's any more
         _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
@@ -98,13 +104,17 @@ def correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -
 def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
     where = (origin, key.primitive_task, key.action, key.context)
     row = db.execute(
-        "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND context = ?", where
+        "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND "
+        "context = ?",
+        where,
     ).fetchone()
     return tally_of(row) if row else Tally()
 
 
 def _put_tally(db: sqlite3.Connection, origin: str, key: Key, tally: Tally) -> None:
-    db.execute("INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", tally_row(origin, key, tally))
+    db.execute(
+        "INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", tally_row(origin, key, tally)
+    )
 
 
 def tally_row(origin: str, key: Key, tally: Tally) -> tuple[Any, ...]:
@@ -117,7 +127,8 @@ def add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow)
     """Add to an origin's firings."""
     where = (origin, key.task, key.transition, key.context)
     row = db.execute(
-        "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?", where
+        "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?",
+        where,
     ).fetchone()
     flow = merge_flows(flow_of(row) if row else Flow(), gained)
     db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", flow_row(origin, key, flow))
@@ -128,7 +139,9 @@ def flow_row(origin: str, key: PassageKey, flow: Flow) -> tuple[Any, ...]:
     return origin, key.task, key.transition, key.context, flow.fired, json.dumps(flow.to_plain())
 
 
-def put_question(db: sqlite3.Connection, origin: str, task: str, asked: Question, version: int) -> None:
+def put_question(
+    db: sqlite3.Connection, origin: str, task: str, asked: Question, version: int
+) -> None:
     """Keep by what an origin judges the actions of a primitive task."""
     row = (origin, task, version, asked.measure, asked.target, asked.rho)
     db.execute("INSERT OR REPLACE INTO question VALUES (?, ?, ?, ?, ?, ?)", row)
@@ -153,27 +166,36 @@ def question_of(row: Sequence[Any]) -> Question:
 def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
     """Replace a selector's state."""
     body = json.dumps(state, separators=(",", ":"))
-    db.execute("INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)", (task, state["selector"], trials(state), body))
+    db.execute(
+        "INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)",
+        (task, state["selector"], trials(state), body),
+    )
 
 
-def take_selector(db: sqlite3.Connection, task: str, name: str, state: Mapping[str, Any], origin: str) -> None:
+def take_selector(
+    db: sqlite3.Connection, task: str, name: str, state: Mapping[str, Any], origin: str
+) -> None:
     """Another file's state, unless what was learned there under that origin was reset here."""
     if db.execute(
         "SELECT 1 FROM forgotten WHERE origin = ? AND primitive_task = ?", (origin, CHOICE + task)
     ).fetchone():
         return
-    row = db.execute("SELECT state FROM selector WHERE primitive_task = ? AND name = ?", (task, name)).fetchone()
+    row = db.execute(
+        "SELECT state FROM selector WHERE primitive_task = ? AND name = ?", (task, name)
+    ).fetchone()
     put_selector(db, task, state if row is None else joined(state_of(row[0]), state))
 
 
 def forget(db: sqlite3.Connection) -> None:
-    """Drop what some file has reset; if that was this file's own, what it learns from now on is another origin's."""
+    """Drop what some file has reset; if that was this file's own, what it learns from now on is
+    another origin's."""
     db.execute(
         "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
         "AND f.primitive_task = tally.primitive_task)"
     )
     db.execute(
-        "DELETE FROM question WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = question.origin "
+        "DELETE FROM question WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = "
+        "question.origin "
         "AND f.primitive_task = question.primitive_task)"
     )
     db.execute(
@@ -195,9 +217,12 @@ KEYS = {
 def take_later(db: sqlite3.Connection, table: str, rows: Sequence[Sequence[Any]]) -> None:
     """Rows that are not there yet, or of a later version than those that are."""
     names = [name for _, name, *_ in db.execute(f"PRAGMA table_info({table})")]
-    body = ", ".join(f"{name} = excluded.{name}" for name in names if name not in KEYS[table].split(", "))
+    body = ", ".join(
+        f"{name} = excluded.{name}" for name in names if name not in KEYS[table].split(", ")
+    )
     db.executemany(
-        f"INSERT INTO {table} VALUES ({', '.join('?' for _ in names)}) ON CONFLICT({KEYS[table]}) DO UPDATE SET {body} "
+        f"INSERT INTO {table} VALUES ({', '.join('?' for _ in names)}) ON "
+        f"CONFLICT({KEYS[table]}) DO UPDATE SET {body} "
         "WHERE excluded.version > version",
         rows,
     )

@@ -1,8 +1,10 @@
-"""The executor's selector that learns: it turns the executor's records into records of learning, and chooses by them.
+"""The executor's selector that learns: it turns the executor's records into records of learning,
+and chooses by them.
 
-It stands on two sides of the executor: as its `Selector` it is asked for actions, as an `Observer` it sees everything that
-happens. Its state changes by what it observes alone, never by being asked, and times are kept to the microsecond, as journals
-keep them; so a resumed run, whose recorded steps are shown to it again, has the same state as one that was never interrupted.
+It stands on two sides of the executor: as its `Selector` it is asked for actions, as an `Observer`
+it sees everything that happens. Its state changes by what it observes alone, never by being asked,
+and times are kept to the microsecond, as journals keep them; so a resumed run, whose recorded steps
+are shown to it again, has the same state as one that was never interrupted.
 """
 
 from __future__ import annotations
@@ -14,18 +16,24 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.conditions import ConditionError, ConditionFault, Expression
-from coordinator.conditions import parse as parse_condition
-from coordinator.engine import State
-from coordinator.engine.instructions import Corrected, Fired, Instruction, RunRecorded, StartRun
-from coordinator.engine.state import Phase
-from coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
-from coordinator.learning.estimate import Observation
-from coordinator.learning.learning import Learning
-from coordinator.learning.records import Choice, Correction, End, Passage, Record
-from coordinator.mission.partners import FirstAlternative
-from coordinator.task import Task
-from services.comm.notice import Progress
+from petrobot.coordinator.conditions import ConditionError, ConditionFault, Expression
+from petrobot.coordinator.conditions import parse as parse_condition
+from petrobot.coordinator.engine import State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Fired,
+    Instruction,
+    RunRecorded,
+    StartRun,
+)
+from petrobot.coordinator.engine.state import Phase
+from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
+from petrobot.coordinator.learning.estimate import Observation
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.notice import Progress
 
 LARGEST = 1e150
 """Numbers of results from here on are no costs: their squares could not be summed."""
@@ -37,7 +45,8 @@ class ContextError(ValueError):
 
 @dataclass(frozen=True)
 class Contexts:
-    """What contexts are told apart by: names of parameters and variables, and conditions on them."""
+    """What contexts are told apart by: names of parameters and variables, and conditions on
+    them."""
 
     parts: tuple[str, ...] = ()
 
@@ -61,12 +70,14 @@ class Contexts:
         for condition in self.conditions:
             for name in sorted(condition.names - known):
                 raise ContextError(
-                    f"context {condition.text!r}: {task.name} has no parameter or variable {name!r}; "
+                    f"context {condition.text!r}: {task.name} has no parameter or variable "
+                    f"{name!r}; "
                     f"it has: {', '.join(sorted(known)) or 'none'}"
                 )
 
     def of(self, values: Mapping[str, Any]) -> str:
-        """The context now, as text: `regime=B`, `light < 0.3=true`; several parts are joined by a comma."""
+        """The context now, as text: `regime=B`, `light < 0.3=true`; several parts are joined by a
+        comma."""
         return ", ".join(f"{c.text}={_judged(c, values)}" for c in self.conditions)
 
 
@@ -99,10 +110,12 @@ class _Going:
 class LearningSelector(FirstAlternative):
     """Implements `Selector` and `Observer` over a `Learning`.
 
-    `chosen`: actions that the user fixed; what is learned of them counts nevertheless. `live`: records are applied as they
-    come; False for a worker of a campaign, whose records are applied later, in order, to the one state of all. `generation`:
-    how many mission runs were learned from before, so that the draws of a second run with the same seed are others. `declared`:
-    in lock step the compute time (s) of each action as services.toml declares it, so that measured CPU time never steers there.
+    `chosen`: actions that the user fixed; what is learned of them counts nevertheless. `live`:
+    records are applied as they come; False for a worker of a campaign, whose records are applied
+    later, in order, to the one state of all. `generation`: how many mission runs were learned from
+    before, so that the draws of a second run with the same seed are others. `declared`: in lock
+    step the compute time (s) of each action as services.toml declares it, so that measured CPU time
+    never steers there.
     """
 
     def __init__(
@@ -127,7 +140,8 @@ class LearningSelector(FirstAlternative):
         self._values: Mapping[str, Any] = {}
         self._going: dict[str, _Going] = {}
         self._deferred: dict[str, tuple[End, int]] = {}
-        """Runs whose verdict may still come, each with the trials of its primitive task and context up to then."""
+        """Runs whose verdict may still come, each with the trials of its primitive task and context
+        up to then."""
         self._trials: Counter[tuple[str, str]] = Counter()
         self._waiting: dict[str, float] = {}
         self._watched = _waits_for_events(learning.task)
@@ -137,12 +151,17 @@ class LearningSelector(FirstAlternative):
         """The context now."""
         return self.contexts.of(self._values)
 
-    # --- selector --------------------------------------------------------------------------------------------------
+    # --- selector -----------------------------------------------------------------------------
 
     def choose(
-        self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
+        self,
+        task: str,
+        run: str,
+        alternatives: tuple[str, ...],
+        variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
-        """The user's choice, else the selector's. (The operator's own is the executor's: it stands in the engine's state.)"""
+        """The user's choice, else the selector's. (The operator's own is the executor's: it stands
+        in the engine's state.)"""
         if task in self._chosen or task not in self.learning.selectors:
             return super().choose(task, run, alternatives, variables)
         context = self.contexts.of(self._values if variables is None else variables)
@@ -150,12 +169,17 @@ class LearningSelector(FirstAlternative):
         return self.learning.choose(task, context, alternatives, rng)
 
     def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
-        """Probability of each alternative in the context now, and its R, C and J where they are known."""
+        """Probability of each alternative in the context now, and its R, C and J where they are
+        known."""
         selector = self.learning.selectors.get(task)
         if selector is None:
             return {}
         batch, shares = selector.learner(self.context), selector.probabilities(self.context)
-        known = {"reliability": batch.reliability(), "cost": batch.mean_cost(), "j": batch.objective()}
+        known = {
+            "reliability": batch.reliability(),
+            "cost": batch.mean_cost(),
+            "j": batch.objective(),
+        }
         shown: dict[str, dict[str, float]] = {}
         for i, action in enumerate(selector.actions):
             shown[action] = {"probability": shares[action]}
@@ -163,7 +187,7 @@ class LearningSelector(FirstAlternative):
                 shown[action] |= {name: float(values[0, i]) for name, values in known.items()}
         return shown
 
-    # --- observer --------------------------------------------------------------------------------------------------
+    # --- observer -----------------------------------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Keep what a choice was made on, and what a run's result says beside its status."""
@@ -202,7 +226,7 @@ class LearningSelector(FirstAlternative):
             else:
                 self._waiting.pop(name, None)
 
-    # --- records ---------------------------------------------------------------------------------------------------
+    # --- records ------------------------------------------------------------------------------
 
     def _run(self, now: float, run: str) -> _Going:
         return self._going.setdefault(run, _Going(now))
@@ -233,7 +257,11 @@ class LearningSelector(FirstAlternative):
         context = self.context if going.context is None else going.context
         preempted = (going.taken_by or "") if record.cancelled else None
         until = going.taken_at if preempted else now
-        seconds = max(0.0, record.seconds) if preempted is None else round(max(0.0, until - going.entered), 6)
+        seconds = (
+            max(0.0, record.seconds)
+            if preempted is None
+            else round(max(0.0, until - going.entered), 6)
+        )
         result = going.ended
         outcome = Observation(
             record.status,
@@ -246,7 +274,10 @@ class LearningSelector(FirstAlternative):
             round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
         )
         end = End(record.primitive_task, record.action, context, outcome)
-        selector, where = self.learning.selectors.get(end.primitive_task), (end.primitive_task, context)
+        selector, where = (
+            self.learning.selectors.get(end.primitive_task),
+            (end.primitive_task, context),
+        )
         if selector is not None and selector.learns_from(end.action, outcome):
             self._trials[where] += 1
         if record.deferred:
@@ -254,8 +285,12 @@ class LearningSelector(FirstAlternative):
         self._note(end)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
-        """CPU seconds as measured; as declared where they are the cost and the run must come out the same again."""
-        if self._declared is not None and self.learning.question(record.primitive_task).measure == "cpu":
+        """CPU seconds as measured; as declared where they are the cost and the run must come out
+        the same again."""
+        if (
+            self._declared is not None
+            and self.learning.question(record.primitive_task).measure == "cpu"
+        ):
             return self._declared.get(record.action, 0.0)
         return None if result is None else result.cpu_seconds
 
@@ -268,7 +303,8 @@ class LearningSelector(FirstAlternative):
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of a result; anything else is no cost. What is not finite would spoil every sum that it came into."""
+    """The numbers of a result; anything else is no cost. What is not finite would spoil every sum
+    that it came into."""
     return {
         name: float(value)
         for name, value in sorted(values.items())
@@ -278,4 +314,8 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
 
 def _waits_for_events(task: Task) -> Sequence[str]:
     """Transitions that wait for events alone, not for a run."""
-    return [t.name for t in task.flat.transitions.values() if t.events and all(a.end is None for a in t.inputs)]
+    return [
+        t.name
+        for t in task.flat.transitions.values()
+        if t.events and all(a.end is None for a in t.inputs)
+    ]

@@ -1,4 +1,5 @@
-"""One mission run that learns: opened on an estimates file, written down for a resume, and saved once."""
+"""One mission run that learns: opened on an estimates file, written down for a resume, and saved
+once."""
 
 from __future__ import annotations
 
@@ -8,18 +9,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
-from coordinator.experience.learner import Contexts, LearningSelector, usual_contexts
-from coordinator.learning.learning import Estimates, Learning
-from coordinator.learning.objective import Question
-from coordinator.learning.records import Correction, End
-from coordinator.learning.selectors import DEFAULT, RULES
-from coordinator.task import Task
+from petrobot.coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.experience.learner import Contexts, LearningSelector, usual_contexts
+from petrobot.coordinator.learning.learning import Estimates, Learning
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Correction, End
+from petrobot.coordinator.learning.selectors import DEFAULT, RULES
+from petrobot.coordinator.task import Task
 
 
 @dataclass(frozen=True)
 class LearningSetting:
-    """How a mission run learns. `contexts`: what is told apart (None: the regime, if the task has one)."""
+    """How a mission run learns. `contexts`: what is told apart (None: the regime, if the task has
+    one)."""
 
     path: Path
     selector: str = DEFAULT
@@ -49,30 +51,48 @@ class LearningSetting:
     def of_plain(cls, data: Mapping[str, Any]) -> LearningSetting:
         """What `to_plain` gave."""
         contexts = None if data["contexts"] is None else tuple(data["contexts"])
-        given = (data["selector"], data["target"], contexts, data["chosen"], data["frozen"], data["declared"])
+        given = (
+            data["selector"],
+            data["target"],
+            contexts,
+            data["chosen"],
+            data["frozen"],
+            data["declared"],
+        )
         return cls(Path(data["path"]), *given)
 
 
 class LearningSession:
     """The learning of one mission run, between an estimates file and the executor.
 
-    `begun`: the selectors' states and the generation when the run began, as `beginning()` gave them (for a resumed run; None:
-    as the file has them). Raises EstimatesError, ContextError, ValueError.
+    `begun`: the selectors' states and the generation when the run began, as `beginning()` gave them
+    (for a resumed run; None: as the file has them). Raises EstimatesError, ContextError,
+    ValueError.
     """
 
-    def __init__(self, task: Task, setting: LearningSetting, seed: int, begun: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        setting: LearningSetting,
+        seed: int,
+        begun: Mapping[str, Any] | None = None,
+    ) -> None:
         if setting.selector not in RULES:
             raise ValueError(f"no selector {setting.selector!r}; there are: {', '.join(RULES)}")
         self.setting = setting
         self.file = EstimatesFile(setting.path)
         if setting.frozen and not setting.path.exists():
-            raise EstimatesError(f"{setting.path}: no such file, so nothing was learned to be frozen; learn first")
+            raise EstimatesError(
+                f"{setting.path}: no such file, so nothing was learned to be frozen; learn first"
+            )
         kept = self.file.read()
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
         generation = kept.generation if begun is None else int(begun["generation"])
         self._generation = generation
         self._token = secrets.token_hex(8) if begun is None else str(begun["token"])
-        self.learning = _learning(task, setting, kept, None if begun is None else begun["selectors"], self._token)
+        self.learning = _learning(
+            task, setting, kept, None if begun is None else begun["selectors"], self._token
+        )
         self._begun = self.learning.state()
         self.selector = LearningSelector(
             self.learning,
@@ -92,19 +112,25 @@ class LearningSession:
     def save(self, *, interrupted: bool = False) -> int:
         """Add what was learned to the file; gives the number of runs that were counted.
 
-        `interrupted`: the mission run may be resumed; what is saved of it now will not be counted again then.
+        `interrupted`: the mission run may be resumed; what is saved of it now will not be counted
+        again then.
         """
         if self.setting.frozen:
             return 0
         done = self.file.records_of(self._token)
         gained, late = (self.learning.gained, ()) if not done else self._gained_after(done)
         counted = len(self.selector.records) if interrupted else None
-        self.file.add(gained, self.learning.state(), self._token, counted, late, self.learning.asked())
+        self.file.add(
+            gained, self.learning.state(), self._token, counted, late, self.learning.asked()
+        )
         return sum(t.runs + t.censored for t in gained.tallies.values())
 
     def _gained_after(self, done: int) -> tuple[Estimates, Sequence[Correction]]:
-        """What came after so many records, and the verdicts in it on runs that the file has counted already."""
-        counted = {id(record.outcome) for record in self.selector.records[:done] if isinstance(record, End)}
+        """What came after so many records, and the verdicts in it on runs that the file has counted
+        already."""
+        counted = {
+            id(record.outcome) for record in self.selector.records[:done] if isinstance(record, End)
+        }
         gained, late = Estimates(), []
         for record in self.selector.records[done:]:
             if isinstance(record, Correction) and id(record.was) in counted:
@@ -115,9 +141,14 @@ class LearningSession:
 
 
 def _learning(
-    task: Task, setting: LearningSetting, kept: Kept, states: Mapping[str, Mapping[str, Any]] | None, salt: str
+    task: Task,
+    setting: LearningSetting,
+    kept: Kept,
+    states: Mapping[str, Mapping[str, Any]] | None,
+    salt: str,
 ) -> Learning:
-    """`salt` names the session, so that its runs in the kept sample are told from any other's, a copied file's included."""
+    """`salt` names the session, so that its runs in the kept sample are told from any other's, a
+    copied file's included."""
     question = Question(target=setting.target)
     learning = Learning(task, setting.selector, question, kept.estimates, salt)
     try:
@@ -135,7 +166,8 @@ def _learning(
 
 
 def session_of(task: Task, header: Mapping[str, Any]) -> LearningSession | None:
-    """The session of a recorded run, as it began; None if it did not learn. Raises EstimatesError, ValueError."""
+    """The session of a recorded run, as it began; None if it did not learn. Raises EstimatesError,
+    ValueError."""
     begun = header.get("learning")
     if begun is None:
         return None

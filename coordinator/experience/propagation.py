@@ -1,7 +1,9 @@
-"""From actions to primitive tasks to the task: measured estimates into the stochastic view, and R, C and J back out of it.
+"""From actions to primitive tasks to the task: measured estimates into the stochastic view, and R,
+C and J back out of it.
 
-The net decides how numbers compose: branches, loops, races and recoveries are the stochastic view's (docs/analysis.md). Where the
-net is a mere series, all must come to the conjunctive product R = R_1 R_2 ..., C = C_1 + C_2 + ..., which is kept as a cross-check.
+The net decides how numbers compose: branches, loops, races and recoveries are the stochastic view's
+(docs/analysis.md). Where the net is a mere series, all must come to the conjunctive product R = R_1
+R_2 ..., C = C_1 + C_2 + ..., which is kept as a cross-check.
 """
 
 from __future__ import annotations
@@ -12,22 +14,22 @@ from functools import reduce
 from math import log, nan, prod, sqrt
 from typing import Any
 
-from coordinator.analysis.forecast import Forecast, forecast
-from coordinator.analysis.graph import sum_by
-from coordinator.analysis.space import Limits
-from coordinator.analysis.stochastic import Measured, is_cause, stochastic_view
-from coordinator.learning.competing import Incidence, incidences
-from coordinator.learning.estimate import CENSORED, Tally, merge
-from coordinator.learning.learning import Estimates
-from coordinator.learning.objective import cost_weight, objective
-from coordinator.task import Estimate, Kind, Status, Task
+from petrobot.coordinator.analysis.forecast import Forecast, forecast
+from petrobot.coordinator.analysis.graph import sum_by
+from petrobot.coordinator.analysis.space import Limits
+from petrobot.coordinator.analysis.stochastic import Measured, is_cause, stochastic_view
+from petrobot.coordinator.learning.competing import Incidence, incidences
+from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import cost_weight, objective
+from petrobot.coordinator.task import Estimate, Kind, Status, Task
 
 Choice = Mapping[str, Mapping[str, float]]
 SHORTEST = 1e-3
 """Seconds that an end takes at least in the stochastic view, which knows no duration 0."""
 
 
-# --- in ------------------------------------------------------------------------------------------------------------------
+# --- in ---------------------------------------------------------------------------------------
 
 
 def measured_from(
@@ -35,9 +37,10 @@ def measured_from(
 ) -> Measured:
     """What the stochastic view needs, from estimates of one context (None: of all together).
 
-    `choice` are the selector's probabilities by primitive task; None: the alternatives were chosen as often as they ran.
-    Runs of a preempted place are competing risks of their own ends and the events or timers that preempt them. What preempts as
-    soon as the marking allows it (another run has ended) is no such risk but a mere cut-off, as an abort is: the net says when.
+    `choice` are the selector's probabilities by primitive task; None: the alternatives were chosen
+    as often as they ran. Runs of a preempted place are competing risks of their own ends and the
+    events or timers that preempt them. What preempts as soon as the marking allows it (another run
+    has ended) is no such risk but a mere cut-off, as an abort is: the net says when.
     """
     runs: dict[tuple[str, str], dict[Status, Estimate]] = {}
     preempted: dict[tuple[str, str], dict[str, Estimate]] = {}
@@ -81,7 +84,9 @@ def _ends(tally: Tally, takers: set[str]) -> tuple[dict[Status, Estimate], dict[
     laws = _exact(tally, causes) if None not in causes.values() else _incident(tally, causes)
     own = {
         Status(c): Estimate(
-            law.share, max(law.mean + extra, SHORTEST), law.cv * law.mean / max(law.mean + extra, SHORTEST)
+            law.share,
+            max(law.mean + extra, SHORTEST),
+            law.cv * law.mean / max(law.mean + extra, SHORTEST),
         )
         for c, law in laws.items()
         if not c.startswith("by:")
@@ -95,7 +100,8 @@ def _ends(tally: Tally, takers: set[str]) -> tuple[dict[Status, Estimate], dict[
 
 
 def _cause(exit_: str, takers: set[str]) -> str | None:
-    """By what a run ended: a status, `by:` a transition; None: it was cut off, and would have ended otherwise."""
+    """By what a run ended: a status, `by:` a transition; None: it was cut off, and would have ended
+    otherwise."""
     status, _, transition = exit_.partition(":")
     if not transition:
         return None if status == CENSORED else status
@@ -121,7 +127,8 @@ def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | I
 
 
 def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | Incidence]:
-    """Some runs were cut off: Aalen-Johansen over the kept sample, at a constant rate beyond its longest run."""
+    """Some runs were cut off: Aalen-Johansen over the kept sample, at a constant rate beyond its
+    longest run."""
     kept = tally.sample.kept
     times, ends = [k.seconds for k in kept], [causes.get(k.exit) for k in kept]
     left, longest = unended(times, ends)
@@ -132,16 +139,20 @@ def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law 
 
 
 def unended(times: Sequence[float], causes: Sequence[str | None]) -> tuple[float, float]:
-    """Probability that a run has not ended by the longest time seen (Kaplan and Meier's estimate), and that time (s)."""
+    """Probability that a run has not ended by the longest time seen (Kaplan and Meier's estimate),
+    and that time (s)."""
     left, going = 1.0, len(times)
-    for _, cause in sorted(zip(times, causes, strict=True), key=lambda pair: (pair[0], pair[1] is None)):
+    for _, cause in sorted(
+        zip(times, causes, strict=True), key=lambda pair: (pair[0], pair[1] is None)
+    ):
         left *= 1.0 if cause is None else 1.0 - 1.0 / going
         going -= 1
     return left, max(times, default=0.0)
 
 
 def _with_tail(law: Incidence, left: float, longest: float, mean: float) -> _Law:
-    """A law whose part `left` ends after `longest` s, by an exponential time of this mean (s) later."""
+    """A law whose part `left` ends after `longest` s, by an exponential time of this mean (s)
+    later."""
     first = (1 - left) * law.mean + left * (longest + mean)
     own = (law.cv**2 + 1) * law.mean**2
     second = (1 - left) * own + left * (longest**2 + 2 * longest * mean + 2 * mean**2)
@@ -169,11 +180,14 @@ def _with_missing(
 
 
 def _shares(often: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
-    return {task: {a: n / sum(runs.values()) for a, n in runs.items()} for task, runs in often.items()}
+    return {
+        task: {a: n / sum(runs.values()) for a, n in runs.items()} for task, runs in often.items()
+    }
 
 
 def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """Mean wait (s) for each event of a transition that only waits: waited seconds over occurrences."""
+    """Mean wait (s) for each event of a transition that only waits: waited seconds over
+    occurrences."""
     waited: dict[str, list[float]] = {}
     for key, flow in estimates.flows.items():
         if (
@@ -190,7 +204,8 @@ def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, f
 
 
 def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """How often each transition with a condition fired: relative frequencies among those that compete."""
+    """How often each transition with a condition fired: relative frequencies among those that
+    compete."""
     fired: dict[str, float] = {}
     for key, flow in estimates.flows.items():
         transition = task.flat.transitions.get(key.transition)
@@ -200,12 +215,13 @@ def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str
     return fired
 
 
-# --- out -----------------------------------------------------------------------------------------------------------------
+# --- out --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A primitive task, its alternatives mixed as they are chosen: R, mean C, J, and expected runs in one mission run."""
+    """A primitive task, its alternatives mixed as they are chosen: R, mean C, J, and expected runs
+    in one mission run."""
 
     primitive_task: str
     reliability: float
@@ -216,14 +232,17 @@ class Part:
 
 @dataclass(frozen=True)
 class Propagated:
-    """R and C of the task. R_conj, R_goal and P_complete are three numbers, not one (docs/analysis.md)."""
+    """R and C of the task. R_conj, R_goal and P_complete are three numbers, not one
+    (docs/analysis.md)."""
 
     parts: Mapping[str, Part]
     forecast: Forecast
     cost: float
-    """Expected cost of a mission run: it adds over runs, parallel branches included. Time is the forecast's, not this."""
+    """Expected cost of a mission run: it adds over runs, parallel branches included. Time is the
+    forecast's, not this."""
     product: float
-    """The conjunctive product over the primitive tasks that a mission run always has: equal to R_conj in a mere series."""
+    """The conjunctive product over the primitive tasks that a mission run always has: equal to
+    R_conj in a mere series."""
 
     @property
     def conjunctive(self) -> float:
@@ -252,8 +271,9 @@ def propagate(
 ) -> Propagated:
     """R, C and J of primitive tasks and of the whole task, from actions' estimates through the net.
 
-    `measure` is the cost to add up (None: what each primitive task declares, so its unit may differ by part and the task's
-    sum is only meaningful if it does not). Raises NoEstimate and ValueError as the stochastic view does.
+    `measure` is the cost to add up (None: what each primitive task declares, so its unit may differ
+    by part and the task's sum is only meaningful if it does not). Raises NoEstimate and ValueError
+    as the stochastic view does.
     """
     measured = measured_from(task, estimates, context, choice)
     solved = forecast(stochastic_view(task, measured), limits=limits)

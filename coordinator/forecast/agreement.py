@@ -1,9 +1,12 @@
-"""Whether a measurement agrees with a forecast that was registered before: predictive tests, Holm, equivalence, whole law.
+"""Whether a measurement agrees with a forecast that was registered before: predictive tests, Holm,
+equivalence, whole law.
 
-Shares: a beta-binomial predictive law whose weight is that of the forecast's own uncertainty (Jeffreys prior), so a share of 1
-that was forecast from n throws still expects a miss in a further n. Times: normal with the bootstrap's predictive deviation. Many
-comparisons: S. Holm, Scandinavian Journal of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is
-the measurement's 90 % interval lies within the margin about the forecast number (D. J. Schuirmann, 1987).
+Shares: a beta-binomial predictive law whose weight is that of the forecast's own uncertainty
+(Jeffreys prior), so a share of 1 that was forecast from n throws still expects a miss in a further
+n. Times: normal with the bootstrap's predictive deviation. Many comparisons: S. Holm, Scandinavian
+Journal of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is the
+measurement's 90 % interval lies within the margin about the forecast number (D. J. Schuirmann,
+1987).
 """
 
 from __future__ import annotations
@@ -15,11 +18,16 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom, chi2_contingency, norm, t
 
-from coordinator.forecast.history import Training, Values
-from coordinator.forecast.predict import GRID, SHARES, figures
-from coordinator.forecast.residual import measured, routing, ways_table
-from coordinator.forecast.shares import holm, predictive_interval, share_p_value, share_weight
-from coordinator.learning.intervals import wilson
+from petrobot.coordinator.forecast.history import Training, Values
+from petrobot.coordinator.forecast.predict import GRID, SHARES, figures
+from petrobot.coordinator.forecast.residual import measured, routing, ways_table
+from petrobot.coordinator.forecast.shares import (
+    holm,
+    predictive_interval,
+    share_p_value,
+    share_weight,
+)
+from petrobot.coordinator.learning.intervals import wilson
 
 FAMILY = ("R_goal", "P_complete", "mean", "q90")
 """What is judged together by Holm, in all regimes."""
@@ -30,10 +38,14 @@ EQUIVALENCE = 0.90
 
 
 def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> dict[str, Any]:
-    """Compare each regime's forecast with what was measured. Raises ValueError if they have no regime in common."""
+    """Compare each regime's forecast with what was measured. Raises ValueError if they have no
+    regime in common."""
     common = [name for name in forecast["regimes"] if name in regimes]
     if not common:
-        raise ValueError(f"the campaign ran {', '.join(regimes)}, the forecast is of {', '.join(forecast['regimes'])}")
+        raise ValueError(
+            f"the campaign ran {', '.join(regimes)}, the forecast is of "
+            f"{', '.join(forecast['regimes'])}"
+        )
     rows, controls, laws, ways = [], [], [], []
     for name in common:
         said, training = forecast["regimes"][name], regimes[name]
@@ -84,16 +96,21 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
         low, high = wilson(round(value * n), n, EQUIVALENCE)
         row["margin"] = MARGIN_SHARE
     else:
-        row["p"] = time_p_value(found["value"], found["sd"], value, said["runs"], len(times), said["training_throws"])
+        row["p"] = time_p_value(
+            found["value"], found["sd"], value, said["runs"], len(times), said["training_throws"]
+        )
         low, high = mean_interval(times) if figure == "mean" else quantile_interval(times, 0.9)
         row["margin"] = round(MARGIN_TIME * found["value"], 6)
     row["measured_90"] = [round(low, 6), round(high, 6)]
-    row["equivalent"] = abs(low - found["value"]) <= row["margin"] and abs(high - found["value"]) <= row["margin"]
+    row["equivalent"] = (
+        abs(low - found["value"]) <= row["margin"] and abs(high - found["value"]) <= row["margin"]
+    )
     return row
 
 
 def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, training: int) -> float:
-    """Two-sided p-value of a time of n new throws, given the predictive deviation for `runs` of them (both from n^-1/2 laws)."""
+    """Two-sided p-value of a time of n new throws, given the predictive deviation for `runs` of
+    them (both from n^-1/2 laws)."""
     scaled = sd * math.sqrt((1.0 / n + 1.0 / training) / (1.0 / runs + 1.0 / training))
     if scaled <= 0.0:
         return 1.0 if seen == value else 0.0
@@ -116,7 +133,9 @@ def quantile_interval(times: Values, q: float, level: float = EQUIVALENCE) -> tu
     ordered, n = np.sort(times), len(times)
     low = int(binom.ppf((1 - level) / 2, n, q))
     high = int(binom.ppf((1 + level) / 2, n, q)) + 1
-    return (float(ordered[low - 1]) if low >= 1 else -math.inf), (float(ordered[high - 1]) if high <= n else math.inf)
+    return (float(ordered[low - 1]) if low >= 1 else -math.inf), (
+        float(ordered[high - 1]) if high <= n else math.inf
+    )
 
 
 def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
@@ -124,11 +143,18 @@ def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[s
     value, n = said["product"]["R_conj"], len(training.throws)
     seen = figures(measured(training))["R_conj"]
     p = share_p_value(value, float(said["training_throws"]), round(seen * n), n)
-    return {"regime": regime, "forecast": value, "measured": round(seen, 6), "p": p, "rejected": p < LEVEL}
+    return {
+        "regime": regime,
+        "forecast": value,
+        "measured": round(seen, 6),
+        "p": p,
+        "rejected": p < LEVEL,
+    }
 
 
 def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
-    """Kolmogorov's distance between the measured and the forecast law of the time; its 99 % point is the bootstrap's."""
+    """Kolmogorov's distance between the measured and the forecast law of the time; its 99 % point
+    is the bootstrap's."""
     played = measured(training)
     times = np.sort(played.time[~np.isnan(played.time)])
     if not len(times) or not said["law"]["s"]:
@@ -139,14 +165,29 @@ def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, 
     q = np.array(GRID)
     distance = float(np.max(np.maximum(q - at, 0.0) + np.maximum(below - q, 0.0)))
     limit = said["distance_99"] * max(1.0, math.sqrt(said["runs"] / len(times)))
-    return {"regime": regime, "distance": round(distance, 4), "limit": round(limit, 4), "agrees": distance <= limit}
+    return {
+        "regime": regime,
+        "distance": round(distance, 4),
+        "limit": round(limit, 4),
+        "agrees": distance <= limit,
+    }
 
 
-def _routing(regime: str, before: Mapping[str, Any], after: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """For each place: chi-square test that training and new throws left it by the same ways equally often."""
+def _routing(
+    regime: str, before: Mapping[str, Any], after: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """For each place: chi-square test that training and new throws left it by the same ways equally
+    often."""
     rows = []
     for place in before:
         table = ways_table(before[place], after.get(place, {}))
         if table.shape[1] > 1 and table.sum(axis=1).min() > 0:
-            rows.append({"regime": regime, "place": place, "p": float(chi2_contingency(table).pvalue), "p_holm": None})
+            rows.append(
+                {
+                    "regime": regime,
+                    "place": place,
+                    "p": float(chi2_contingency(table).pvalue),
+                    "p_holm": None,
+                }
+            )
     return rows

@@ -1,4 +1,5 @@
-"""Whether a campaign chooses as a forecast says that it will: other actions are another forecast's matter."""
+"""Whether a campaign chooses as a forecast says that it will: other actions are another forecast's
+matter."""
 
 from __future__ import annotations
 
@@ -8,12 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2_contingency
 
-from coordinator.forecast.history import Training
+from petrobot.coordinator.forecast.history import Training
 
 Counts = Mapping[str, Mapping[str, float]]
 """By primitive task and action: runs."""
 OTHER = 1e-6
-"""Level below which two mixes of actions are not the same one: far beyond any chance, since refusing is not a test's verdict."""
+"""Level below which two mixes of actions are not the same one: far beyond any chance, since
+refusing is not a test's verdict."""
 FEW = 30
 """Runs in which a mix shows; fewer runs of one action alone say nothing about the others."""
 
@@ -31,12 +33,19 @@ def choice_counts(training: Training) -> dict[str, dict[str, int]]:
 def choices_of(training: Training) -> dict[str, dict[str, float]]:
     """How often each action was chosen, as shares."""
     counts = choice_counts(training)
-    return {t: {a: n / sum(actions.values()) for a, n in actions.items()} for t, actions in counts.items()}
+    return {
+        t: {a: n / sum(actions.values()) for a, n in actions.items()}
+        for t, actions in counts.items()
+    }
 
 
 def misfit(said: Mapping[str, Any], run: Counts) -> list[str]:
     """Primitive tasks whose actions a campaign chooses otherwise than a regime's forecast says."""
-    return [name for name, counts in run.items() if name in said["choices"] and not _alike(said, name, counts)]
+    return [
+        name
+        for name, counts in run.items()
+        if name in said["choices"] and not _alike(said, name, counts)
+    ]
 
 
 def _alike(said: Mapping[str, Any], name: str, counts: Mapping[str, float]) -> bool:
@@ -48,7 +57,9 @@ def _alike(said: Mapping[str, Any], name: str, counts: Mapping[str, float]) -> b
     known = [a for a in {**chosen, **counts} if chosen.get(a, 0.0) > 0 or counts.get(a, 0) > 0]
     if len(known) < 2 or not sum(counts.values()):
         return True
-    table = np.array([[chosen.get(a, 0.0) * trained for a in known], [counts.get(a, 0.0) for a in known]])
+    table = np.array(
+        [[chosen.get(a, 0.0) * trained for a in known], [counts.get(a, 0.0) for a in known]]
+    )
     return float(chi2_contingency(table).pvalue) >= OTHER
 
 
@@ -59,7 +70,11 @@ def in_words(choices: Counts, names: Iterable[str]) -> str:
         whole = sum(choices[name].values())
         shares = {a: n / whole for a, n in choices[name].items() if n > 0}
         sole = next(iter(shares)) if len(shares) == 1 else ""
-        out.append(f"{name}={sole}" if sole else f"{name}: " + ", ".join(f"{a} {p:.0%}" for a, p in shares.items()))
+        out.append(
+            f"{name}={sole}"
+            if sole
+            else f"{name}: " + ", ".join(f"{a} {p:.0%}" for a, p in shares.items())
+        )
     return "; ".join(out)
 
 

@@ -1,4 +1,5 @@
-"""Runs of a campaign as arrays: what each came to, how long it took, and what had ended before it in its throw."""
+"""Runs of a campaign as arrays: what each came to, how long it took, and what had ended before it
+in its throw."""
 
 from __future__ import annotations
 
@@ -8,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.analysis.stochastic import is_cause
-from coordinator.campaign.rows import Row
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.task import End, Kind, Status, Task, Transition
+from petrobot.coordinator.analysis.stochastic import is_cause
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.task import End, Kind, Status, Task, Transition
 
 Codes = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -33,26 +34,37 @@ class Vocabulary:
     transitions: tuple[str, ...]
     actions: tuple[str, ...]
     open: frozenset[str] = frozenset()
-    """Places whose ended runs the marking alone does not lead on (an event, a timer or a variable decides): there the transition
-    that took a run belongs to its outcome; elsewhere it follows from the statuses and from what else has ended."""
+    """Places whose ended runs the marking alone does not lead on (an event, a timer or a variable
+    decides): there the transition that took a run belongs to its outcome; elsewhere it follows from
+    the statuses and from what else has ended."""
     cutting: frozenset[str] = frozenset()
-    """Transitions that preempt as soon as the marking allows it: they cut runs off, whose own ends are then not known."""
+    """Transitions that preempt as soon as the marking allows it: they cut runs off, whose own ends
+    are then not known."""
 
     @classmethod
     def of(cls, task: Task) -> Vocabulary:
         """Of a task."""
         flat = task.flat
-        taking = [t for t in flat.transitions.values() if t.events or t.after is not None or reads_variables(t)]
+        taking = [
+            t
+            for t in flat.transitions.values()
+            if t.events or t.after is not None or reads_variables(t)
+        ]
         cutting = [
-            t.name for t in flat.transitions.values() if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
+            t.name
+            for t in flat.transitions.values()
+            if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
         ]
         actions = dict.fromkeys(a for p in flat.primitive_tasks.values() for a in p.alternatives)
         places = tuple(p.name for p in flat.places.values() if p.kind is Kind.ACTION)
-        undecided = frozenset(a.place for t in taking for a in t.inputs if a.end in (End.NORMAL, End.ERROR))
+        undecided = frozenset(
+            a.place for t in taking for a in t.inputs if a.end in (End.NORMAL, End.ERROR)
+        )
         return cls(places, tuple(flat.transitions), tuple(actions), undecided, frozenset(cutting))
 
     def outcome(self, status: int, taken: int) -> int:
-        """One code, above 0, for a status code and the transition that took the token (-1: none did)."""
+        """One code, above 0, for a status code and the transition that took the token (-1: none
+        did)."""
         return CUT + (status + 1) * (len(self.transitions) + 1) + taken + 1
 
     def parts(self, outcome: Codes) -> tuple[Codes, Codes]:
@@ -77,16 +89,28 @@ class Seen:
     def nothing(cls, q: int, n: int) -> Seen:
         """Nothing has ended yet."""
         return cls(
-            np.zeros((q, n), np.int64), np.zeros((q, n), np.int64), np.full((q, n), np.nan), np.zeros((q, n), np.int64)
+            np.zeros((q, n), np.int64),
+            np.zeros((q, n), np.int64),
+            np.full((q, n), np.nan),
+            np.zeros((q, n), np.int64),
         )
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Seen:
         """Some columns."""
-        return Seen(self.outcome[:, which], self.action[:, which], self.took[:, which], self.visits[:, which])
+        return Seen(
+            self.outcome[:, which],
+            self.action[:, which],
+            self.took[:, which],
+            self.visits[:, which],
+        )
 
     def note(self, q: int, columns: Codes, outcome: Codes, action: Codes, took: Values) -> None:
         """Runs have ended in a place."""
-        self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = outcome, action, took
+        self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = (
+            outcome,
+            action,
+            took,
+        )
         self.visits[q, columns] += 1
 
 
@@ -138,7 +162,8 @@ class Training:
     waits: dict[str, tuple[Values, Codes]]
     """By waiting transition: seconds of each firing, and the throw that it belongs to."""
     whole: bool = True
-    """Its throws are those that were run; else each holds a single run or wait, and what a throw came to is not known."""
+    """Its throws are those that were run; else each holds a single run or wait, and what a throw
+    came to is not known."""
 
     @classmethod
     def of(cls, task: Task, throws: Iterable[Throw], *, whole: bool = True) -> Training:
@@ -149,14 +174,20 @@ class Training:
         waits: dict[str, list[tuple[float, int]]] = {}
         timers = _cutting_timers(task)
         for i, throw in enumerate(kept):
-            for name, seconds in (*throw.waits, *((t, s) for t in timers for s in _waited(t, throw))):
+            for name, seconds in (
+                *throw.waits,
+                *((t, s) for t in timers for s in _waited(t, throw)),
+            ):
                 waits.setdefault(name, []).append((seconds, i))
         return cls(
             task,
             vocabulary,
             kept,
             _runs(vocabulary, kept),
-            {name: (np.array([s for s, _ in w]), np.array([i for _, i in w])) for name, w in waits.items()},
+            {
+                name: (np.array([s for s, _ in w]), np.array([i for _, i in w]))
+                for name, w in waits.items()
+            },
             whole,
         )
 
@@ -171,7 +202,8 @@ def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
 
 
 def _cutting_timers(task: Task) -> list[str]:
-    """Timers that preempt beside other runs and wait for nothing but runs: their waits follow from those that they took."""
+    """Timers that preempt beside other runs and wait for nothing but runs: their waits follow from
+    those that they took."""
     return [
         t.name
         for t in task.flat.transitions.values()
@@ -184,7 +216,8 @@ def _cutting_timers(task: Task) -> list[str]:
 
 
 def _waited(timer: str, throw: Throw) -> list[float]:
-    """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended, where it takes ended ones)."""
+    """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended,
+    where it takes ended ones)."""
     by_place: dict[str, list[RunEntry]] = {}
     for run in throw.runs:
         if run.taken == timer:
@@ -211,7 +244,11 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
         for j in range(begin, end):
             for i in _ended_before(flat, j, begin, end):
                 run = flat[i][1]
-                one = (np.array([codes[i]]), np.array([actions.get(run.action, 0)]), np.array([run.took]))
+                one = (
+                    np.array([codes[i]]),
+                    np.array([actions.get(run.action, 0)]),
+                    np.array([run.took]),
+                )
                 seen.note(places[run.place], np.array([j]), *one)
         begin = end
     return Runs(
@@ -230,7 +267,9 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
 def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int) -> list[int]:
     """Runs of the same throw that had ended when run j began, in the order of their ends."""
     came = flat[j][1].begun
-    over = [i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9]
+    over = [
+        i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9
+    ]
     return sorted((i for i in over if i < j), key=lambda i: flat[i][1].begun + flat[i][1].took)
 
 
@@ -241,7 +280,8 @@ def _outcome(vocabulary: Vocabulary, run: RunEntry) -> int:
 
 
 def _is_cut_off(vocabulary: Vocabulary, run: RunEntry) -> bool:
-    """By a transition that fires as the marking allows, or by nothing of the task (an abort, the end of the records)."""
+    """By a transition that fires as the marking allows, or by nothing of the task (an abort, the
+    end of the records)."""
     if run.cancelled and run.taken in vocabulary.transitions:
         return run.taken in vocabulary.cutting
     return not run.status
@@ -249,4 +289,6 @@ def _is_cut_off(vocabulary: Vocabulary, run: RunEntry) -> bool:
 
 def reads_variables(t: Transition) -> bool:
     """Whether its condition looks at more than the statuses of the runs that it takes."""
-    return t.when is not None and not t.when.names <= {f"{a.place}.status" for a in t.inputs if a.end is not None}
+    return t.when is not None and not t.when.names <= {
+        f"{a.place}.status" for a in t.inputs if a.end is not None
+    }

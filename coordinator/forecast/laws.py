@@ -1,12 +1,16 @@
-"""Laws of runs: empirical competing risks of (outcome, duration) in contexts that chi-square tests tell apart.
+"""Laws of runs: empirical competing risks of (outcome, duration) in contexts that chi-square tests
+tell apart.
 
-Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on which the response depends most
-significantly splits the runs, again and again, until no test rejects independence. Factors are what had ended before in the same
-throw: in each action place outcome, action and duration of the latest run, and the number of runs. First the outcome is unfolded
-so, then, for each outcome of each of these contexts, the duration: so a strong dependence among durations never hides one among
-outcomes. Within a context a duration keeps its linear trend with an earlier one. Runs that were cut off are censored: the ends
-that were seen weigh what the Aalen-Johansen estimate gives them. What it leaves beyond the longest run goes on at a constant rate
-(B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974), and whoever draws it is told.
+Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on
+which the response depends most significantly splits the runs, again and again, until no test
+rejects independence. Factors are what had ended before in the same throw: in each action place
+outcome, action and duration of the latest run, and the number of runs. First the outcome is
+unfolded so, then, for each outcome of each of these contexts, the duration: so a strong dependence
+among durations never hides one among outcomes. Within a context a duration keeps its linear trend
+with an earlier one. Runs that were cut off are censored: the ends that were seen weigh what the
+Aalen-Johansen estimate gives them. What it leaves beyond the longest run goes on at a constant rate
+(B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974), and whoever
+draws it is told.
 """
 
 from __future__ import annotations
@@ -19,7 +23,16 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2, chi2_contingency
 
-from coordinator.forecast.history import CENSORED, NONE, Codes, Runs, Seen, Training, Values, Vocabulary
+from petrobot.coordinator.forecast.history import (
+    CENSORED,
+    NONE,
+    Codes,
+    Runs,
+    Seen,
+    Training,
+    Values,
+    Vocabulary,
+)
 
 ALPHA = 0.01
 """Level at which dependence counts, over all factors of a node (Bonferroni)."""
@@ -27,11 +40,13 @@ LEAST = 30
 """Runs in a context at least."""
 DEEPEST = 6
 OWN = 0.7
-"""A factor of the runs' own place goes before the best one if the logarithm of its p-value is at least this share of its."""
+"""A factor of the runs' own place goes before the best one if the logarithm of its p-value is at
+least this share of its."""
 SURE = 3.0
 """Standard errors beyond which a trend within a context counts."""
 GROUPS = 6
-"""Classes of an earlier duration at most, where durations are told apart by it; half of them for outcomes."""
+"""Classes of an earlier duration at most, where durations are told apart by it; half of them for
+outcomes."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +63,8 @@ class Law:
 
     @property
     def beyond(self) -> np.ndarray:
-        """Members that stand for what comes after the longest run that was seen: their own ends are not known."""
+        """Members that stand for what comes after the longest run that was seen: their own ends are
+        not known."""
         found: np.ndarray = self.outcome == NONE
         return found
 
@@ -61,7 +77,8 @@ class Law:
 
 @dataclass(frozen=True)
 class Trend:
-    """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier` is that of each member (s)."""
+    """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier` is
+    that of each member (s)."""
 
     place: int
     slope: float
@@ -114,7 +131,11 @@ class Context:
 
     def leaves(self) -> list[Context]:
         """All contexts that no test splits further."""
-        return [leaf for child in self.children for leaf in child.leaves()] if self.children else [self]
+        return (
+            [leaf for child in self.children for leaf in child.leaves()]
+            if self.children
+            else [self]
+        )
 
 
 class Laws:
@@ -146,7 +167,9 @@ class Laws:
         elif outcomes:
             deepest = DEEPEST if deepest else 0
             for code in np.unique(ended.outcome[ended.outcome != NONE]):
-                context.durations[int(code)] = self._grow(ended.of(ended.outcome == code), deepest, outcomes=False)
+                context.durations[int(code)] = self._grow(
+                    ended.of(ended.outcome == code), deepest, outcomes=False
+                )
         return context
 
     def splits(self) -> list[dict[str, Any]]:
@@ -175,9 +198,11 @@ class Laws:
 
 
 def with_weights(runs: Runs) -> Runs:
-    """The runs that ended, weighing their steps of the Aalen-Johansen estimate; the weights sum to 1.
+    """The runs that ended, weighing their steps of the Aalen-Johansen estimate; the weights sum to
+    1.
 
-    What it leaves is shared by the runs that were cut off after the last end, which stay as members without an outcome (NONE).
+    What it leaves is shared by the runs that were cut off after the last end, which stay as members
+    without an outcome (NONE).
     """
     ordered = runs.of(np.lexsort((runs.censored, runs.took)))
     n, ended = len(runs), ~ordered.censored
@@ -186,17 +211,22 @@ def with_weights(runs: Runs) -> Runs:
     last = int(np.flatnonzero(ended)[-1]) + 1 if ended.any() else 0
     beyond = np.arange(n) >= last
     weight = np.where(beyond, left[last] / max(1, n - last), -np.diff(left))
-    return replace(ordered, weight=weight, outcome=np.where(beyond, NONE, ordered.outcome)).of(ended | beyond)
+    return replace(ordered, weight=weight, outcome=np.where(beyond, NONE, ordered.outcome)).of(
+        ended | beyond
+    )
 
 
 def _law(runs: Runs, *, trend: bool) -> Law:
     whole = runs.weight.sum()
     weight = runs.weight / whole if whole else runs.weight
-    return Law(runs.outcome, runs.preempted, runs.took, weight, runs.throw, _trend(runs) if trend else None)
+    return Law(
+        runs.outcome, runs.preempted, runs.took, weight, runs.throw, _trend(runs) if trend else None
+    )
 
 
 def _trend(runs: Runs) -> Trend | None:
-    """The strongest linear dependence on an earlier duration, if it is beyond three standard errors."""
+    """The strongest linear dependence on an earlier duration, if it is beyond three standard
+    errors."""
     best: Trend | None = None
     strongest, n = SURE, len(runs)
     for place, earlier in enumerate(runs.seen.took):
@@ -211,17 +241,23 @@ def _trend(runs: Runs) -> Trend | None:
 
 
 def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
-    """The most significant split of runs and the child of each run; None if no test rejects independence.
+    """The most significant split of runs and the child of each run; None if no test rejects
+    independence.
 
-    Of factors that tell about as much, one of the runs' own place: branches side by side go on in step, so the visits of one tell
-    those of the other in every throw that was run, but the branches drift apart where they are played.
+    Of factors that tell about as much, one of the runs' own place: branches side by side go on in
+    step, so the visits of one tell those of the other in every throw that was run, but the branches
+    drift apart where they are played.
     """
     response = runs.outcome if outcomes else _classes(runs.took)
     groups = GROUPS // 2 if outcomes else GROUPS
     candidates: list[tuple[float, Split, Codes]] = []
     for place in range(len(runs.seen.outcome)):
         for kind in ("outcome", "action", "visits", "took"):
-            made = _by_duration(runs, place, groups) if kind == "took" else _candidate(runs, kind, place)
+            made = (
+                _by_duration(runs, place, groups)
+                if kind == "took"
+                else _candidate(runs, kind, place)
+            )
             if made is not None:
                 candidates.append((_log_p(made[1], response), *made))
     if not candidates:
@@ -244,9 +280,11 @@ def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
     found, counts = np.unique(codes, return_counts=True)
     large = [int(c) for c, n in zip(found, counts, strict=True) if n >= LEAST]
     if len(found) - len(large) and len(codes) - counts[counts >= LEAST].sum() < LEAST and large:
-        # The rest joins the most visits that are frequent: a fourth visit is more like a third one than like a first one. Of
-        # classes without an order it joins the smallest large one.
-        large.remove(max(large) if kind == "visits" else min(large, key=lambda c: int(counts[found == c][0])))
+        # The rest joins the most visits that are frequent: a fourth visit is more like a third one
+        # than like a first one. Of classes without an order it joins the smallest large one.
+        large.remove(
+            max(large) if kind == "visits" else min(large, key=lambda c: int(counts[found == c][0]))
+        )
     groups = {code: i for i, code in enumerate(large)}
     rest = bool(len(found) > len(large))
     if len(groups) + rest < 2:
@@ -270,7 +308,8 @@ def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | Non
 
 
 def _log_p(child: Codes, response: Codes) -> float:
-    """Logarithm of the p-value of the chi-square test of independence; 0 where one of them does not vary."""
+    """Logarithm of the p-value of the chi-square test of independence; 0 where one of them does not
+    vary."""
     table = crossed(child, response)
     if min(table.shape) < 2:
         return 0.0
@@ -288,14 +327,19 @@ def crossed(one: Codes, other: Codes) -> np.ndarray:
 
 
 def dependences(training: Training) -> list[dict[str, Any]]:
-    """Chi-square tests of the statuses of two places within one throw (first runs), the most significant first."""
+    """Chi-square tests of the statuses of two places within one throw (first runs), the most
+    significant first."""
     vocabulary, runs = training.vocabulary, training.runs
     status = first_statuses(vocabulary, runs, len(training.throws))
     out = []
     for i, one in enumerate(vocabulary.places):
         for j in range(i + 1, len(vocabulary.places)):
             both = (status[i] >= 0) & (status[j] >= 0)
-            table = crossed(status[i][both], status[j][both]) if both.any() else np.zeros((1, 1), np.int64)
+            table = (
+                crossed(status[i][both], status[j][both])
+                if both.any()
+                else np.zeros((1, 1), np.int64)
+            )
             if min(table.shape) < 2:
                 continue
             p = float(chi2_contingency(table).pvalue)
@@ -304,7 +348,8 @@ def dependences(training: Training) -> list[dict[str, Any]]:
 
 
 def first_statuses(vocabulary: Vocabulary, runs: Runs, throws: int) -> Codes:
-    """(q, throws): status code of the first run in each place of each throw; CENSORED - 1 where there is none."""
+    """(q, throws): status code of the first run in each place of each throw; CENSORED - 1 where
+    there is none."""
     out = np.full((len(vocabulary.places), throws), CENSORED - 1)
     status, _ = vocabulary.parts(runs.outcome)
     for i in range(len(runs) - 1, -1, -1):

@@ -1,8 +1,10 @@
-"""Plays throws of a task through its net, many side by side: runs end as their laws draw, the net says what follows.
+"""Plays throws of a task through its net, many side by side: runs end as their laws draw, the net
+says what follows.
 
-This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place an action is chosen, then how
-and when its run will end is drawn in one draw (competing risks: of itself with a status, or preempted by an event or a timer);
-transitions that wait for events or timers race with their measured waits; everything else fires at once, also what preempts a run
+This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place
+an action is chosen, then how and when its run will end is drawn in one draw (competing risks: of
+itself with a status, or preempted by an event or a timer); transitions that wait for events or
+timers race with their measured waits; everything else fires at once, also what preempts a run
 because another one has ended.
 """
 
@@ -13,15 +15,16 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from coordinator.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
-from coordinator.forecast.sampling import Drawer, Mask
-from coordinator.forecast.structure import ERROR, SUCCESS, Move, Structure
-from coordinator.net import Marking
-from coordinator.task import Counts, Status
+from petrobot.coordinator.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
+from petrobot.coordinator.forecast.sampling import Drawer, Mask
+from petrobot.coordinator.forecast.structure import ERROR, SUCCESS, Move, Structure
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import Counts, Status
 
 IDLE, GOING, DONE = 0, 1, 2
 LONGEST = 10_000
-"""Firings without time going on, and steps of a throw, after which it counts as one that never ends."""
+"""Firings without time going on, and steps of a throw, after which it counts as one that never
+ends."""
 Choices = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
 
@@ -38,9 +41,11 @@ class Played:
     endless: int = 0
     """Throws that were cut off after `longest` steps."""
     beyond: Mapping[str, int] = field(default_factory=dict)
-    """By action place: throws in which a run went on for longer than any run that was seen, before anything took it."""
+    """By action place: throws in which a run went on for longer than any run that was seen, before
+    anything took it."""
     astray: Mapping[str, int] = field(default_factory=dict)
-    """By transition: throws in which its measured preemption came when the marking did not allow it."""
+    """By transition: throws in which its measured preemption came when the marking did not allow
+    it."""
     ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By action place: how often each transition took a token out of it."""
 
@@ -49,9 +54,15 @@ class Play:
     """Throws under way; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
     def __init__(
-        self, structure: Structure, drawer: Drawer, choices: Choices, replicate: Codes, longest: int = LONGEST
+        self,
+        structure: Structure,
+        drawer: Drawer,
+        choices: Choices,
+        replicate: Codes,
+        longest: int = LONGEST,
     ) -> None:
-        """`longest`: steps (ends of runs and of waits) of a throw at most. Raises ValueError for a choice without probabilities."""
+        """`longest`: steps (ends of runs and of waits) of a throw at most. Raises ValueError for a
+        choice without probabilities."""
         self._longest = longest
         self._s, self._drawer = structure, drawer
         n, q = len(replicate), len(structure.vocabulary.places)
@@ -74,7 +85,9 @@ class Play:
         self._now, self._begun = np.zeros(n), np.zeros(n)
         self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
         self._ends: dict[Marking, int] = {}
-        self._out = Played(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.full(n, np.nan))
+        self._out = Played(
+            np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.full(n, np.nan)
+        )
 
     def _choice(self, choices: Choices, place: str) -> tuple[Codes, Values]:
         primitive = self._s.task.primitive_task_of(place)
@@ -98,12 +111,20 @@ class Play:
         return replace(
             self._out,
             endless=len(self._column),
-            beyond={name: len(columns) for (kind, name), columns in self._odd.items() if kind == "beyond"},
-            astray={name: len(columns) for (kind, name), columns in self._odd.items() if kind == "astray"},
+            beyond={
+                name: len(columns)
+                for (kind, name), columns in self._odd.items()
+                if kind == "beyond"
+            },
+            astray={
+                name: len(columns)
+                for (kind, name), columns in self._odd.items()
+                if kind == "astray"
+            },
             ways=self._ways,
         )
 
-    # --- one step ----------------------------------------------------------------------------------------------------
+    # --- one step -----------------------------------------------------------------------------
 
     def _settle(self) -> None:
         """Fire what needs no time until nothing does."""
@@ -123,7 +144,10 @@ class Play:
                 columns = np.flatnonzero(chosen == i)
                 if len(columns):
                     self._fire(move, columns)
-        raise ValueError(f"{self._s.task.name}: transitions fire for ever without time going on; run petrobot check")
+        raise ValueError(
+            f"{self._s.task.name}: transitions fire for ever without time going on; run "
+            "petrobot check"
+        )
 
     def _enabled(self, m: Move) -> Mask:
         out = np.ones(len(self._column), np.bool_)
@@ -167,7 +191,8 @@ class Play:
             self._start(q, columns)
 
     def _cut(self, q: int, m: Move, counts: Counts, columns: Codes) -> None:
-        """Runs that are taken while they go on: they count as the arc says, whatever they would have come to."""
+        """Runs that are taken while they go on: they count as the arc says, whatever they would
+        have come to."""
         status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
         lasted = self._now[columns] - self._came[q, columns]
         code = np.full(len(columns), self._s.vocabulary.outcome(status, m.number))
@@ -187,13 +212,25 @@ class Play:
         action = codes[np.minimum(which, len(codes) - 1)]
         ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
         status, taken = self._s.vocabulary.parts(ends.outcome)
-        self._phase[q, columns], self._status[q, columns], self._want[q, columns] = GOING, status, taken
-        self._preempted[q, columns], self._end[q, columns] = ends.preempted, self._now[columns] + ends.took
-        self._action[q, columns], self._outcome[q, columns], self._took[q, columns] = action, ends.outcome, ends.took
+        self._phase[q, columns], self._status[q, columns], self._want[q, columns] = (
+            GOING,
+            status,
+            taken,
+        )
+        self._preempted[q, columns], self._end[q, columns] = (
+            ends.preempted,
+            self._now[columns] + ends.took,
+        )
+        self._action[q, columns], self._outcome[q, columns], self._took[q, columns] = (
+            action,
+            ends.outcome,
+            ends.took,
+        )
         self._came[q, columns], self._beyond[q, columns] = self._now[columns], ends.beyond
 
     def _wait(self) -> None:
-        """Draw when transitions that wait will fire, as soon as they can; forget it when they cannot any more."""
+        """Draw when transitions that wait will fire, as soon as they can; forget it when they
+        cannot any more."""
         for i, move in enumerate(self._slow):
             able = self._enabled(move)
             fresh = np.flatnonzero(able & np.isinf(self._due[i]))
@@ -234,39 +271,53 @@ class Play:
             return
         self._end[q, columns] = np.inf
         self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[q, columns]])
-        self._seen.note(q, columns, self._outcome[q, columns], self._action[q, columns], self._took[q, columns])
+        self._seen.note(
+            q, columns, self._outcome[q, columns], self._action[q, columns], self._took[q, columns]
+        )
         self._good[columns] &= self._status[q, columns] <= SUCCESS  # censored ones spoil nothing
         cut = columns[self._preempted[q, columns]]
         self._phase[q, columns] = DONE
         self._phase[q, cut] = GOING
         for number in np.unique(self._want[q, cut]):
             own = cut[self._want[q, cut] == number]
-            able = self._enabled(self._s.moves[number])[own] if number >= 0 else np.zeros(len(own), np.bool_)
+            able = (
+                self._enabled(self._s.moves[number])[own]
+                if number >= 0
+                else np.zeros(len(own), np.bool_)
+            )
             if able.any():
                 self._fire(self._s.moves[number], own[able])
-            self._phase[q, own[~able]] = DONE  # what preempts it is not enabled: it ends by itself, with that status
+            self._phase[q, own[~able]] = (
+                DONE  # what preempts it is not enabled: it ends by itself, with that status
+            )
             self._note_odd("astray", self._s.moves[number].name, own[~able])
 
     def _free(self, stuck: Codes) -> None:
-        """Nothing will happen in these columns: let the ended runs go any way that their status allows, else give up."""
+        """Nothing will happen in these columns: let the ended runs go any way that their status
+        allows, else give up."""
         for q, place in enumerate(self._s.vocabulary.places):
-            self._note_odd("beyond", place, stuck[(self._phase[q, stuck] == GOING) & self._beyond[q, stuck]])
+            self._note_odd(
+                "beyond", place, stuck[(self._phase[q, stuck] == GOING) & self._beyond[q, stuck]]
+            )
         held = ((self._want[:, stuck] >= 0) & (self._phase[:, stuck] == DONE)).any(axis=0)
         self._want[:, stuck[held]] = -1
         dead = np.zeros(len(self._column), np.bool_)
         dead[stuck[~held]] = True
         self._finish(np.where(dead, -1, 0))
 
-    # --- ends --------------------------------------------------------------------------------------------------------
+    # --- ends ---------------------------------------------------------------------------------
 
     def _over(self) -> Codes:
         """1: as designed, -1: given up, 0: goes on."""
         _, first, inverse = np.unique(self._keys(), return_index=True, return_inverse=True)
-        verdicts = np.array([self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64)
+        verdicts = np.array(
+            [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
+        )
         return verdicts[inverse.ravel()]
 
     def _keys(self) -> Codes:
-        """One number for each column's marking: its digits in a base above every count of tokens."""
+        """One number for each column's marking: its digits in a base above every count of
+        tokens."""
         base = int(self._tokens.max(initial=0)) + 1
         if base ** len(self._tokens) >= 2**62:
             return np.unique(self._tokens, axis=1, return_inverse=True)[1].ravel()

@@ -1,4 +1,5 @@
-"""The forecast of one regime: expected numbers, predictive samples by a cluster bootstrap, and the product rule beside them."""
+"""The forecast of one regime: expected numbers, predictive samples by a cluster bootstrap, and the
+product rule beside them."""
 
 from __future__ import annotations
 
@@ -7,17 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.forecast.choices import choice_counts, choices_of
-from coordinator.forecast.history import Training, Values
-from coordinator.forecast.laws import Laws, dependences
-from coordinator.forecast.play import Choices, Play, Played
-from coordinator.forecast.residual import doubts, residuals, routing
-from coordinator.forecast.sampling import Drawer
-from coordinator.forecast.shares import predictive_interval, share_weight
-from coordinator.forecast.structure import SUCCESS, Structure
+from petrobot.coordinator.forecast.choices import choice_counts, choices_of
+from petrobot.coordinator.forecast.history import Training, Values
+from petrobot.coordinator.forecast.laws import Laws, dependences
+from petrobot.coordinator.forecast.play import Choices, Play, Played
+from petrobot.coordinator.forecast.residual import doubts, residuals, routing
+from petrobot.coordinator.forecast.sampling import Drawer
+from petrobot.coordinator.forecast.shares import predictive_interval, share_weight
+from petrobot.coordinator.forecast.structure import SUCCESS, Structure
 
 POINT = 40_000
-"""Throws played for the expected numbers: the simulation's own error of a share is then below 0.25 points."""
+"""Throws played for the expected numbers: the simulation's own error of a share is then below 0.25
+points."""
 REPLICATES = 200
 TOGETHER = 25_000
 """Throws played side by side."""
@@ -41,7 +43,8 @@ class Request:
 
 
 def figures(played: Played) -> dict[str, float]:
-    """The numbers that are forecast, of played or measured throws; times are nan where no throw completed."""
+    """The numbers that are forecast, of played or measured throws; times are nan where no throw
+    completed."""
     times = played.time[played.completed & ~np.isnan(played.time)]
     return {
         "R_goal": float(np.mean(played.goals > 0)),
@@ -53,13 +56,18 @@ def figures(played: Played) -> dict[str, float]:
 
 
 def predict(training: Training, request: Request) -> dict[str, Any]:
-    """Forecast further throws of a regime. Raises ValueError for a choice that was never measured."""
+    """Forecast further throws of a regime. Raises ValueError for a choice that was never
+    measured."""
     structure, laws = Structure.of(training.task), Laws(training)
     _refuse_unmeasured(training, laws, request.choices)
     random = np.random.default_rng(request.seed)
     even = np.ones((1, len(training.throws)))
-    residual = residuals(training, _replayed(training, structure, laws, request)) if training.whole else []
-    whole = _played(training, structure, laws, request, even, np.zeros(request.point, np.int64), random)
+    residual = (
+        residuals(training, _replayed(training, structure, laws, request)) if training.whole else []
+    )
+    whole = _played(
+        training, structure, laws, request, even, np.zeros(request.point, np.int64), random
+    )
     samples, distances = _bootstrap(training, structure, laws, request, whole, random)
     point = figures(whole)
     times = whole.time[whole.completed]
@@ -67,7 +75,8 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "training_throws": len(training.throws),
         "runs": request.runs,
         "figures": {
-            name: _figure(name, point[name], samples[name], request, len(training.throws)) for name in (*SHARES, *TIMES)
+            name: _figure(name, point[name], samples[name], request, len(training.throws))
+            for name in (*SHARES, *TIMES)
         },
         "product": product_rule(training, request.choices),
         "law": {"q": list(GRID), "s": _rounded(np.quantile(times, GRID)) if len(times) else []},
@@ -78,9 +87,13 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "residual": residual,
         "doubts": doubts(residual, whole, request.point),
         "routing": routing(training, request.choices),
-        "choice_runs": {name: sum(actions.values()) for name, actions in choice_counts(training).items()},
+        "choice_runs": {
+            name: sum(actions.values()) for name, actions in choice_counts(training).items()
+        },
         "asked": sorted(
-            name for name, chosen in request.choices.items() if dict(chosen) != choices_of(training).get(name)
+            name
+            for name, chosen in request.choices.items()
+            if dict(chosen) != choices_of(training).get(name)
         ),
         "not_back": sum(t.completed and t.time is None for t in training.throws),
         "endless": round(whole.endless / request.point, 6),
@@ -94,8 +107,14 @@ def _refuse_unmeasured(training: Training, laws: Laws, choices: Choices) -> None
         primitive = training.task.primitive_task_of(place).name
         for action, probability in choices.get(primitive, {}).items():
             measured_there = any(key[0] == q for key in laws.contexts)
-            if probability > 0 and measured_there and (q, names.actions.index(action) + 1) not in laws.contexts:
-                raise ValueError(f"{primitive}: {action} was never run in {place}; train with --selector random")
+            if (
+                probability > 0
+                and measured_there
+                and (q, names.actions.index(action) + 1) not in laws.contexts
+            ):
+                raise ValueError(
+                    f"{primitive}: {action} was never run in {place}; train with --selector random"
+                )
 
 
 def _played(
@@ -122,18 +141,27 @@ def _replayed(training: Training, structure: Structure, laws: Laws, request: Req
     n = len(training.throws)
     own = Request(request.runs, choices_of(training), request.seed)
     random = np.random.default_rng([request.seed, 1])
-    return _played(training, structure, laws, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random)
+    return _played(
+        training, structure, laws, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random
+    )
 
 
 def longest_of(training: Training) -> int:
-    """Steps after which a played throw counts as endless: twenty times as many as the longest measured one had, and a hundred."""
+    """Steps after which a played throw counts as endless: twenty times as many as the longest
+    measured one had, and a hundred."""
     return 100 + 20 * max(len(throw.runs) + len(throw.waits) for throw in training.throws)
 
 
 def _bootstrap(
-    training: Training, structure: Structure, laws: Laws, request: Request, whole: Played, random: np.random.Generator
+    training: Training,
+    structure: Structure,
+    laws: Laws,
+    request: Request,
+    whole: Played,
+    random: np.random.Generator,
 ) -> tuple[dict[str, Values], Values]:
-    """Figures of `runs` new throws under resampled training throws, and how far each law of the time is from the whole one."""
+    """Figures of `runs` new throws under resampled training throws, and how far each law of the
+    time is from the whole one."""
     n = len(training.throws)
     at_once = max(1, TOGETHER // request.runs)
     found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
@@ -146,7 +174,9 @@ def _bootstrap(
         played = _played(training, structure, laws, request, weights, replicate, random)
         for b in range(count):
             own = replicate == b
-            one = Played(played.goals[own], played.completed[own], played.all_success[own], played.time[own])
+            one = Played(
+                played.goals[own], played.completed[own], played.all_success[own], played.time[own]
+            )
             for name, value in figures(one).items():
                 found[name].append(value)
             distances.append(distance(one.time[one.completed], reference))
@@ -164,20 +194,25 @@ def distance(sample: Values, reference: Values) -> float:
     return float(max(np.max(np.abs(at - steps[1:])), np.max(np.abs(below - steps[:-1]))))
 
 
-def _figure(name: str, value: float, samples: Values, request: Request, training: int) -> dict[str, Any]:
+def _figure(
+    name: str, value: float, samples: Values, request: Request, training: int
+) -> dict[str, Any]:
     known = samples[~np.isnan(samples)]
     if not len(known):
         return {"value": None, "interval": None, "sd": None}
     sd = float(known.std(ddof=1)) if len(known) > 1 else 0.0
     if name in SHARES:
-        interval = predictive_interval(value, share_weight(value, sd, request.runs, training), request.runs, LEVEL)
+        interval = predictive_interval(
+            value, share_weight(value, sd, request.runs, training), request.runs, LEVEL
+        )
     else:
         interval = _rounded(np.quantile(known, ((1 - LEVEL) / 2, (1 + LEVEL) / 2)))
     return {"value": round(value, 6), "interval": interval, "sd": round(sd, 8)}
 
 
 def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
-    """The product of reliabilities over the places of the normal flow: R_conj of a series, if all were independent."""
+    """The product of reliabilities over the places of the normal flow: R_conj of a series, if all
+    were independent."""
     names, runs = training.vocabulary, training.runs
     status, _ = names.parts(runs.outcome)
     normal = [q for q, p in enumerate(names.places) if p not in training.task.flat.error_elements]
@@ -186,9 +221,16 @@ def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
         chosen = choices.get(training.task.primitive_task_of(names.places[q]).name, {})
         r = whole = 0.0
         for action, probability in chosen.items():
-            own = (runs.place == q) & (runs.action == names.actions.index(action) + 1) & ~runs.censored
+            own = (
+                (runs.place == q)
+                & (runs.action == names.actions.index(action) + 1)
+                & ~runs.censored
+            )
             if own.any():
-                r, whole = r + probability * float(np.mean(status[own] == SUCCESS)), whole + probability
+                r, whole = (
+                    r + probability * float(np.mean(status[own] == SUCCESS)),
+                    whole + probability,
+                )
         if whole:
             factors[names.places[q]] = round(r / whole, 6)
             value *= r / whole

@@ -1,4 +1,5 @@
-"""Forecast files: written before the runs, with the time, a hash of what they rest on, and a hash of what they say."""
+"""Forecast files: written before the runs, with the time, a hash of what they rest on, and a hash
+of what they say."""
 
 from __future__ import annotations
 
@@ -10,24 +11,27 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from coordinator.analysis.completion import law
-from coordinator.analysis.forecast import forecast as solve
-from coordinator.analysis.space import Limits
-from coordinator.analysis.stochastic import NoEstimate, stochastic_view
-from coordinator.campaign.observed import context_of
-from coordinator.experience.propagation import Choice, measured_from
-from coordinator.forecast.history import Training
-from coordinator.forecast.predict import Request, predict
-from coordinator.learning.learning import Estimates
-from coordinator.task import Task
-from services.comm.json_text import finite, json_text
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.analysis.completion import law
+from petrobot.coordinator.analysis.forecast import forecast as solve
+from petrobot.coordinator.analysis.space import Limits
+from petrobot.coordinator.analysis.stochastic import NoEstimate, stochastic_view
+from petrobot.coordinator.campaign.observed import context_of
+from petrobot.coordinator.experience.propagation import Choice, measured_from
+from petrobot.coordinator.forecast.history import Training
+from petrobot.coordinator.forecast.predict import Request, predict
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.json_text import finite, json_text
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 SCHEMA = 1
 METHOD = (
-    "Generalised semi-Markov simulation of the net: measured competing risks of each run, in contexts told apart by "
-    "chi-square tests, with their measured durations (no phase-type fit); predictive intervals by a cluster bootstrap over "
-    "training throws, with the noise of the new runs. Beside it the exact solution of the stochastic view (GSPN): phase-type "
+    "Generalised semi-Markov simulation of the net: measured competing risks of each run, in "
+    "contexts told apart by "
+    "chi-square tests, with their measured durations (no phase-type fit); predictive "
+    "intervals by a cluster bootstrap over "
+    "training throws, with the noise of the new runs. Beside it the exact solution of the "
+    "stochastic view (GSPN): phase-type "
     "durations, statuses of one throw independent of each other."
 )
 LARGEST = 50_000
@@ -47,14 +51,17 @@ def register(
     about: Mapping[str, Any],
     estimates: Estimates | None = None,
 ) -> dict[str, Any]:
-    """A forecast of the regimes in `requests`; `about` says what it rests on. With `estimates` the stochastic view stands beside.
+    """A forecast of the regimes in `requests`; `about` says what it rests on. With `estimates` the
+    stochastic view stands beside.
 
     Raises ForecastError.
     """
     regimes = {}
     for name, request in requests.items():
         if name not in trainings:
-            raise ForecastError(f"no throw of regime {name} was measured; there are {', '.join(trainings)}")
+            raise ForecastError(
+                f"no throw of regime {name} was measured; there are {', '.join(trainings)}"
+            )
         try:
             regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
             if estimates is not None:
@@ -111,13 +118,17 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _no_forecast(path: Path, why: str) -> ForecastError:
-    return ForecastError(f"{path} is no forecast: {why}; give a file that `petrobot forecast --out FILE` wrote")
+    return ForecastError(
+        f"{path} is no forecast: {why}; give a file that `petrobot forecast --out FILE` wrote"
+    )
 
 
 def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict[str, Any]:
-    """The numbers of the stochastic view for one run of the task; only `why` where it cannot be solved.
+    """The numbers of the stochastic view for one run of the task; only `why` where it cannot be
+    solved.
 
-    Its times begin with the initial marking, so they hold the wait for the event that begins the run, too.
+    Its times begin with the initial marking, so they hold the wait for the event that begins the
+    run, too.
     """
     try:
         view = stochastic_view(task, measured_from(task, estimates, context_of(regime), choice))
@@ -127,7 +138,11 @@ def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict
     except (NoEstimate, ValueError, ArithmeticError) as fault:
         return {"why": str(fault)}
     try:
-        q90 = law(found.chain, found.done.goal, steps=JUMPS).quantile(0.9) if found.completion_probability > 0 else None
+        q90 = (
+            law(found.chain, found.done.goal, steps=JUMPS).quantile(0.9)
+            if found.completion_probability > 0
+            else None
+        )
     except ArithmeticError:
         q90 = None
     numbers = {
@@ -137,4 +152,7 @@ def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict
         "mean": found.done.mean,
         "q90": q90,
     }
-    return {**{k: None if v is None else round(float(v), 6) for k, v in numbers.items()}, "markings": found.chain.n}
+    return {
+        **{k: None if v is None else round(float(v), 6) for k, v in numbers.items()},
+        "markings": found.chain.n,
+    }

@@ -1,4 +1,5 @@
-"""Whether a forecast can be true: throws played with the training's own choices against the throws that they were learned from."""
+"""Whether a forecast can be true: throws played with the training's own choices against the throws
+that they were learned from."""
 
 from __future__ import annotations
 
@@ -8,15 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2_contingency, ttest_ind
 
-from coordinator.forecast.history import Training, Values
-from coordinator.forecast.play import Choices, Played
-from coordinator.forecast.shares import holm
+from petrobot.coordinator.forecast.history import Training, Values
+from petrobot.coordinator.forecast.play import Choices, Played
+from petrobot.coordinator.forecast.shares import holm
 
 LEVEL = 0.01
 """Level at which played and measured throws differ, over all tests of a regime (Holm)."""
 NEGLIGIBLE = 0.02
-"""Share of throws that may rest on a guess, or by which a share of played throws may miss the measured one: what is less moves no
-forecast share by more than the margin of equivalence."""
+"""Share of throws that may rest on a guess, or by which a share of played throws may miss the
+measured one: what is less moves no forecast share by more than the margin of equivalence."""
 TIME, MEAN = "time", "mean time"
 OFF_TIME = 0.05
 """The same of mean times (relative) and of shares of throws in classes of the time."""
@@ -34,10 +35,12 @@ def measured(training: Training) -> Played:
 
 
 def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
-    """Chi-square tests that measured and played throws come from one law, with p, Holm's p and how far off they are.
+    """Chi-square tests that measured and played throws come from one law, with p, Holm's p and how
+    far off they are.
 
-    Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which transitions its runs left it. `off`
-    is the largest difference of two shares; of the mean time the relative one.
+    Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which
+    transitions its runs left it. `off` is the largest difference of two shares; of the mean time
+    the relative one.
     """
     real = measured(training)
     tables = {
@@ -48,8 +51,12 @@ def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
     }
     for place, ways in routing(training).items():
         tables[f"ways out of {place}"] = ways_table(ways, played.ways.get(place, {}))
-    alone = {name: _p_value(table) for name, table in tables.items()} | {MEAN: _same_mean(real.time, played.time)}
-    off = {name: _off(table) for name, table in tables.items()} | {MEAN: _mean_off(real.time, played.time)}
+    alone = {name: _p_value(table) for name, table in tables.items()} | {
+        MEAN: _same_mean(real.time, played.time)
+    }
+    off = {name: _off(table) for name, table in tables.items()} | {
+        MEAN: _mean_off(real.time, played.time)
+    }
     return [
         {"of": name, "p": p, "p_holm": together, "off": round(off[name], 6)}
         for (name, p), together in zip(alone.items(), holm(list(alone.values())), strict=True)
@@ -94,20 +101,24 @@ def _classes(times: Values, of: Values) -> Values:
     known = of[~np.isnan(of)]
     if not len(known):
         return np.full(len(times), np.nan)
-    classes = np.searchsorted(np.quantile(known, (0.25, 0.5, 0.75, 0.9)), times, side="right").astype(np.float64)
+    classes = np.searchsorted(
+        np.quantile(known, (0.25, 0.5, 0.75, 0.9)), times, side="right"
+    ).astype(np.float64)
     return np.where(np.isnan(times), np.nan, classes)
 
 
 def routing(training: Training, choices: Choices | None = None) -> dict[str, dict[str, int]]:
     """By action place: how often each transition took a token out of it.
 
-    With `choices` only in throws all of whose runs might have been chosen so: they alone say how such throws go on.
+    With `choices` only in throws all of whose runs might have been chosen so: they alone say how
+    such throws go on.
     """
     primitive = training.task.primitive_task_of
     out: dict[str, dict[str, int]] = {}
     for throw in training.throws:
         if choices is not None and any(
-            choices.get(primitive(run.place).name, {run.action: 1.0}).get(run.action, 0.0) <= 0 for run in throw.runs
+            choices.get(primitive(run.place).name, {run.action: 1.0}).get(run.action, 0.0) <= 0
+            for run in throw.runs
         ):
             continue
         for run in throw.runs:
@@ -124,31 +135,38 @@ def ways_table(before: Mapping[str, int], after: Mapping[str, int]) -> np.ndarra
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, throws: int) -> list[str]:
-    """Why a forecast is doubtful, in words; nothing where it is not. `throws` were played for the forecast.
+    """Why a forecast is doubtful, in words; nothing where it is not. `throws` were played for the
+    forecast.
 
-    Played throws have to be off by more than chance and by more than matters: with many throws the first alone says little.
+    Played throws have to be off by more than chance and by more than matters: with many throws the
+    first alone says little.
     """
     out = [
-        f"throws played with the training's own choices differ from the training's: {row['of']}, off by {row['off']:.1%} "
+        "throws played with the training's own choices differ from the training's: "
+        f"{row['of']}, off by {row['off']:.1%} "
         f"(p = {row['p_holm']:.1e})"
         for row in residual
-        if row["p_holm"] < LEVEL and row["off"] > (OFF_TIME if row["of"] in (TIME, MEAN) else NEGLIGIBLE)
+        if row["p_holm"] < LEVEL
+        and row["off"] > (OFF_TIME if row["of"] in (TIME, MEAN) else NEGLIGIBLE)
     ]
     for place, n in sorted(played.beyond.items()):
         if n > NEGLIGIBLE * throws:
             out.append(
-                f"in {n / throws:.1%} of the throws played a run in {place} goes on for longer than any that was measured: "
+                f"in {n / throws:.1%} of the throws played a run in {place} goes on for "
+                "longer than any that was measured: "
                 "what it comes to then is a guess; train with runs that nothing cuts off so early"
             )
     for name, n in sorted(played.astray.items()):
         if n > NEGLIGIBLE * throws:
             out.append(
-                f"in {n / throws:.1%} of the throws played {name} comes when the marking does not allow it: how long a run goes on "
+                f"in {n / throws:.1%} of the throws played {name} comes when the marking "
+                "does not allow it: how long a run goes on "
                 "until it is preempted depends on more than the run"
             )
     if played.endless > NEGLIGIBLE * throws:
         out.append(
-            f"{played.endless / throws:.1%} of the throws played never end: branches that watch each other need more training "
+            f"{played.endless / throws:.1%} of the throws played never end: branches that "
+            "watch each other need more training "
             "throws, so that the contexts can tell them apart"
         )
     return out

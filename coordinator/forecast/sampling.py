@@ -1,4 +1,5 @@
-"""Draws ends of runs and waits from laws, for many replicas at once, each with its own bootstrap weights of the throws."""
+"""Draws ends of runs and waits from laws, for many replicas at once, each with its own bootstrap
+weights of the throws."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.forecast.history import CUT, Codes, Seen, Values
-from coordinator.forecast.laws import Context, Law, Laws
+from petrobot.coordinator.forecast.history import CUT, Codes, Seen, Values
+from petrobot.coordinator.forecast.laws import Context, Law, Laws
 
 Mask = NDArray[np.bool_]
 
@@ -27,10 +28,15 @@ class Ends:
 
 
 class Drawer:
-    """`weights` (replicates, throws): how often each training throw counts in each replicate; `of` each column's replicate."""
+    """`weights` (replicates, throws): how often each training throw counts in each replicate; `of`
+    each column's replicate."""
 
     def __init__(
-        self, laws: Laws, waits: Mapping[str, tuple[Values, Codes]], weights: Values, random: np.random.Generator
+        self,
+        laws: Laws,
+        waits: Mapping[str, tuple[Values, Codes]],
+        weights: Values,
+        random: np.random.Generator,
     ) -> None:
         self._laws, self._waits, self._weights, self._random = laws, waits, weights, random
         self._bounds: dict[object, Values] = {}
@@ -47,7 +53,9 @@ class Drawer:
             self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
         return out
 
-    def _descend(self, node: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends) -> None:
+    def _descend(
+        self, node: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+    ) -> None:
         if node.split is None:
             self._draw_leaf(node, columns, replicate, seen, out)
             return
@@ -57,7 +65,9 @@ class Drawer:
             if len(own):
                 self._descend(below, own, replicate, seen, out)
 
-    def _draw_leaf(self, leaf: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends) -> None:
+    def _draw_leaf(
+        self, leaf: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+    ) -> None:
         """First the outcome, then the duration from the outcome's own tree."""
         law = leaf.law
         index = self._draw(leaf.number, law.weight, law.throw, replicate[columns])
@@ -75,13 +85,18 @@ class Drawer:
                 self._descend(tree, own, replicate, seen, out)
 
     def _draw_beyond(self, leaf: Context, columns: Codes, replicate: Codes, out: Ends) -> None:
-        """Longer than the longest run: at a constant rate, with outcomes in the shares of those that were seen."""
+        """Longer than the longest run: at a constant rate, with outcomes in the shares of those
+        that were seen."""
         law, seen = leaf.law, np.flatnonzero(~leaf.law.beyond)
         out.beyond[columns] = True
         if not law.rate or not len(seen):
             out.outcome[columns], out.preempted[columns], out.took[columns] = CUT, False, np.inf
             return
-        index = seen[self._draw((leaf.number, "beyond"), law.weight[seen], law.throw[seen], replicate[columns])]
+        index = seen[
+            self._draw(
+                (leaf.number, "beyond"), law.weight[seen], law.throw[seen], replicate[columns]
+            )
+        ]
         out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
         out.took[columns] = law.took.max() - np.log1p(-self._random.random(len(columns))) / law.rate
 
@@ -95,7 +110,8 @@ class Drawer:
         return drawn
 
     def _draw(self, key: object, weight: Values, throws: Codes, replicate: Codes) -> Codes:
-        """A member for each column, by its replicate's weights; by the plain ones where those leave none."""
+        """A member for each column, by its replicate's weights; by the plain ones where those leave
+        none."""
         bounds = self._bounds.get(key)
         if bounds is None:
             each = weight * self._weights[:, throws]
@@ -104,7 +120,9 @@ class Drawer:
             bounds = bounds / bounds[:, -1:] + np.arange(len(bounds))[:, None]
             self._bounds[key] = bounds
         members = bounds.shape[1]
-        at = np.searchsorted(bounds.ravel(), replicate + self._random.random(len(replicate)), side="right")
+        at = np.searchsorted(
+            bounds.ravel(), replicate + self._random.random(len(replicate)), side="right"
+        )
         index: Codes = np.clip(at - replicate * members, 0, members - 1)
         return index
 
@@ -114,7 +132,8 @@ class Drawer:
 
 
 def _along(law: Law, index: Codes, took: Values) -> Values:
-    """What the trend of a law adds to drawn durations, for columns in which other runs took other times before."""
+    """What the trend of a law adds to drawn durations, for columns in which other runs took other
+    times before."""
     if law.trend is None:
         return np.zeros(len(index))
     now = took[law.trend.place]

@@ -1,7 +1,9 @@
-"""What tests of shares need: the predictive law of a share of new throws, and Holm's adjustment for many tests.
+"""What tests of shares need: the predictive law of a share of new throws, and Holm's adjustment for
+many tests.
 
-The law is beta-binomial about the forecast, weighing as many throws as the forecast is sure of, with Jeffreys' prior: so a share
-of 1 that was forecast from n throws still expects a miss now and then in a further n.
+The law is beta-binomial about the forecast, weighing as many throws as the forecast is sure of,
+with Jeffreys' prior: so a share of 1 that was forecast from n throws still expects a miss now and
+then in a further n.
 """
 
 from __future__ import annotations
@@ -23,9 +25,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def share_weight(value: float, sd: float, runs: int, training: int) -> float:
-    """How many throws the forecast of a share weighs: from its predictive deviation less the noise of `runs` new throws.
+    """How many throws the forecast of a share weighs: from its predictive deviation less the noise
+    of `runs` new throws.
 
-    At most as much as the training throws themselves; exactly that where the bootstrap saw no variation.
+    At most as much as the training throws themselves; exactly that where the bootstrap saw no
+    variation.
     """
     noise = value * (1.0 - value)
     own = sd * sd - noise / runs

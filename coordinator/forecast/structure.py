@@ -1,4 +1,5 @@
-"""A task's net as arrays for playing it: arcs, kinds of transitions, conditions on the statuses of the runs that they take."""
+"""A task's net as arrays for playing it: arcs, kinds of transitions, conditions on the statuses of
+the runs that they take."""
 
 from __future__ import annotations
 
@@ -7,10 +8,10 @@ from itertools import product
 
 import numpy as np
 
-from coordinator.analysis.stochastic import is_cause
-from coordinator.conditions import ConditionFault
-from coordinator.forecast.history import STATUSES, Vocabulary, reads_variables
-from coordinator.task import Counts, End, Kind, Status, Task, Transition
+from petrobot.coordinator.analysis.stochastic import is_cause
+from petrobot.coordinator.conditions import ConditionFault
+from petrobot.coordinator.forecast.history import STATUSES, Vocabulary, reads_variables
+from petrobot.coordinator.task import Counts, End, Kind, Status, Task, Transition
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,11 @@ class Move:
     going: tuple[int, ...]
     preempt: tuple[tuple[int, Counts], ...]
     cause: bool
-    """Its preemption is a cause by which a run ends, drawn with the run; else it preempts as soon as it can fire."""
+    """Its preemption is a cause by which a run ends, drawn with the run; else it preempts as soon
+    as it can fire."""
     takes_done: bool
-    """It also takes a run that has ended but whose token is still there (its priority is higher)."""
+    """It also takes a run that has ended but whose token is still there (its priority is
+    higher)."""
     starts: tuple[int, ...]
     """Action places in which it starts a run."""
     waits: bool
@@ -38,7 +41,8 @@ class Move:
     after: float | None
     mean_wait: float | None
     allowed: np.ndarray | None
-    """Which statuses of the runs it takes (axes: normal, then error) its condition admits; None: any."""
+    """Which statuses of the runs it takes (axes: normal, then error) its condition admits; None:
+    any."""
     priority: int
     weight: float
     yields: bool
@@ -67,11 +71,16 @@ class Structure:
         vocabulary = Vocabulary.of(flat)
         for place in flat.places.values():
             if place.kind is Kind.ACTION and (place.servers or 1) > 1:
-                raise ValueError(f"places.{place.name}: forecasts know one run at a time; give it servers = 1")
+                raise ValueError(
+                    f"places.{place.name}: forecasts know one run at a time; give it servers = 1"
+                )
         for t in flat.transitions.values():
             _refuse_unknown_preemption(t)
         assumptions: list[str] = []
-        moves = tuple(_move(flat, vocabulary, t, i, assumptions) for i, t in enumerate(flat.transitions.values()))
+        moves = tuple(
+            _move(flat, vocabulary, t, i, assumptions)
+            for i, t in enumerate(flat.transitions.values())
+        )
         initial = np.array(flat.net.initial, np.int64)
         if flat.runs_place:
             initial[flat.net.place_index[flat.runs_place]] = 1
@@ -79,15 +88,22 @@ class Structure:
         return cls(flat, vocabulary, moves, initial, indices, tuple(assumptions))
 
 
-def _move(flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assumptions: list[str]) -> Move:
+def _move(
+    flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assumptions: list[str]
+) -> Move:
     net = flat.net
     number_of = {name: q for q, name in enumerate(vocabulary.places)}
     by_end = {
-        end: tuple(number_of[a.place] for a in t.inputs if a.end is end) for end in (End.NORMAL, End.ERROR, End.GOING)
+        end: tuple(number_of[a.place] for a in t.inputs if a.end is end)
+        for end in (End.NORMAL, End.ERROR, End.GOING)
     }
-    preempt = tuple((number_of[a.place], a.counts or Counts.NONE) for a in t.inputs if a.end is End.PREEMPT)
+    preempt = tuple(
+        (number_of[a.place], a.counts or Counts.NONE) for a in t.inputs if a.end is End.PREEMPT
+    )
     if reads_variables(t):
-        assumptions.append(f"{t.name}: how often its condition holds is taken from the runs that it took")
+        assumptions.append(
+            f"{t.name}: how often its condition holds is taken from the runs that it took"
+        )
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
     return Move(
@@ -116,20 +132,24 @@ def _move(flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assump
 
 
 def _refuse_unknown_preemption(t: Transition) -> None:
-    """What preempts must follow from the marking, or be measured: an event's time from the begin of the one run that it takes."""
+    """What preempts must follow from the marking, or be measured: an event's time from the begin of
+    the one run that it takes."""
     runs = [a for a in t.inputs if a.end is not None]
     if is_cause(t) or not any(a.end is End.PREEMPT for a in runs):
         return
     if reads_variables(t) and not any(a.end in (End.NORMAL, End.ERROR) for a in runs):
         raise ValueError(
-            f"transitions.{t.name}: when it preempts is decided by variables alone, and forecasts know no variables; let it take "
+            f"transitions.{t.name}: when it preempts is decided by variables alone, and "
+            "forecasts know no variables; let it take "
             "the ended run that sets them, too, or raise an event instead"
         )
     if t.events:
         places = ", ".join(a.place for a in runs)
         raise ValueError(
-            f"transitions.{t.name}: forecasts know an event that preempts one run, this one looks at several ({places}); let "
-            "the event preempt one of them and put a token into a control place, and let a transition without an event take "
+            f"transitions.{t.name}: forecasts know an event that preempts one run, this one "
+            f"looks at several ({places}); let "
+            "the event preempt one of them and put a token into a control place, and let a "
+            "transition without an event take "
             "that token and the others"
         )
 
@@ -137,7 +157,11 @@ def _refuse_unknown_preemption(t: Transition) -> None:
 def _takes_done(flat: Task, t: Transition) -> bool:
     """As the engine does: a preemption of declared higher priority also takes what has ended."""
     places = {a.place for a in t.inputs if a.end is End.PREEMPT}
-    rivals = [u for u in flat.transitions.values() if any(a.place in places and a.end is End.NORMAL for a in u.inputs)]
+    rivals = [
+        u
+        for u in flat.transitions.values()
+        if any(a.place in places and a.end is End.NORMAL for a in u.inputs)
+    ]
     return bool(places) and t.priority > max((u.priority for u in rivals), default=t.priority)
 
 
@@ -146,7 +170,10 @@ def _allowed(t: Transition, places: list[str]) -> np.ndarray | None:
         return None
     out = np.zeros((len(STATUSES),) * len(places), np.bool_)
     for combination in product(range(len(STATUSES)), repeat=len(places)):
-        values = {f"{place}.status": str(STATUSES[s]) for place, s in zip(places, combination, strict=True)}
+        values = {
+            f"{place}.status": str(STATUSES[s])
+            for place, s in zip(places, combination, strict=True)
+        }
         try:
             out[combination] = t.when.holds(values)
         except ConditionFault:
@@ -154,4 +181,6 @@ def _allowed(t: Transition, places: list[str]) -> np.ndarray | None:
     return out
 
 
-SUCCESS, FAILURE, ERROR = (STATUSES.index(s) for s in (Status.SUCCESS, Status.FAILURE, Status.ERROR))
+SUCCESS, FAILURE, ERROR = (
+    STATUSES.index(s) for s in (Status.SUCCESS, Status.FAILURE, Status.ERROR)
+)

@@ -1,20 +1,22 @@
-"""Training from an estimates file, where only sums and samples of runs are left: every run stands for itself, without history.
+"""Training from an estimates file, where only sums and samples of runs are left: every run stands
+for itself, without history.
 
-So nothing can be unfolded by what had ended before, and the bootstrap is one over runs. A campaign's folder is the better source.
+So nothing can be unfolded by what had ended before, and the bootstrap is one over runs. A
+campaign's folder is the better source.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from coordinator.campaign.observed import context_of, regime_of
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.experience.estimates_file import EstimatesError, EstimatesFile
-from coordinator.forecast.history import Training
-from coordinator.forecast.registered import ForecastError
-from coordinator.learning.estimate import CENSORED, Tally
-from coordinator.learning.learning import Estimates
-from coordinator.task import Kind, Task
+from petrobot.coordinator.campaign.observed import context_of, regime_of
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.experience.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.forecast.history import Training
+from petrobot.coordinator.forecast.registered import ForecastError
+from petrobot.coordinator.learning.estimate import CENSORED, Tally
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.task import Kind, Task
 
 
 def read_estimates(path: Path) -> Estimates:
@@ -24,18 +26,25 @@ def read_estimates(path: Path) -> Estimates:
     except EstimatesError as fault:
         raise ForecastError(str(fault)) from fault
     if kept is None or not kept.estimates.tallies:
-        raise ForecastError(f"{path} holds no estimates; give a campaign's folder or a file that `run --learn` wrote")
+        raise ForecastError(
+            f"{path} holds no estimates; give a campaign's folder or a file that `run "
+            "--learn` wrote"
+        )
     return kept.estimates
 
 
 def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
     """Of estimates, by regime."""
     regimes = sorted({regime_of(key.context) for key in estimates.tallies})
-    return {regime: Training.of(task, _throws(task, estimates, regime), whole=False) for regime in regimes}
+    return {
+        regime: Training.of(task, _throws(task, estimates, regime), whole=False)
+        for regime in regimes
+    }
 
 
 def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:
-    """A throw of its own for each run of the samples, as often as it stands for a run that was counted."""
+    """A throw of its own for each run of the samples, as often as it stands for a run that was
+    counted."""
     flat, context = task.flat, context_of(regime)
     out: list[Throw] = []
     for place in flat.places.values():
@@ -51,7 +60,8 @@ def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:
 
 
 def _runs(place: str, action: str, tally: Tally) -> list[RunEntry]:
-    """Runs with the counts of the tally and the durations of its sample (each exit's, again and again; its mean without any)."""
+    """Runs with the counts of the tally and the durations of its sample (each exit's, again and
+    again; its mean without any)."""
     out: list[RunEntry] = []
     for exit_, moments in tally.durations.items():
         counted, _, transition = exit_.partition(":")
@@ -59,5 +69,9 @@ def _runs(place: str, action: str, tally: Tally) -> list[RunEntry]:
         status = "" if counted == CENSORED else counted
         for i in range(moments.n):
             took = seconds[i % len(seconds)]
-            out.append(RunEntry(place, action, 0.0, took, status, taken=transition, cancelled=bool(transition)))
+            out.append(
+                RunEntry(
+                    place, action, 0.0, took, status, taken=transition, cancelled=bool(transition)
+                )
+            )
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from coordinator.forecast.residual import NEGLIGIBLE
+from petrobot.coordinator.forecast.residual import NEGLIGIBLE
 
 WORDS = {
     "R_goal": "R_goal",
@@ -14,24 +14,41 @@ WORDS = {
     "mean": "mean time (s)",
     "q90": "90 % quantile (s)",
 }
-HEAD = ("regime", "figure", "forecast", "95 % predictive", "measured", "p (Holm)", "agrees", "equivalent")
+HEAD = (
+    "regime",
+    "figure",
+    "forecast",
+    "95 % predictive",
+    "measured",
+    "p (Holm)",
+    "agrees",
+    "equivalent",
+)
 
 
 def forecast_text(made: Mapping[str, Any]) -> str:
     """A forecast for people."""
     lines = [f"{made['task']}: forecast of {made['registered_at']}"]
     for name, said in made["regimes"].items():
-        lines.append(f"  regime {name or '-'}: {said['runs']} runs, from {said['training_throws']} throws")
+        lines.append(
+            f"  regime {name or '-'}: {said['runs']} runs, from {said['training_throws']} throws"
+        )
         for figure, found in said["figures"].items():
             if found["value"] is not None:
                 low, high = found["interval"]
-                lines.append(f"    {WORDS[figure]:20}{found['value']:.4f}  95 % [{low:.4f}, {high:.4f}]")
+                lines.append(
+                    f"    {WORDS[figure]:20}{found['value']:.4f}  95 % [{low:.4f}, {high:.4f}]"
+                )
         lines += _exact_lines(said.get("gspn", {}))
-        lines.append(f"    product of R's      {said['product']['R_conj']:.4f} as R_conj, if statuses were independent")
+        lines.append(
+            f"    product of R's      {said['product']['R_conj']:.4f} as R_conj, if statuses "
+            "were independent"
+        )
         for found in said["dependence"][:3]:
             if found["p"] < 0.01:
                 lines.append(
-                    f"    {found['places'][0]} and {found['places'][1]} depend on each other: p = {found['p']:.1e}"
+                    f"    {found['places'][0]} and {found['places'][1]} depend on each "
+                    f"other: p = {found['p']:.1e}"
                 )
         lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
         if 0.0005 < said["endless"] <= NEGLIGIBLE:
@@ -66,7 +83,9 @@ def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
             _number(row["measured"]),
             _p(row),
             _agrees(row),
-            f"{'yes' if row['equivalent'] else 'no'} (within {_number(row['margin'])})" if row["margin"] else "",
+            f"{'yes' if row['equivalent'] else 'no'} (within {_number(row['margin'])})"
+            if row["margin"]
+            else "",
         )
         for row in found["rows"]
     ]
@@ -80,7 +99,11 @@ def _agrees(row: Mapping[str, Any]) -> str:
 def _p(row: Mapping[str, Any]) -> str:
     if row["p"] is None:
         return ""
-    return f"{row['p']:.3f} (alone)" if row["p_holm"] is None else f"{row['p']:.3f} ({row['p_holm']:.3f})"
+    return (
+        f"{row['p']:.3f} (alone)"
+        if row["p_holm"] is None
+        else f"{row['p']:.3f} ({row['p_holm']:.3f})"
+    )
 
 
 def _number(value: float | None) -> str:
@@ -109,7 +132,8 @@ def agreement_text(found: Mapping[str, Any]) -> str:
     """A comparison for a terminal."""
     before = "before the runs" if found["registered_before"] else "AFTER the runs had begun"
     lines = [
-        f"{found['task']}: forecast of {found['forecast']['registered_at']} ({before}) and {found['campaign']['folder']}"
+        f"{found['task']}: forecast of {found['forecast']['registered_at']} ({before}) and "
+        f"{found['campaign']['folder']}"
     ]
     lines += _columns([HEAD, *rows_of(found)])
     lines.append("negative control, the product of marginal reliabilities as R_conj:")
@@ -118,26 +142,38 @@ def agreement_text(found: Mapping[str, Any]) -> str:
         if law["distance"] is not None:
             verdict = "agrees" if law["agrees"] else "DISAGREES"
             lines.append(
-                f"law of the time, regime {law['regime'] or '-'}: distance {law['distance']} of {law['limit']}: {verdict}"
+                f"law of the time, regime {law['regime'] or '-'}: distance {law['distance']} "
+                f"of {law['limit']}: {verdict}"
             )
     odd = [row for row in found["routing"] if row["p_holm"] < 0.01]
     lines += [
-        f"ways out of {row['place']} differ, regime {row['regime'] or '-'}: p = {row['p_holm']:.1e}" for row in odd
+        f"ways out of {row['place']} differ, regime {row['regime'] or '-'}: p = {row['p_holm']:.1e}"
+        for row in odd
     ]
     for regime, doubts in found["doubts"].items():
-        lines += [f"note: registered although doubtful, regime {regime or '-'}: {doubt}" for doubt in doubts]
+        lines += [
+            f"note: registered although doubtful, regime {regime or '-'}: {doubt}"
+            for doubt in doubts
+        ]
     if not found["same_block"]:
-        lines.append("note: the training had another --block: the first throws of a cell are a different share of all")
+        lines.append(
+            "note: the training had another --block: the first throws of a cell are a "
+            "different share of all"
+        )
     if not found["same_task_file"]:
         lines.append("note: the task file has changed between training and these runs")
-    lines.append("agrees" if found["agrees"] else "DISAGREES: at least one figure at 1 % after Holm")
+    lines.append(
+        "agrees" if found["agrees"] else "DISAGREES: at least one figure at 1 % after Holm"
+    )
     return "\n".join(lines)
 
 
 def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
-        "  " + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
+        "  "
+        + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
     ]
 
 
@@ -145,14 +181,22 @@ def agreement_markdown(found: Mapping[str, Any]) -> str:
     """A comparison as Markdown."""
     before = "before" if found["registered_before"] else "**after**"
     lines = [
-        f"Registered {found['forecast']['registered_at']}, {before} the runs (seed {found['campaign']['seed']}).",
+        f"Registered {found['forecast']['registered_at']}, {before} the runs (seed "
+        f"{found['campaign']['seed']}).",
         "",
     ]
     lines += _markdown([HEAD, *rows_of(found)])
-    lines += ["", "The product of marginal reliabilities as a forecast of R_conj (negative control):", ""]
+    lines += [
+        "",
+        "The product of marginal reliabilities as a forecast of R_conj (negative control):",
+        "",
+    ]
     lines += _markdown([("regime", "product", "measured", "p", "verdict"), *control_rows(found)])
     lines += ["", "Law of the time (Kolmogorov's distance, limit at 1 %):", ""]
-    laws = [(law["regime"] or "-", _number(law["distance"]), _number(law["limit"])) for law in found["law"]]
+    laws = [
+        (law["regime"] or "-", _number(law["distance"]), _number(law["limit"]))
+        for law in found["law"]
+    ]
     return "\n".join([*lines, *_markdown([("regime", "distance", "limit"), *laws])]) + "\n"
 
 

@@ -1,6 +1,8 @@
-"""How changes alter a snapshot, and how those that a client has not got yet are merged into one; pure.
+"""How changes alter a snapshot, and how those that a client has not got yet are merged into one;
+pure.
 
-`page/state.js` holds the same rules for browsers. A test applies random changes one by one and merged: same state.
+`page/state.js` holds the same rules for browsers. A test applies random changes one by one and
+merged: same state.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ ENDED_KEPT = 200
 SAMPLES_KEPT = 300
 NOTICES_KEPT = 30
 PENDING_LIMIT = 400
-"""Entries that may wait for one client; one that is further behind gets a fresh snapshot instead."""
+"""Entries that may wait for one client; one that is further behind gets a fresh snapshot
+instead."""
 
 
 def empty_state() -> State:
@@ -57,25 +60,36 @@ def _append(state: State, key: str, entry: Any, kept: int) -> None:
 def _ended(state: State, change: Change) -> None:
     run = state["runs"].pop(change["id"], None)
     if run is not None:
-        extra = {key: change[key] for key in ("status", "ended", "reason", "counts") if key in change}
+        extra = {
+            key: change[key] for key in ("status", "ended", "reason", "counts") if key in change
+        }
         _append(state, "ended", {**run, **extra}, ENDED_KEPT)
 
 
 def _judged(state: State, change: Change) -> None:
     said = {key: change[key] for key in ("status", "reason") if key in change}
-    state["ended"] = [{**run, **said} if run["id"] == change["id"] else run for run in state["ended"]]
+    state["ended"] = [
+        {**run, **said} if run["id"] == change["id"] else run for run in state["ended"]
+    ]
 
 
 def _progress(state: State, change: Change) -> None:
     run = state["runs"].get(change["id"])
     if run is not None:
-        state["runs"][change["id"]] = {**run, **{k: change[k] for k in ("progress", "state", "data") if k in change}}
+        state["runs"][change["id"]] = {
+            **run,
+            **{k: change[k] for k in ("progress", "state", "data") if k in change},
+        }
 
 
 def _setpoint(state: State, change: Change) -> None:
     known = state["setpoints"].get(change["stream"], {"samples": []})
     samples = [*known["samples"], *change.get("samples", ())][-SAMPLES_KEPT:]
-    state["setpoints"][change["stream"]] = {**known, **change.get("setpoint", {}), "samples": samples}
+    state["setpoints"][change["stream"]] = {
+        **known,
+        **change.get("setpoint", {}),
+        "samples": samples,
+    }
 
 
 def _entry(table: str, field: str) -> Callable[[State, Change], None]:
@@ -117,14 +131,16 @@ _RULES: dict[str, Callable[[State, Change], None]] = {
 SNAPSHOT_KEYS = tuple(key for key in empty_state() if key != "sequence")
 """The parts of a snapshot, besides its number."""
 KINDS = frozenset(_RULES) | {"reset"}
-"""Kinds of change. `reset` says that so much is new (another mission) that clients get a snapshot instead."""
+"""Kinds of change. `reset` says that so much is new (another mission) that clients get a snapshot
+instead."""
 
 _NAMED = frozenset({"node", "event", "variable", "device", "image", "report", "selector"})
 _WHOLE = frozenset({"breakpoints", "paused", "controls", "result"})
 
 
 def apply(state: State, change: Change) -> None:
-    """Alter a state by one change. Unknown kinds alter nothing but the number, so that old clients live with new servers."""
+    """Alter a state by one change. Unknown kinds alter nothing but the number, so that old clients
+    live with new servers."""
     rule = _RULES.get(str(change["kind"]))
     if rule is not None:
         rule(state, change)
@@ -137,16 +153,21 @@ def apply(state: State, change: Change) -> None:
 def copy_state(state: State) -> State:
     """A state that later changes to the first do not reach.
 
-    Two levels are copied: the rules above alter no value that lies deeper, they replace it. A whole copy of a task of 300
-    places would take 20 ms.
+    Two levels are copied: the rules above alter no value that lies deeper, they replace it. A whole
+    copy of a task of 300 places would take 20 ms.
     """
-    return {key: copy(value) if isinstance(value, dict | list) else value for key, value in state.items()}
+    return {
+        key: copy(value) if isinstance(value, dict | list) else value
+        for key, value in state.items()
+    }
 
 
 class Pending:
-    """The one merged delta that waits for a client: newest value of what has a newest value, all of what must not be lost.
+    """The one merged delta that waits for a client: newest value of what has a newest value, all of
+    what must not be lost.
 
-    Its size is bounded: past `PENDING_LIMIT` entries, or after a `reset`, it holds nothing and says `stale`.
+    Its size is bounded: past `PENDING_LIMIT` entries, or after a `reset`, it holds nothing and says
+    `stale`.
     """
 
     __slots__ = ("_entries", "_first", "_last", "_time", "stale")
@@ -216,7 +237,11 @@ def _merge(old: Change, new: Change) -> Change:
         return {**old, **new}
     if kind == "setpoint":
         samples = [*old.get("samples", ()), *new.get("samples", ())][-SAMPLES_KEPT:]
-        return {**new, "setpoint": {**old.get("setpoint", {}), **new.get("setpoint", {})}, "samples": samples}
+        return {
+            **new,
+            "setpoint": {**old.get("setpoint", {}), **new.get("setpoint", {})},
+            "samples": samples,
+        }
     return new
 
 

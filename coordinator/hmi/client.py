@@ -1,4 +1,5 @@
-"""A client of the operator's protocol (docs/operator-protocol.md): the snapshot kept up to date, and commands answered."""
+"""A client of the operator's protocol (docs/operator-protocol.md): the snapshot kept up to date,
+and commands answered."""
 
 from __future__ import annotations
 
@@ -9,12 +10,13 @@ from typing import Any, Self
 
 import aiohttp
 
-from coordinator.hmi.changes import State, apply, empty_state
-from coordinator.hmi.port import PROTOCOL
-from coordinator.hmi.sessions import LARGEST_SNAPSHOT
+from petrobot.coordinator.hmi.changes import State, apply, empty_state
+from petrobot.coordinator.hmi.port import PROTOCOL
+from petrobot.coordinator.hmi.sessions import LARGEST_SNAPSHOT
 
 LOST_AFTER = 3.0
-"""Seconds of silence after which the connection counts as lost: the server says `alive` every second."""
+"""Seconds of silence after which the connection counts as lost: the server says `alive` every
+second."""
 ANSWER = 10.0
 """Seconds that a command's answer may take."""
 
@@ -24,9 +26,11 @@ class OperatorError(Exception):
 
 
 class OperatorClient:
-    """One operator at one mission run: `async with OperatorClient(url, token, name, secret) as hand: ...`.
+    """One operator at one mission run: `async with OperatorClient(url, token, name, secret) as
+    hand: ...`.
 
-    `name` is shown to all; who comes back with the same name and `secret` is the same operator. Raises OperatorError.
+    `name` is shown to all; who comes back with the same name and `secret` is the same operator.
+    Raises OperatorError.
     """
 
     def __init__(self, url: str, token: str, name: str, secret: str) -> None:
@@ -61,7 +65,9 @@ class OperatorClient:
         except (aiohttp.ClientError, TimeoutError, OSError) as fault:
             await self.close()
             why = str(fault) or f"no answer within {LOST_AFTER:g} s: it may be frozen"
-            raise OperatorError(f"the coordinator at {self._url} cannot be reached: {why}") from None
+            raise OperatorError(
+                f"the coordinator at {self._url} cannot be reached: {why}"
+            ) from None
         except BaseException:
             await self.close()
             raise
@@ -88,7 +94,9 @@ class OperatorClient:
         self._numbers += 1
         number = self._numbers
         answer = self._answers[number] = asyncio.get_running_loop().create_future()
-        await self._socket.send_json({"type": "command", "id": number, "verb": verb, "data": data or {}})
+        await self._socket.send_json(
+            {"type": "command", "id": number, "verb": verb, "data": data or {}}
+        )
         try:
             async with asyncio.timeout(ANSWER):
                 await answer
@@ -113,7 +121,8 @@ class OperatorClient:
         return True
 
     async def changes(self) -> AsyncIterator[dict[str, Any]]:
-        """Every change as it comes, until the connection ends; `reset` when there is a new snapshot."""
+        """Every change as it comes, until the connection ends; `reset` when there is a new
+        snapshot."""
         self._watched = True
         while not self._over and (change := await self._changes.get()) is not None:
             yield change
@@ -154,7 +163,9 @@ class OperatorClient:
         if kind == "answer":
             answer = self._answers.get(message["id"])
             if answer is not None and not answer.done():
-                answer.set_result({key: value for key, value in message.items() if key not in ("type", "id")})
+                answer.set_result(
+                    {key: value for key, value in message.items() if key not in ("type", "id")}
+                )
         elif kind == "snapshot":
             self.who = message["you"]
             self.state = {key: message.get(key, value) for key, value in empty_state().items()}

@@ -1,6 +1,8 @@
-"""The written side over HTTP: task files, what nodes offer, findings of the check, foreign formats, journals.
+"""The written side over HTTP: task files, what nodes offer, findings of the check, foreign formats,
+journals.
 
-Nothing here looks into a document: whatever takes its time is done in a process of its own and passed on as it comes.
+Nothing here looks into a document: whatever takes its time is done in a process of its own and
+passed on as it comes.
 """
 
 from __future__ import annotations
@@ -11,10 +13,10 @@ from typing import Any
 
 from aiohttp import web
 
-from coordinator.analysing import RefusedError
-from coordinator.hmi.house import HOUSE, House
-from coordinator.hmi.requests import json_answer, read_object, refused, send_json
-from coordinator.hmi.store import StoreError
+from petrobot.coordinator.analysing import RefusedError
+from petrobot.coordinator.hmi.house import HOUSE, House
+from petrobot.coordinator.hmi.requests import json_answer, read_object, refused, send_json
+from petrobot.coordinator.hmi.store import StoreError
 
 RENAMES_AT_MOST = 1000
 DESK_AT_MOST = 64
@@ -46,9 +48,12 @@ async def _open(request: web.Request) -> web.StreamResponse:
 
 
 async def _revision(request: web.Request) -> web.Response:
-    """{revision}: whether a file is still the one that was opened; cheap enough to be asked every few seconds."""
+    """{revision}: whether a file is still the one that was opened; cheap enough to be asked every
+    few seconds."""
     try:
-        return json_answer({"revision": request.app[HOUSE].store.read(request.match_info["name"]).revision})
+        return json_answer(
+            {"revision": request.app[HOUSE].store.read(request.match_info["name"]).revision}
+        )
     except StoreError as fault:
         raise refused(RefusedError(fault.status, str(fault))) from fault
 
@@ -57,15 +62,23 @@ async def _save(request: web.Request) -> web.StreamResponse:
     """{base, document, renames} or, to settle a conflict, {base, text}; 409 gives both versions."""
     house = request.app[HOUSE]
     body = await read_object(request)
-    content = {"text": body["text"]} if isinstance(body.get("text"), str) else {"document": _document(body)}
+    content = (
+        {"text": body["text"]}
+        if isinstance(body.get("text"), str)
+        else {"document": _document(body)}
+    )
     about = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
-    return await _done(request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body))
+    return await _done(
+        request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body)
+    )
 
 
 async def _check(request: web.Request) -> web.StreamResponse:
-    """{name, document, desk}: what the check says of a document that is being drawn, and the text that it would be saved as.
+    """{name, document, desk}: what the check says of a document that is being drawn, and the text
+    that it would be saved as.
 
-    What was asked from the same desk before is given up, analyses too: it was about an older drawing.
+    What was asked from the same desk before is given up, analyses too: it was about an older
+    drawing.
     """
     house = request.app[HOUSE]
     body = await read_object(request)
@@ -75,14 +88,17 @@ async def _check(request: web.Request) -> web.StreamResponse:
 
 
 async def _analyse(request: web.Request) -> web.StreamResponse:
-    """{name, document, desk}: verdicts on a document that is being drawn, and where its time goes; one analysis at a time."""
+    """{name, document, desk}: verdicts on a document that is being drawn, and where its time goes;
+    one analysis at a time."""
     house = request.app[HOUSE]
     body = await read_object(request)
     desk = str(body.get("desk") or "")[:DESK_AT_MOST]
     drawing = _drawing(house, body)
     try:
         text = json.loads(await house.apart.do("drawing", drawing))["text"]
-        said = await house.analyses.do("analysis", {"text": text, "filename": f"{drawing['name']}.toml"}, desk)
+        said = await house.analyses.do(
+            "analysis", {"text": text, "filename": f"{drawing['name']}.toml"}, desk
+        )
     except RefusedError as refusal:
         raise refused(refusal) from refusal
     return await send_json(request, said)
@@ -91,20 +107,27 @@ async def _analyse(request: web.Request) -> web.StreamResponse:
 async def _export(request: web.Request) -> web.Response:
     house, name, form = request.app[HOUSE], request.match_info["name"], request.match_info["form"]
     try:
-        made = json.loads(await house.apart.do("export", {**house.store.folders, "name": name, "form": form}))
+        made = json.loads(
+            await house.apart.do("export", {**house.store.folders, "name": name, "form": form})
+        )
     except RefusedError as refusal:
         raise refused(refusal) from refusal
     return web.Response(
         text=made["text"],
         content_type=made["content_type"],
-        headers={"Content-Disposition": f'attachment; filename="{name}.{form}"', "Cache-Control": "no-store"},
+        headers={
+            "Content-Disposition": f'attachment; filename="{name}.{form}"',
+            "Cache-Control": "no-store",
+        },
     )
 
 
 async def _import(request: web.Request) -> web.StreamResponse:
     """{form, text}: a net in another format as a document to go on drawing."""
     body = await read_object(request)
-    return await _done(request, "import", {"form": str(body.get("form")), "text": str(body.get("text"))})
+    return await _done(
+        request, "import", {"form": str(body.get("form")), "text": str(body.get("text"))}
+    )
 
 
 async def _offers(request: web.Request) -> web.Response:
@@ -123,10 +146,14 @@ async def _run(request: web.Request) -> web.StreamResponse:
     history = request.app[HOUSE].history
     if history is None:
         raise web.HTTPNotFound(text="no such run")
-    return await _done(request, "run", {"folder": str(history.folder), "run": request.match_info["run"]})
+    return await _done(
+        request, "run", {"folder": str(history.folder), "run": request.match_info["run"]}
+    )
 
 
-async def _done(request: web.Request, work: str, given: Mapping[str, Any], desk: str = "") -> web.StreamResponse:
+async def _done(
+    request: web.Request, work: str, given: Mapping[str, Any], desk: str = ""
+) -> web.StreamResponse:
     """Have the work done apart, and pass on what came of it."""
     try:
         said = await request.app[HOUSE].apart.do(work, given, desk)

@@ -1,8 +1,9 @@
-"""Who may come in: the checks that each request passes before anything else, and the headers of each answer.
+"""Who may come in: the checks that each request passes before anything else, and the headers of
+each answer.
 
-Against: a stranger on this host (token), a web page in the operator's browser that posts or opens a WebSocket to this
-server (Origin, Sec-Fetch-Site, JSON only), DNS rebinding (Host), script in names and reasons (Content-Security-Policy;
-the page also never builds markup from text).
+Against: a stranger on this host (token), a web page in the operator's browser that posts or opens a
+WebSocket to this server (Origin, Sec-Fetch-Site, JSON only), DNS rebinding (Host), script in names
+and reasons (Content-Security-Policy; the page also never builds markup from text).
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 HEADERS = {
     "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: "
+        "blob:; connect-src 'self'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     ),
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -76,7 +78,8 @@ class Doors:
         return frozenset(f"{scheme}://{host}" for host in self.hosts)
 
     def fault(self, request: web.Request) -> web.HTTPException | None:
-        """Why a request is refused, or None. The first page with `?token=` is let in here and exchanged by the server."""
+        """Why a request is refused, or None. The first page with `?token=` is let in here and
+        exchanged by the server."""
         if request.headers.get("Host", "").lower() not in self.hosts:
             return web.HTTPMisdirectedRequest(text="this server does not answer to that name")
         origin = request.headers.get("Origin")
@@ -85,10 +88,17 @@ class Doors:
         if request.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
             return web.HTTPForbidden(text="requests from other sites are refused")
         if not self._known(request):
-            return web.HTTPUnauthorized(text="open the address with its token, as printed when petrobot started")
-        changes = request.method not in READING or request.headers.get("Upgrade", "").lower() == "websocket"
+            return web.HTTPUnauthorized(
+                text="open the address with its token, as printed when petrobot started"
+            )
+        changes = (
+            request.method not in READING
+            or request.headers.get("Upgrade", "").lower() == "websocket"
+        )
         if changes and origin is None and not self._bearer(request):
-            return web.HTTPForbidden(text="a browser says its Origin; a script gives the token as Bearer")
+            return web.HTTPForbidden(
+                text="a browser says its Origin; a script gives the token as Bearer"
+            )
         if request.method not in READING and request.content_type != "application/json":
             return web.HTTPUnsupportedMediaType(text="send JSON as application/json")
         return None
@@ -96,18 +106,26 @@ class Doors:
     def _known(self, request: web.Request) -> bool:
         if self._bearer(request):
             return True
-        if hmac.compare_digest(request.cookies.get(self.cookie, "").encode(), self.pass_value.encode()):
+        if hmac.compare_digest(
+            request.cookies.get(self.cookie, "").encode(), self.pass_value.encode()
+        ):
             return True
         return self.is_first_visit(request)
 
     def _bearer(self, request: web.Request) -> bool:
         given = request.headers.get("Authorization", "")
-        return hmac.compare_digest(given.encode("utf-8", "replace"), f"Bearer {self.token}".encode())
+        return hmac.compare_digest(
+            given.encode("utf-8", "replace"), f"Bearer {self.token}".encode()
+        )
 
     def is_first_visit(self, request: web.Request) -> bool:
         """Whether this is the first page, asked for with the right token in its address."""
         given = request.query.get("token", "").encode("utf-8", "replace")
-        return request.method == "GET" and request.path == "/" and hmac.compare_digest(given, self.token.encode())
+        return (
+            request.method == "GET"
+            and request.path == "/"
+            and hmac.compare_digest(given, self.token.encode())
+        )
 
     def hand_out(self, response: web.StreamResponse) -> None:
         """Give the browser its cookie."""
@@ -123,15 +141,19 @@ class Doors:
 
 
 def names_for(host: str, extra: Sequence[str]) -> frozenset[str]:
-    """Names that a server bound to `host` answers to: the address, this machine's own names for loopback, and `extra`."""
+    """Names that a server bound to `host` answers to: the address, this machine's own names for
+    loopback, and `extra`."""
     named = {"[" + host.strip("[]") + "]" if ":" in host else host, *extra}
     if is_loopback(host) or host in ("0.0.0.0", "::"):
         named |= {"127.0.0.1", "localhost", "[::1]"}
-    return frozenset(_PORT.sub("", name.lower()) if not name.startswith("[") else name.lower() for name in named)
+    return frozenset(
+        _PORT.sub("", name.lower()) if not name.startswith("[") else name.lower() for name in named
+    )
 
 
 def middleware(doors: Doors) -> Middleware:
-    """The aiohttp middleware that refuses, and puts the headers on every answer, refusals and errors included."""
+    """The aiohttp middleware that refuses, and puts the headers on every answer, refusals and
+    errors included."""
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:

@@ -1,7 +1,8 @@
 """Edits of a task file's text: what was not edited keeps every byte, its comments and its order.
 
-The page sends the whole document as plain JSON data. It is compared with what the text says now; only values that differ
-are replaced in the text (tomlkit keeps the rest), and renamed tables keep their place.
+The page sends the whole document as plain JSON data. It is compared with what the text says now;
+only values that differ are replaced in the text (tomlkit keeps the rest), and renamed tables keep
+their place.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ from tomlkit.toml_document import TOMLDocument
 LARGEST_SAFE_INTEGER = 2**53 - 1
 _BARE_END = re.compile(r"(?<!\r)\n")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_FAULTS = (TOMLKitError, TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError)
+_FAULTS = (
+    TOMLKitError,
+    TypeError,
+    ValueError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    RecursionError,
+)
 
 
 class EditError(ValueError):
@@ -45,13 +54,15 @@ def parse(text: str) -> TOMLDocument:
 
 
 def plain(document: TOMLDocument) -> dict[str, Any]:
-    """The document as JSON data: what JSON cannot hold (dates, infinities, huge integers) becomes text."""
+    """The document as JSON data: what JSON cannot hold (dates, infinities, huge integers) becomes
+    text."""
     value: dict[str, Any] = _json_value(document.unwrap())
     return value
 
 
 def edited(text: str, wanted: Mapping[str, Any], renames: Sequence[Rename] = ()) -> str:
-    """The text after its document was made equal to `wanted`; the same bytes when it was already. Raises EditError."""
+    """The text after its document was made equal to `wanted`; the same bytes when it was already.
+    Raises EditError."""
     for rename in renames:
         text = _renamed(text, rename)
     document = parse(text)
@@ -71,7 +82,9 @@ def edited(text: str, wanted: Mapping[str, Any], renames: Sequence[Rename] = ())
 
 def _lines_as_in(text: str, result: str) -> str:
     """The result with the line ends of a text that has one kind throughout."""
-    return _BARE_END.sub("\r\n", result) if "\r\n" in text and not _BARE_END.search(text) else result
+    return (
+        _BARE_END.sub("\r\n", result) if "\r\n" in text and not _BARE_END.search(text) else result
+    )
 
 
 def _json_value(value: Any) -> Any:
@@ -97,10 +110,14 @@ def _without_none(value: Any) -> Any:
 
 
 def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The document without tables of elements that hold none: their header goes with the last of them."""
+    """The document without tables of elements that hold none: their header goes with the last of
+    them."""
     kept = {key: value for key, value in document.items() if value != {}}
     if isinstance(kept.get("subnets"), Mapping):
-        kept["subnets"] = {n: _without_empty(s) if isinstance(s, Mapping) else s for n, s in kept["subnets"].items()}
+        kept["subnets"] = {
+            n: _without_empty(s) if isinstance(s, Mapping) else s
+            for n, s in kept["subnets"].items()
+        }
     return kept
 
 
@@ -119,7 +136,9 @@ def _value_of(item: Any) -> Any:
     return _json_value(item.unwrap() if hasattr(item, "unwrap") else item)
 
 
-def _make_equal(table: MutableMapping[str, Any], wanted: Mapping[str, Any], path: tuple[str, ...]) -> None:
+def _make_equal(
+    table: MutableMapping[str, Any], wanted: Mapping[str, Any], path: tuple[str, ...]
+) -> None:
     for key in [key for key in table if key not in wanted]:
         del table[key]
     for key, value in wanted.items():
@@ -131,7 +150,9 @@ def _make_equal(table: MutableMapping[str, Any], wanted: Mapping[str, Any], path
 
 def _put(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[str, ...]) -> None:
     if isinstance(value, Mapping) and not isinstance(table, InlineTable) and _has_header(path):
-        made = tomlkit.table(is_super_table=bool(value) and all(isinstance(v, Mapping) for v in value.values()))
+        made = tomlkit.table(
+            is_super_table=bool(value) and all(isinstance(v, Mapping) for v in value.values())
+        )
         for inner, inner_value in value.items():
             _put(made, inner, inner_value, (*path, inner))
         table[key] = made
@@ -140,7 +161,8 @@ def _put(table: MutableMapping[str, Any], key: str, value: Any, path: tuple[str,
 
 
 def _has_header(path: tuple[str, ...]) -> bool:
-    """Whether a new table gets a [header] of its own: `places.p`, `subnets.s.places.p`; arguments stand inline."""
+    """Whether a new table gets a [header] of its own: `places.p`, `subnets.s.places.p`; arguments
+    stand inline."""
     return len(path) <= 2 or (path[0] == "subnets" and len(path) <= 4)
 
 
@@ -204,7 +226,8 @@ def _item(value: Any) -> Item:
 
 
 def _renamed(text: str, rename: Rename) -> str:
-    """The text with the table's headers renamed; unaltered if that cannot be done in place (it is then written anew)."""
+    """The text with the table's headers renamed; unaltered if that cannot be done in place (it is
+    then written anew)."""
     goal = plain(parse(text))
     table: Any = goal
     for key in rename.path:
@@ -212,7 +235,9 @@ def _renamed(text: str, rename: Rename) -> str:
     if not isinstance(table, dict) or rename.old not in table or rename.new in table:
         return text
     table[rename.new] = table.pop(rename.old)
-    candidate = _header_pattern(rename).sub(lambda found: found[1] + _key(rename.new) + found[2], text)
+    candidate = _header_pattern(rename).sub(
+        lambda found: found[1] + _key(rename.new) + found[2], text
+    )
     try:
         done = _same(plain(parse(candidate)), goal)
     except EditError:

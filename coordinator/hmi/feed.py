@@ -1,12 +1,12 @@
-"""Numbers changes, keeps the snapshot that they lead to, and hands them to subscribers: the half of a mission port that
-is the same for every mission."""
+"""Numbers changes, keeps the snapshot that they lead to, and hands them to subscribers: the half of
+a mission port that is the same for every mission."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from coordinator.hmi.changes import KINDS, State, apply, copy_state, empty_state
+from petrobot.coordinator.hmi.changes import KINDS, State, apply, copy_state, empty_state
 
 Receive = Callable[[dict[str, Any]], None]
 
@@ -43,7 +43,8 @@ class Feed:
             receive(change)
 
     def replace(self, **parts: Any) -> None:
-        """Begin anew, as for another mission: clients get a fresh snapshot. Parts not given are empty."""
+        """Begin anew, as for another mission: clients get a fresh snapshot. Parts not given are
+        empty."""
         sequence = self._state["sequence"]
         unknown = parts.keys() - self._state.keys()
         if unknown:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from aiohttp import web
 
-from coordinator.analysing import RefusedError
-from coordinator.hmi.house import HOUSE
-from coordinator.hmi.port import PROTOCOL
-from coordinator.hmi.requests import json_answer, read_object, refused
-from coordinator.hmi.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
+from petrobot.coordinator.analysing import RefusedError
+from petrobot.coordinator.hmi.house import HOUSE
+from petrobot.coordinator.hmi.port import PROTOCOL
+from petrobot.coordinator.hmi.requests import json_answer, read_object, refused
+from petrobot.coordinator.hmi.sessions import LARGEST_MESSAGE, Session, carry_out, who_is
 
 CLIENTS = 64
 
@@ -25,7 +25,9 @@ async def _live(request: web.Request) -> web.StreamResponse:
     house = request.app[HOUSE]
     if len(house.sessions) >= CLIENTS:
         raise web.HTTPServiceUnavailable(text=f"{CLIENTS} clients are connected already")
-    socket = web.WebSocketResponse(heartbeat=15.0, max_msg_size=LARGEST_MESSAGE, compress=False, timeout=0.5)
+    socket = web.WebSocketResponse(
+        heartbeat=15.0, max_msg_size=LARGEST_MESSAGE, compress=False, timeout=0.5
+    )
     if not socket.can_prepare(request).ok:
         raise web.HTTPUpgradeRequired(text="this address speaks WebSocket")
     await socket.prepare(request)
@@ -55,7 +57,8 @@ async def _start(request: web.Request) -> web.Response:
 
 
 async def _command(request: web.Request) -> web.Response:
-    """{name, verb, data}: for scripts. Their `who` is their name and digits of the token, the same at each call."""
+    """{name, verb, data}: for scripts. Their `who` is their name and digits of the token, the same
+    at each call."""
     house = request.app[HOUSE]
     body = await read_object(request)
     data = body.get("data", {})

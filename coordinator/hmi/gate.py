@@ -21,7 +21,9 @@ class _Turned(asyncio.Protocol):
 class Gate:
     """A protocol factory around aiohttp's that counts and times connections."""
 
-    def __init__(self, server: web.Server, limit: int = CONNECTIONS, silent: float = SILENT_S) -> None:
+    def __init__(
+        self, server: web.Server, limit: int = CONNECTIONS, silent: float = SILENT_S
+    ) -> None:
         self._server = server
         self._limit = limit
         self.silent = silent

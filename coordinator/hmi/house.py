@@ -1,4 +1,5 @@
-"""What all handlers of one server share: the mission, the task files, the doors, and who is connected."""
+"""What all handlers of one server share: the mission, the task files, the doors, and who is
+connected."""
 
 from __future__ import annotations
 
@@ -10,12 +11,12 @@ from typing import Any
 
 from aiohttp import web
 
-from coordinator.analysing import Apart
-from coordinator.hmi.doors import Doors
-from coordinator.hmi.gate import Gate
-from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
-from coordinator.hmi.sessions import Session, carry_out, encode
-from coordinator.hmi.store import TaskStore
+from petrobot.coordinator.analysing import Apart
+from petrobot.coordinator.hmi.doors import Doors
+from petrobot.coordinator.hmi.gate import Gate
+from petrobot.coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
+from petrobot.coordinator.hmi.sessions import Session, carry_out, encode
+from petrobot.coordinator.hmi.store import TaskStore
 
 ABSENT_S = 10.0
 """Controls go free when their holder's last window has been gone for so long."""
@@ -62,7 +63,8 @@ class House:
             asyncio.get_running_loop().call_later(ABSENT_S, self._free_controls, session.who)
 
     def heard(self, who: str) -> None:
-        """A script gave a command: if it holds the controls and gives none for a while, they go free."""
+        """A script gave a command: if it holds the controls and gives none for a while, they go
+        free."""
         loop = asyncio.get_running_loop()
         self._heard[who] = loop.time()
         loop.call_later(ABSENT_S, self._free_controls, who)

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coordinator.analysing import RefusedError
-from coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
-from coordinator.hmi.picture import picture
-from coordinator.hmi.telling import reason_of, told
-from coordinator.record.journal import Journal, JournalError, read_journal
-from coordinator.record.recording import ReplayError, Step, replay
-from coordinator.record.runfolder import JOURNAL, RESULT
-from coordinator.task import End, Task
-from coordinator.taskfile import TaskFileError, loads
+from petrobot.coordinator.analysing import RefusedError
+from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
+from petrobot.coordinator.hmi.picture import picture
+from petrobot.coordinator.hmi.telling import reason_of, told
+from petrobot.coordinator.record.journal import Journal, JournalError, read_journal
+from petrobot.coordinator.record.recording import ReplayError, Step, replay
+from petrobot.coordinator.record.runfolder import JOURNAL, RESULT
+from petrobot.coordinator.task import End, Task
+from petrobot.coordinator.taskfile import TaskFileError, loads
 
 RECORDS_AT_MOST = 20_000
 RUNS_AT_MOST = 300
@@ -24,7 +24,8 @@ RUNS_AT_MOST = 300
 
 @dataclass(frozen=True, slots=True)
 class JournalHistory:
-    """The runs of one folder (`coordinator.record.runfolder`). Fits `coordinator.hmi.port.HistoryPort`."""
+    """The runs of one folder (`coordinator.record.runfolder`). Fits
+    `coordinator.hmi.port.HistoryPort`."""
 
     folder: Path
 
@@ -36,7 +37,8 @@ def _runs(folder: str) -> list[dict[str, Any]]:
 
 
 def _run(folder: str, run: str) -> dict[str, Any]:
-    """One run, derived again from its journal: {id, task (as in a snapshot), initial (marking), records}."""
+    """One run, derived again from its journal: {id, task (as in a snapshot), initial (marking),
+    records}."""
     if run not in {path.parent.name for path in Path(folder).glob(f"*/{JOURNAL}")}:
         raise RefusedError(404, "no such run")
     return opened(Path(folder) / run / JOURNAL, run)
@@ -44,11 +46,21 @@ def _run(folder: str, run: str) -> dict[str, Any]:
 
 def _listed(path: Path) -> dict[str, Any]:
     """What the list of runs says of one; the journal itself is read only when it is opened."""
-    entry: dict[str, Any] = {"id": path.parent.name, "task": "", "state": "running", "started": "", "seconds": None}
+    entry: dict[str, Any] = {
+        "id": path.parent.name,
+        "task": "",
+        "state": "running",
+        "started": "",
+        "seconds": None,
+    }
     try:
         result = json.loads((path.parent / RESULT).read_text(encoding="utf-8"))
         seconds = result.get("sim_s", result.get("wall_s"))
-        entry |= {"task": result.get("task", ""), "state": result.get("status", ""), "seconds": seconds}
+        entry |= {
+            "task": result.get("task", ""),
+            "state": result.get("status", ""),
+            "seconds": seconds,
+        }
     except (OSError, ValueError):
         entry["state"] = "running or interrupted"
     entry["modified"] = path.stat().st_mtime
@@ -56,7 +68,8 @@ def _listed(path: Path) -> dict[str, Any]:
 
 
 def opened(path: Path, run: str) -> dict[str, Any]:
-    """A journal as the page's history. A journal that cannot be derived again says so in `fault`, with what could be."""
+    """A journal as the page's history. A journal that cannot be derived again says so in `fault`,
+    with what could be."""
     try:
         journal = read_journal(path)
         task = task_of(journal)
@@ -65,7 +78,9 @@ def opened(path: Path, run: str) -> dict[str, Any]:
     engine = Engine(task, journal.header.get("devices") or _devices(journal))
     teller = _Teller(task)
     records: list[dict[str, Any]] = []
-    fault_text = f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
+    fault_text = (
+        f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
+    )
     try:
         for step in replay(journal, engine):
             records.append(teller.record(step))
@@ -91,12 +106,17 @@ def opened(path: Path, run: str) -> dict[str, Any]:
 def _source(header: Mapping[str, Any]) -> dict[str, Any] | None:
     """From which point of which run this one set out."""
     source = header.get("from")
-    return {key: source[key] for key in ("run", "record", "going") if key in source} if source else None
+    return (
+        {key: source[key] for key in ("run", "record", "going") if key in source}
+        if source
+        else None
+    )
 
 
 def task_of(journal: Journal) -> Task:
-    """The task that a journal ran, with the number of runs that it was given. Raises TaskFileError, KeyError."""
-    from coordinator.launch import with_runs
+    """The task that a journal ran, with the number of runs that it was given. Raises TaskFileError,
+    KeyError."""
+    from petrobot.coordinator.launch import with_runs
 
     task = loads(journal.header["task"], f"{journal.path} (task)")
     runs = journal.header.get("runs")
@@ -104,7 +124,7 @@ def task_of(journal: Journal) -> Task:
 
 
 def _devices(journal: Journal) -> dict[str, str]:
-    from services.comm.directory import parse
+    from petrobot.services.comm.directory import parse
 
     text = journal.header.get("services")
     if not text:
@@ -121,17 +141,24 @@ class _Teller:
         self._marking = task.net.initial
         self._actions: dict[str, str] = {}
         self._ends: dict[str, dict[str, Any]] = {}
-        self._errors = {t.name for t in task.flat.transitions.values() if any(i.end is End.ERROR for i in t.inputs)}
+        self._errors = {
+            t.name
+            for t in task.flat.transitions.values()
+            if any(i.end is End.ERROR for i in t.inputs)
+        }
 
     def record(self, step: Step) -> dict[str, Any]:
-        """{number, t, text, firings, marking (what changed), notes, error, going (places whose runs go on)}."""
+        """{number, t, text, firings, marking (what changed), notes, error, going (places whose runs
+        go on)}."""
         firings, notes = [], []
         for instruction in step.instructions:
             if isinstance(instruction, StartRun):
                 self._actions[instruction.run] = instruction.action
                 notes.append(f"{instruction.action} starts in {instruction.place}")
             elif isinstance(instruction, RunRecorded):
-                end = reason_of(instruction.status, instruction.cause, instruction.text, instruction.executed)
+                end = reason_of(
+                    instruction.status, instruction.cause, instruction.text, instruction.executed
+                )
                 self._ends[instruction.run] = end
             elif isinstance(instruction, Report) and instruction.severity.value != "note":
                 notes.append(instruction.text)
@@ -148,12 +175,18 @@ class _Teller:
             "marking": changed,
             "notes": notes,
             "error": any(f["error"] for f in firings),
-            "going": sorted({run.place for run in step.state.runs() if run.phase is not Phase.DONE}),
+            "going": sorted(
+                {run.place for run in step.state.runs() if run.phase is not Phase.DONE}
+            ),
         }
 
     def _firing(self, step: Step, fired: Fired) -> dict[str, Any]:
         ends = [self._ends[run] for run in fired.runs if run in self._ends]
-        worst = max(ends, key=lambda end: ("none", "success", "failure", "error").index(end["status"]), default=None)
+        worst = max(
+            ends,
+            key=lambda end: ("none", "success", "failure", "error").index(end["status"]),
+            default=None,
+        )
         return {
             "transition": fired.transition,
             "cause": told(step.stimulus, fired.cause),

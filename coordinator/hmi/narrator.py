@@ -1,12 +1,13 @@
-"""Tells a mission run as changes of the page's state: an observer of the executor, and of journals read back."""
+"""Tells a mission run as changes of the page's state: an observer of the executor, and of journals
+read back."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from coordinator.conditions.wording import Severity
-from coordinator.engine import (
+from petrobot.coordinator.conditions.wording import Severity
+from petrobot.coordinator.engine import (
     Abort,
     CancelRun,
     Chosen,
@@ -32,14 +33,14 @@ from coordinator.engine import (
     State,
     Stimulus,
 )
-from coordinator.engine.state import ACTIVE
-from coordinator.hmi.changes import empty_state
-from coordinator.hmi.feed import Feed
-from coordinator.hmi.picture import picture
-from coordinator.hmi.telling import plain_value, reason_of, told
-from coordinator.net import Marking
-from coordinator.task import End, Executed, Scope, Task
-from services.comm.notice import Progress
+from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.hmi.changes import empty_state
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.hmi.picture import picture
+from petrobot.coordinator.hmi.telling import plain_value, reason_of, told
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import End, Executed, Scope, Task
+from petrobot.services.comm.notice import Progress
 
 _AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
 _GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
@@ -47,13 +48,16 @@ _LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "e
 
 
 class Narrator:
-    """Fills a feed. `where` gives the node of each action. Fits `coordinator.mission.executor.Observer`.
+    """Fills a feed. `where` gives the node of each action. Fits
+    `coordinator.mission.executor.Observer`.
 
-    `settled` is to be called after each stimulus that the engine has handled, with the new state: it tells what no
-    instruction says (latched events, variables, breakpoints).
+    `settled` is to be called after each stimulus that the engine has handled, with the new state:
+    it tells what no instruction says (latched events, variables, breakpoints).
     """
 
-    def __init__(self, feed: Feed, task: Task, where: Mapping[str, str] | None = None, origin: float = 0.0) -> None:
+    def __init__(
+        self, feed: Feed, task: Task, where: Mapping[str, str] | None = None, origin: float = 0.0
+    ) -> None:
         self.feed = feed
         self.task = task
         self.origin = origin
@@ -67,7 +71,9 @@ class Narrator:
         self._seen: State | None = None
         self._aborted = False
         self._error_exits = {
-            t.name for t in task.flat.transitions.values() if any(i.end is End.ERROR for i in t.inputs)
+            t.name
+            for t in task.flat.transitions.values()
+            if any(i.end is End.ERROR for i in t.inputs)
         }
         self._tell: Mapping[type, Callable[[float, Any], None]] = {
             Fired: self._fired,
@@ -87,16 +93,29 @@ class Narrator:
     def begin(self, mission: str, mode: str, *, starts: bool = True, **parts: Any) -> None:
         """A mission run begins: clients get a snapshot with the task at its initial marking.
 
-        `starts` says whether another mission run can be started when this one has ended.
-        `parts` are further parts of the snapshot that outlive a mission run, such as `controls`, `nodes` and `selectors`.
+        `starts` says whether another mission run can be started when this one has ended. `parts`
+        are further parts of the snapshot that outlive a mission run, such as `controls`, `nodes`
+        and `selectors`.
         """
         flat = self.task.flat
         events = {
-            name: {"scope": e.scope.value, "memory": e.memory.value, "armed": False, "count": 0, "last": None}
+            name: {
+                "scope": e.scope.value,
+                "memory": e.memory.value,
+                "armed": False,
+                "count": 0,
+                "last": None,
+            }
             for name, e in flat.events.items()
         }
         state = {key: value for key, value in empty_state().items() if key != "sequence"} | {
-            "mission": {"id": mission, "state": "idle", "mode": mode, "firings": 0, "starts": starts},
+            "mission": {
+                "id": mission,
+                "state": "idle",
+                "mode": mode,
+                "firings": 0,
+                "starts": starts,
+            },
             "task": picture(self.task),
             "marking": dict(zip(self._net.places, self._net.initial, strict=True)),
             "events": events,
@@ -104,14 +123,16 @@ class Narrator:
         }
         self.feed.replace(**(state | parts))
 
-    # --- what the executor tells -----------------------------------------------------------------------------------
+    # --- what the executor tells --------------------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """The engine takes a stimulus in."""
         time = now - self.origin
         self._stimulus = stimulus
         if isinstance(stimulus, RunEnded):
-            self._ends[stimulus.run] = reason_of(stimulus.status, stimulus.cause, stimulus.text, stimulus.executed)
+            self._ends[stimulus.run] = reason_of(
+                stimulus.status, stimulus.cause, stimulus.text, stimulus.executed
+            )
         elif isinstance(stimulus, Chosen):
             self._why[stimulus.key] = stimulus.reason
         elif isinstance(stimulus, (EventOccurred, RaiseEvent)):
@@ -132,7 +153,9 @@ class Narrator:
 
     def progress(self, now: float, run: str, notice: Progress) -> None:
         """A run says how far it is."""
-        self.feed.emit("run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4))
+        self.feed.emit(
+            "run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4)
+        )
 
     def settled(self, now: float, state: State) -> None:
         """The engine has handled a stimulus."""
@@ -145,14 +168,23 @@ class Narrator:
                 if name not in before or before[name] != value:
                     self.feed.emit("variable", time=time, name=name, value=plain_value(value))
         if seen is None or seen.breakpoints != state.breakpoints:
-            self.feed.emit("breakpoints", time=time, breakpoints=[self._key(n) for n in sorted(state.breakpoints)])
+            self.feed.emit(
+                "breakpoints",
+                time=time,
+                breakpoints=[self._key(n) for n in sorted(state.breakpoints)],
+            )
         before_overrides = seen.overrides if seen else {}
         if before_overrides is not state.overrides:
             self._overrides(time, before_overrides, state.overrides)
-        if state.mode in (Mode.RUNNING, Mode.PAUSED) and self.feed.state["mission"]["state"] == "idle":
+        if (
+            state.mode in (Mode.RUNNING, Mode.PAUSED)
+            and self.feed.state["mission"]["state"] == "idle"
+        ):
             self.feed.emit("mission", time=time, mission={"state": "running"})
         if state.mode is Mode.ABORTING and self.feed.state["mission"]["state"] == "running":
-            self.feed.emit("mission", time=time, mission={"state": "stopping", "reason": state.ending})
+            self.feed.emit(
+                "mission", time=time, mission={"state": "stopping", "reason": state.ending}
+            )
         self._seen = state
 
     def adopt(self, now: float, state: State) -> None:
@@ -164,7 +196,15 @@ class Narrator:
             if run.phase in _GOING:
                 primitive = self.task.primitive_task_of(run.place)
                 self._started(
-                    time, StartRun(run.id, run.place, primitive.name, run.action, run.arguments, primitive.deadline)
+                    time,
+                    StartRun(
+                        run.id,
+                        run.place,
+                        primitive.name,
+                        run.action,
+                        run.arguments,
+                        primitive.deadline,
+                    ),
                 )
                 if run.phase not in (Phase.RUNNING, Phase.STARTING):
                     self._state(time, run.id, "held" if run.phase is Phase.HELD else "stopping")
@@ -172,12 +212,17 @@ class Narrator:
             self._paused(time, Paused("as another process left it"))
         self.settled(now, state)
 
-    # --- in the words of the protocol ------------------------------------------------------------------------------
+    # --- in the words of the protocol ---------------------------------------------------------
 
     def _fired(self, time: float, fired: Fired) -> None:
         ends = [self._ends[run] for run in fired.runs if run in self._ends]
-        worst = max(ends, key=lambda end: ("success", "failure", "error").index(end["status"]), default=None)
-        run = next((r for r in fired.runs if self._ends.get(r) is worst), fired.runs[0] if fired.runs else "")
+        worst = max(
+            ends, key=lambda end: ("success", "failure", "error").index(end["status"]), default=None
+        )
+        run = next(
+            (r for r in fired.runs if self._ends.get(r) is worst),
+            fired.runs[0] if fired.runs else "",
+        )
         action = self._actions.get(run, "")
         firing = {
             "number": fired.number,
@@ -223,7 +268,9 @@ class Narrator:
         self._state(time, held.run, _AFTER_HOLD[held.answer])
         node = self._where.get(self._actions.get(held.run, ""), "?")
         before = self._held.get(node, Hold.HELD.value)
-        self._held[node] = before if before == Hold.CANNOT.value else held.answer.value  # the worst of a node's runs
+        self._held[node] = (
+            before if before == Hold.CANNOT.value else held.answer.value
+        )  # the worst of a node's runs
         paused = self.feed.state["paused"]
         if paused is not None:
             self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})
@@ -239,19 +286,27 @@ class Narrator:
 
     def _corrected(self, time: float, corrected: Corrected) -> None:
         reason = reason_of(corrected.status, corrected.cause, corrected.text, Executed.YES)
-        self.feed.emit("run_judged", time=time, id=corrected.run, status=corrected.status.value, reason=reason)
+        self.feed.emit(
+            "run_judged", time=time, id=corrected.run, status=corrected.status.value, reason=reason
+        )
 
     def _report(self, time: float, report: Report) -> None:
         if report.severity is not Severity.NOTE:
             self.feed.emit(
                 "notice",
                 time=time,
-                notice={"level": _LEVEL[report.severity], "text": report.text, "at": round(time, 4)},
+                notice={
+                    "level": _LEVEL[report.severity],
+                    "text": report.text,
+                    "at": round(time, 4),
+                },
             )
 
     def _paused(self, time: float, paused: Paused) -> None:
         self._held = {}
-        self.feed.emit("paused", time=time, paused={"reason": paused.reason, "at": round(time, 4), "nodes": {}})
+        self.feed.emit(
+            "paused", time=time, paused={"reason": paused.reason, "at": round(time, 4), "nodes": {}}
+        )
 
     def _finished(self, time: float, finished: Finished) -> None:
         state = "aborted" if self._aborted else finished.status.value
@@ -264,10 +319,14 @@ class Narrator:
         for name in before ^ after:
             known = self.feed.state["events"].get(name)
             if known is not None and self.task.flat.events[name].scope is Scope.EXTERNAL:
-                self.feed.emit("event", time=time, name=name, event={**known, "armed": name in after})
+                self.feed.emit(
+                    "event", time=time, name=name, event={**known, "armed": name in after}
+                )
 
     def _overrides(self, time: float, before: Mapping[str, str], after: Mapping[str, str]) -> None:
-        for name in sorted(name for name in {*before, *after} if before.get(name) != after.get(name)):
+        for name in sorted(
+            name for name in {*before, *after} if before.get(name) != after.get(name)
+        ):
             selector = {**self.feed.state["selectors"].get(name, {}), "override": after.get(name)}
             self.feed.emit("selector", time=time, name=name, selector=selector)
 

@@ -1,4 +1,5 @@
-"""Nets of other tools as the text of a task file, to go on drawing: names, marking, weights, inhibitors and positions; pure."""
+"""Nets of other tools as the text of a task file, to go on drawing: names, marking, weights,
+inhibitors and positions; pure."""
 
 from __future__ import annotations
 
@@ -6,24 +7,30 @@ import re
 
 import tomlkit
 
-from coordinator.analysis.netfile import NetFile
-from coordinator.task import Kind
+from petrobot.coordinator.analysis.netfile import NetFile
+from petrobot.coordinator.task import Kind
 
 _NOT_NAME = re.compile(r"\W+")
 
 
 def as_task_file(model: NetFile) -> str:
-    """Its places are control places, to be given their meaning by drawing on; `final` is never true until it is written."""
+    """Its places are control places, to be given their meaning by drawing on; `final` is never true
+    until it is written."""
     names = usable_names(model)
     document = tomlkit.document()
     document.add("schema", tomlkit.item(1))
-    document.add("task", tomlkit.item({"name": _free(model.name or "imported", set()), "final": "false"}))
+    document.add(
+        "task", tomlkit.item({"name": _free(model.name or "imported", set()), "final": "false"})
+    )
     places, transitions = tomlkit.table(is_super_table=True), tomlkit.table(is_super_table=True)
     net = model.net
     for place, tokens, capacity in zip(net.places, net.initial, net.capacity, strict=True):
         own = {"tokens": tokens} if tokens else {}
         most = {} if capacity is None else {"capacity": capacity}
-        places.add(names[place], tomlkit.item({"kind": Kind.CONTROL.value, **own, **most, **_position(model, place)}))
+        places.add(
+            names[place],
+            tomlkit.item({"kind": Kind.CONTROL.value, **own, **most, **_position(model, place)}),
+        )
     for t, name in enumerate(net.transitions):
         takes = [_arc(names[net.places[p]], w) for p, w in net.consume[t]]
         takes += [f"!{_arc(names[net.places[p]], w)}" for p, w in net.inhibit[t]]
@@ -37,9 +44,13 @@ def as_task_file(model: NetFile) -> str:
 
 
 def usable_names(model: NetFile) -> dict[str, str]:
-    """For each id of the file a name that a task file may hold: its label made usable, kept apart from all others."""
+    """For each id of the file a name that a task file may hold: its label made usable, kept apart
+    from all others."""
     taken: set[str] = set()
-    return {i: _free(model.labels.get(i) or i, taken) for i in (*model.net.places, *model.net.transitions)}
+    return {
+        i: _free(model.labels.get(i) or i, taken)
+        for i in (*model.net.places, *model.net.transitions)
+    }
 
 
 def _arc(place: str, weight: int) -> str:

@@ -1,15 +1,26 @@
-"""A task as the page draws it: plain data of places, transitions and arcs with all that they mean; pure."""
+"""A task as the page draws it: plain data of places, transitions and arcs with all that they mean;
+pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from coordinator.task import Event, Kind, Place, PrimitiveTask, Reference, Scope, Task, Transition
+from petrobot.coordinator.task import (
+    Event,
+    Kind,
+    Place,
+    PrimitiveTask,
+    Reference,
+    Scope,
+    Task,
+    Transition,
+)
 
 
 def picture(task: Task) -> dict[str, Any]:
-    """The snapshot's `task`: the flat net (its names are those of markings and firings) and the macro places above it."""
+    """The snapshot's `task`: the flat net (its names are those of markings and firings) and the
+    macro places above it."""
     flat = task.flat
     errors = flat.error_elements
     macros = dict(_macros(task, task.places, ""))
@@ -23,21 +34,28 @@ def picture(task: Task) -> dict[str, Any]:
         "events": {name: _event(e) for name, e in task.events.items()},
         "places": [
             *(_place(p, p.name in errors) for p in flat.places.values()),
-            *({**_place(p, False), "name": name, "in_macro": around} for name, (p, around) in macros.items()),
+            *(
+                {**_place(p, False), "name": name, "in_macro": around}
+                for name, (p, around) in macros.items()
+            ),
         ],
         "transitions": [_transition(t, flat, t.name in errors) for t in flat.transitions.values()],
         "arcs": [arc for t in flat.transitions.values() for arc in _arcs(t)],
     }
 
 
-def _macros(task: Task, places: Mapping[str, Place], prefix: str) -> Iterator[tuple[str, tuple[Place, str]]]:
+def _macros(
+    task: Task, places: Mapping[str, Place], prefix: str
+) -> Iterator[tuple[str, tuple[Place, str]]]:
     """Each macro place by its full name, with the full name of the one around it."""
     for place in places.values():
         if place.kind is Kind.MACRO:
             around = prefix + place.macro if place.macro else prefix.removesuffix(".")
             yield prefix + place.name, (place, around)
             if place.subnet:
-                yield from _macros(task, task.subnets[place.subnet].places, f"{prefix}{place.name}.")
+                yield from _macros(
+                    task, task.subnets[place.subnet].places, f"{prefix}{place.name}."
+                )
 
 
 def _place(place: Place, error: bool) -> dict[str, Any]:
@@ -53,7 +71,9 @@ def _place(place: Place, error: bool) -> dict[str, Any]:
         "servers": place.servers,
         "primitive_task": place.task,
         "subnet": place.subnet,
-        "args": {k: f"${v.variable}" if isinstance(v, Reference) else v for k, v in place.args.items()},
+        "args": {
+            k: f"${v.variable}" if isinstance(v, Reference) else v for k, v in place.args.items()
+        },
         "error": error,
     }
 
@@ -81,12 +101,31 @@ def _event_words(name: str, task: Task) -> dict[str, str]:
 
 def _arcs(transition: Transition) -> Iterator[dict[str, Any]]:
     for arc in transition.inputs:
-        ends = {"end": arc.end.value if arc.end else None, "counts": arc.counts.value if arc.counts else None}
-        yield {"place": arc.place, "transition": transition.name, "direction": "in", "weight": arc.weight, **ends}
+        ends = {
+            "end": arc.end.value if arc.end else None,
+            "counts": arc.counts.value if arc.counts else None,
+        }
+        yield {
+            "place": arc.place,
+            "transition": transition.name,
+            "direction": "in",
+            "weight": arc.weight,
+            **ends,
+        }
     for out in transition.outputs:
-        yield {"place": out.place, "transition": transition.name, "direction": "out", "weight": out.weight}
+        yield {
+            "place": out.place,
+            "transition": transition.name,
+            "direction": "out",
+            "weight": out.weight,
+        }
     for stop in transition.inhibitors:
-        yield {"place": stop.place, "transition": transition.name, "direction": "inhibit", "weight": stop.threshold}
+        yield {
+            "place": stop.place,
+            "transition": transition.name,
+            "direction": "inhibit",
+            "weight": stop.threshold,
+        }
 
 
 def _primitive_task(task: PrimitiveTask) -> dict[str, Any]:
@@ -101,4 +140,9 @@ def _primitive_task(task: PrimitiveTask) -> dict[str, Any]:
 
 
 def _event(event: Event) -> dict[str, Any]:
-    return {"scope": event.scope.value, "memory": event.memory.value, "by": event.by, "text": event.text}
+    return {
+        "scope": event.scope.value,
+        "memory": event.memory.value,
+        "by": event.by,
+        "text": event.text,
+    }

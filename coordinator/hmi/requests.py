@@ -10,9 +10,9 @@ from typing import Any
 
 from aiohttp import web
 
-from coordinator.analysing import RefusedError
-from coordinator.hmi.doors import HEADERS
-from services.comm.json_text import json_text
+from petrobot.coordinator.analysing import RefusedError
+from petrobot.coordinator.hmi.doors import HEADERS
+from petrobot.services.comm.json_text import json_text
 
 BODY_S = 10.0
 LARGEST_BODY = 2 * 1024 * 1024
@@ -40,7 +40,11 @@ async def read_object(request: web.Request) -> dict[str, Any]:
 
 async def send_json(request: web.Request, text: bytes, status: int = 200) -> web.StreamResponse:
     """Answer with JSON text that may be long, piece by piece: no other client waits for it."""
-    headers = {**HEADERS, "Cache-Control": "no-store", "Content-Type": "application/json; charset=utf-8"}
+    headers = {
+        **HEADERS,
+        "Cache-Control": "no-store",
+        "Content-Type": "application/json; charset=utf-8",
+    }
     response = web.StreamResponse(status=status, headers=headers)
     response.content_length = len(text)
     with contextlib.suppress(ConnectionError):  # whoever asked has left meanwhile
@@ -53,7 +57,9 @@ async def send_json(request: web.Request, text: bytes, status: int = 200) -> web
 
 def json_answer(value: Mapping[str, Any] | Sequence[Any], status: int = 200) -> web.Response:
     """An answer that no cache keeps."""
-    body = json_text(value, ensure_ascii=False).encode("utf-8", "replace")  # a lone surrogate is no text
+    body = json_text(value, ensure_ascii=False).encode(
+        "utf-8", "replace"
+    )  # a lone surrogate is no text
     return web.Response(
         body=body,
         status=status,

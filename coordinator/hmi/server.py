@@ -1,4 +1,5 @@
-"""Serves the operator's page in the coordinator's own loop: files, task documents, history, and one WebSocket a client."""
+"""Serves the operator's page in the coordinator's own loop: files, task documents, history, and one
+WebSocket a client."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from pathlib import Path
 
 from aiohttp import web
 
-from coordinator.hmi import documents, feeds
-from coordinator.hmi.doors import Doors, Handler, middleware, names_for
-from coordinator.hmi.gate import Gate
-from coordinator.hmi.house import HOUSE, House
-from coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
-from coordinator.hmi.requests import LARGEST_BODY
-from coordinator.hmi.sessions import Session
-from coordinator.hmi.store import TaskStore
+from petrobot.coordinator.hmi import documents, feeds
+from petrobot.coordinator.hmi.doors import Doors, Handler, middleware, names_for
+from petrobot.coordinator.hmi.gate import Gate
+from petrobot.coordinator.hmi.house import HOUSE, House
+from petrobot.coordinator.hmi.port import HistoryPort, MissionPort, OffersPort, StartsPort
+from petrobot.coordinator.hmi.requests import LARGEST_BODY
+from petrobot.coordinator.hmi.sessions import Session
+from petrobot.coordinator.hmi.store import TaskStore
 
 PAGE_FILES = Path(__file__).parent / "page"
 LAST_COMMANDS_S = 1.0
@@ -29,7 +30,9 @@ LAST_COMMANDS_S = 1.0
 class Page:
     """A running page: `url` holds the token; `await close()` ends it."""
 
-    def __init__(self, runner: web.AppRunner, listening: asyncio.Server, house: House, url: str) -> None:
+    def __init__(
+        self, runner: web.AppRunner, listening: asyncio.Server, house: House, url: str
+    ) -> None:
         self._runner = runner
         self._listening = listening
         self._house = house
@@ -55,7 +58,8 @@ class Page:
             await asyncio.wait(set(self._house.commands))
 
     async def close(self) -> None:
-        """Close all connections and the port. Whoever gave the last commands is answered; one that takes long is given up."""
+        """Close all connections and the port. Whoever gave the last commands is answered; one that
+        takes long is given up."""
         self._listening.close()
         self._house.closing = True
         with contextlib.suppress(TimeoutError):
@@ -84,23 +88,42 @@ async def start_page(
     tls: ssl.SSLContext | None = None,
     page: bool = True,
 ) -> Page:
-    """Serve the page of a mission; without `page` only the operator's protocol: the WebSocket, snapshot and commands.
+    """Serve the page of a mission; without `page` only the operator's protocol: the WebSocket,
+    snapshot and commands.
 
-    Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and a save of one makes a copy there. `port` 0
-    takes a free one. `names` are further names under which browsers ask for this server (needed when `host` is
-    not loopback). `token` is drawn anew unless given. Raises OSError when the address cannot be bound.
+    Tasks are saved in `tasks_folder`; those of `shipped` are offered, too, and a save of one makes
+    a copy there. `port` 0 takes a free one. `names` are further names under which browsers ask for
+    this server (needed when `host` is not loopback). `token` is drawn anew unless given. Raises
+    OSError when the address cannot be bound.
     """
     listener = _listen(host, port)
     number = listener.getsockname()[1]
-    doors = Doors(token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None)
+    doors = Doors(
+        token or secrets.token_urlsafe(24), number, names_for(host, names), tls is not None
+    )
     house = House(port_object, TaskStore(tasks_folder, shipped), doors, offers, history, starts)
-    runner = web.AppRunner(_application(house, page), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0)
+    runner = web.AppRunner(
+        _application(house, page), access_log=None, keepalive_timeout=30.0, shutdown_timeout=1.0
+    )
     await runner.setup()
     assert runner.server is not None
     house.gate = Gate(runner.server)
-    listening = await asyncio.get_running_loop().create_server(house.gate, sock=listener, ssl=tls, backlog=128)
-    shown = "127.0.0.1" if host in ("0.0.0.0", "::", "localhost") else f"[{host}]" if ":" in host else host
-    return Page(runner, listening, house, f"{'https' if tls else 'http'}://{shown}:{number}/?token={doors.token}")
+    listening = await asyncio.get_running_loop().create_server(
+        house.gate, sock=listener, ssl=tls, backlog=128
+    )
+    shown = (
+        "127.0.0.1"
+        if host in ("0.0.0.0", "::", "localhost")
+        else f"[{host}]"
+        if ":" in host
+        else host
+    )
+    return Page(
+        runner,
+        listening,
+        house,
+        f"{'https' if tls else 'http'}://{shown}:{number}/?token={doors.token}",
+    )
 
 
 def _listen(host: str, port: int) -> sockets.socket:
@@ -125,7 +148,9 @@ def _application(house: House, page: bool) -> web.Application:
             house.gate.asked(request)
         return await handler(request)
 
-    app = web.Application(middlewares=[count, middleware(house.doors)], client_max_size=LARGEST_BODY)
+    app = web.Application(
+        middlewares=[count, middleware(house.doors)], client_max_size=LARGEST_BODY
+    )
     app[HOUSE] = house
     feeds.add_routes(app)
     if page:
@@ -138,7 +163,9 @@ def _application(house: House, page: bool) -> web.Application:
 async def _index(request: web.Request) -> web.StreamResponse:
     doors = request.app[HOUSE].doors
     if "token" in request.query:
-        away = web.HTTPSeeOther("/")  # the token leaves the address bar and the history of the browser
+        away = web.HTTPSeeOther(
+            "/"
+        )  # the token leaves the address bar and the history of the browser
         doors.hand_out(away)
         raise away
     return web.FileResponse(PAGE_FILES / "index.html", headers={"Cache-Control": "no-store"})

@@ -1,4 +1,5 @@
-"""One WebSocket of one client: a snapshot, then merged deltas as fast as the client takes them, and its commands."""
+"""One WebSocket of one client: a snapshot, then merged deltas as fast as the client takes them, and
+its commands."""
 
 from __future__ import annotations
 
@@ -13,9 +14,9 @@ from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from coordinator.hmi.changes import Pending
-from coordinator.hmi.port import PROTOCOL, VERBS, MissionPort
-from services.comm.json_text import json_text
+from petrobot.coordinator.hmi.changes import Pending
+from petrobot.coordinator.hmi.port import PROTOCOL, VERBS, MissionPort
+from petrobot.services.comm.json_text import json_text
 
 LONGEST_FAULT = 400
 SEND_S = 8.0
@@ -41,12 +42,14 @@ class ProtocolError(Exception):
 
 
 def encode(message: Mapping[str, Any]) -> str:
-    """A message as JSON text: whatever a value is, it neither ends the feed nor makes the message unreadable."""
+    """A message as JSON text: whatever a value is, it neither ends the feed nor makes the message
+    unreadable."""
     return json_text(message, separators=(",", ":"))
 
 
 def who_is(name: str, tab: str) -> str:
-    """How a client is called for all: its name and four digits of its tab's secret, so that two of one name differ."""
+    """How a client is called for all: its name and four digits of its tab's secret, so that two of
+    one name differ."""
     clean = _NAME.sub("", name).strip()[:24] or "operator"
     return f"{clean} {hashlib.sha256(tab.encode()).hexdigest()[:4]}"
 
@@ -55,12 +58,18 @@ class Session:
     """One connected client."""
 
     def __init__(
-        self, socket: web.WebSocketResponse, port: MissionPort, encoded: Encode, commands: set[asyncio.Task[None]]
+        self,
+        socket: web.WebSocketResponse,
+        port: MissionPort,
+        encoded: Encode,
+        commands: set[asyncio.Task[None]],
     ) -> None:
         self._socket = socket
         self._port = port
         self._encoded = encoded
-        self._all_commands = commands  # held by the server: a command goes on when its client leaves
+        self._all_commands = (
+            commands  # held by the server: a command goes on when its client leaves
+        )
         self._pending = Pending()
         self._news = asyncio.Event()
         self._answers: list[dict[str, Any]] = []
@@ -86,7 +95,9 @@ class Session:
                 stop()
                 await _end(sender)
         except ProtocolError as fault:
-            await self._socket.close(code=WSCloseCode.POLICY_VIOLATION, message=str(fault).encode()[:120])
+            await self._socket.close(
+                code=WSCloseCode.POLICY_VIOLATION, message=str(fault).encode()[:120]
+            )
         except (ConnectionError, TimeoutError):
             await self._close_hard()
 
@@ -99,7 +110,9 @@ class Session:
                 answers, self._answers = self._answers, []
                 for answer in answers:
                     await self._send(encode(answer))
-                await self._socket.close(code=WSCloseCode.GOING_AWAY, message=b"the coordinator has ended")
+                await self._socket.close(
+                    code=WSCloseCode.GOING_AWAY, message=b"the coordinator has ended"
+                )
 
     def _receive(self, change: dict[str, Any]) -> None:
         self._pending.add(change)
@@ -142,11 +155,17 @@ class Session:
         if not isinstance(number, int) or not isinstance(data, dict):
             raise ProtocolError("a command has a whole number as id and an object as data")
         if number in self._numbers:
-            self._answer(number, {"ok": False, "code": "replayed", "text": f"command {number} was given before"})
+            self._answer(
+                number,
+                {"ok": False, "code": "replayed", "text": f"command {number} was given before"},
+            )
             return
         self._numbers.append(number)
         if verb != "estop" and self._commands >= COMMANDS_AT_ONCE:
-            self._answer(number, {"ok": False, "code": "busy", "text": "wait for the answers to earlier commands"})
+            self._answer(
+                number,
+                {"ok": False, "code": "busy", "text": "wait for the answers to earlier commands"},
+            )
             return
         task = asyncio.create_task(self._carry_out(number, str(verb), data))
         self._all_commands.add(task)
@@ -194,7 +213,9 @@ class Session:
         self._pending.clear()
         self.snapshots_sent += 1
         snapshot = self._port.snapshot()
-        await self._send(encode({**snapshot, "type": "snapshot", "protocol": PROTOCOL, "you": self.who}))
+        await self._send(
+            encode({**snapshot, "type": "snapshot", "protocol": PROTOCOL, "you": self.who})
+        )
 
     async def _send(self, text: str) -> None:
         async with asyncio.timeout(SEND_S):
@@ -206,8 +227,11 @@ class Session:
                 await self._socket.close(code=WSCloseCode.TRY_AGAIN_LATER)
 
 
-async def carry_out(port: MissionPort, who: str, verb: str, data: Mapping[str, Any]) -> dict[str, Any]:
-    """One command to the mission; whatever goes wrong there becomes an answer, so that no command goes unanswered."""
+async def carry_out(
+    port: MissionPort, who: str, verb: str, data: Mapping[str, Any]
+) -> dict[str, Any]:
+    """One command to the mission; whatever goes wrong there becomes an answer, so that no command
+    goes unanswered."""
     if verb not in VERBS:
         return {"ok": False, "code": "unknown_command", "text": f"no command {verb[:40]!r}"}
     try:

@@ -1,5 +1,5 @@
-"""The folders of task files: names, texts, revisions. Shipped ones are read only; a save that would undo another's is refused
-with both versions."""
+"""The folders of task files: names, texts, revisions. Shipped ones are read only; a save that would
+undo another's is refused with both versions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from coordinator.hmi.edits import EditError, Rename, edited, parse
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.hmi.edits import EditError, Rename, edited, parse
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 LARGEST_FILE = 1024 * 1024
@@ -49,7 +49,8 @@ class TaskText:
 
 
 class TaskStore:
-    """Task files by bare name: those of the user's own folder, made when it is first needed, and behind them shipped ones."""
+    """Task files by bare name: those of the user's own folder, made when it is first needed, and
+    behind them shipped ones."""
 
     def __init__(self, folder: Path, shipped: Path | None = None) -> None:
         self._folder = folder
@@ -70,9 +71,13 @@ class TaskStore:
         return sorted(self._own() | self._behind())
 
     def listed(self) -> list[dict[str, object]]:
-        """All task files: {name, own, shipped}; one that is both is the user's copy of a shipped one."""
+        """All task files: {name, own, shipped}; one that is both is the user's copy of a shipped
+        one."""
         own, behind = self._own(), self._behind()
-        return [{"name": name, "own": name in own, "shipped": name in behind} for name in sorted(own | behind)]
+        return [
+            {"name": name, "own": name in own, "shipped": name in behind}
+            for name in sorted(own | behind)
+        ]
 
     def read(self, name: str) -> TaskText:
         """One task file, the user's own if there is one. Raises StoreError."""
@@ -92,10 +97,14 @@ class TaskStore:
     def _behind(self) -> set[str]:
         return _stems(self._shipped) if self._shipped is not None else set()
 
-    def save(self, name: str, base: str | None, document: dict[str, object], renames: list[Rename]) -> TaskText:
-        """Write an edited document; `base` is the revision that the edit began from, None for a new file.
+    def save(
+        self, name: str, base: str | None, document: dict[str, object], renames: list[Rename]
+    ) -> TaskText:
+        """Write an edited document; `base` is the revision that the edit began from, None for a new
+        file.
 
-        Only what differs from the file's own values is altered in its text. Raises Conflict, StoreError.
+        Only what differs from the file's own values is altered in its text. Raises Conflict,
+        StoreError.
         """
         try:
             current: TaskText | None = self.read(name)
@@ -110,7 +119,8 @@ class TaskStore:
         return TaskText(name, yours)
 
     def save_text(self, name: str, base: str | None, text: str) -> TaskText:
-        """Write a whole text, as after a conflict was settled by hand. Raises Conflict, StoreError."""
+        """Write a whole text, as after a conflict was settled by hand. Raises Conflict,
+        StoreError."""
         try:
             parse(text)
             current = self.read(name) if name in self.names() else None
@@ -121,7 +131,9 @@ class TaskStore:
         self._write(name, text)
         return TaskText(name, text)
 
-    def edited_text(self, current: TaskText | None, document: dict[str, object], renames: list[Rename]) -> str:
+    def edited_text(
+        self, current: TaskText | None, document: dict[str, object], renames: list[Rename]
+    ) -> str:
         """What the file would become. Raises StoreError."""
         try:
             return edited(current.text if current else "", document, renames)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
     Begin,
@@ -30,7 +30,7 @@ from coordinator.engine import (
     VariableChanged,
     Verdict,
 )
-from coordinator.task import Executed, Status
+from petrobot.coordinator.task import Executed, Status
 
 LONGEST_TEXT = 400
 
@@ -41,7 +41,8 @@ def place_of(run: str) -> str:
 
 
 def told(stimulus: Stimulus | None, cause: str = "") -> str:
-    """What happened. `cause` is that of a firing: `stability` means that it followed from another."""
+    """What happened. `cause` is that of a firing: `stability` means that it followed from
+    another."""
     if cause == "stability":
         return "followed at once"
     match stimulus:
@@ -52,7 +53,11 @@ def told(stimulus: Stimulus | None, cause: str = "") -> str:
         case RunHeld(run, answer):
             return f"{place_of(run)}: {answer.value.replace('_', ' ')}"
         case Chosen(key, alternative, reason):
-            return f"{alternative} chosen for {place_of(key)}: {reason}" if reason else f"{alternative} chosen"
+            return (
+                f"{alternative} chosen for {place_of(key)}: {reason}"
+                if reason
+                else f"{alternative} chosen"
+            )
         case Verdict(run, status):
             return f"verdict on {place_of(run)}: {status.value}"
         case EventOccurred(event):
@@ -114,7 +119,11 @@ def plain_value(value: Any, depth: int = 4) -> Any:
     if isinstance(value, str):
         return value[:LONGEST_TEXT]
     if isinstance(value, Mapping):
-        return {str(k): plain_value(v, depth - 1) for k, v in list(value.items())[:32]} if depth else "…"
+        return (
+            {str(k): plain_value(v, depth - 1) for k, v in list(value.items())[:32]}
+            if depth
+            else "…"
+        )
     if isinstance(value, (list, tuple)):
         return [plain_value(v, depth - 1) for v in value[:64]] if depth else "…"
     return value

@@ -1,6 +1,8 @@
-"""Work on task files that may take long for a large net, as plain functions of plain data: open, save, check, convert.
+"""Work on task files that may take long for a large net, as plain functions of plain data: open,
+save, check, convert.
 
-The page's server has all of it done in a process of its own (`coordinator.analysing.Apart`), in the names of `WORKS`.
+The page's server has all of it done in a process of its own (`coordinator.analysing.Apart`), in the
+names of `WORKS`.
 """
 
 from __future__ import annotations
@@ -10,17 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coordinator.analysing import RefusedError
-from coordinator.analysis import pnml_writing
-from coordinator.analysis.commands import net_file_of
-from coordinator.analysis.netfile import FormatError as NetFormatError
-from coordinator.analysis.pnml_reading import parse_pnml
-from coordinator.check import check
-from coordinator.hmi.edits import EditError, Rename, parse, plain
-from coordinator.hmi.netfiles import as_task_file
-from coordinator.hmi.store import Conflict, StoreError, TaskStore, TaskText
-from coordinator.task import Task
-from coordinator.taskfile import TaskFileError, dumps, loads
+from petrobot.coordinator.analysing import RefusedError
+from petrobot.coordinator.analysis import pnml_writing
+from petrobot.coordinator.analysis.commands import net_file_of
+from petrobot.coordinator.analysis.netfile import FormatError as NetFormatError
+from petrobot.coordinator.analysis.pnml_reading import parse_pnml
+from petrobot.coordinator.check import check
+from petrobot.coordinator.hmi.edits import EditError, Rename, parse, plain
+from petrobot.coordinator.hmi.netfiles import as_task_file
+from petrobot.coordinator.hmi.store import Conflict, StoreError, TaskStore, TaskText
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import TaskFileError, dumps, loads
 
 Where = Mapping[str, str] | None
 
@@ -38,7 +40,8 @@ class Made:
 
 
 def findings(text: str, filename: str, where: Mapping[str, str] | None) -> list[dict[str, Any]]:
-    """What keeps the task from running or should be looked at: {severity, key, text, remedy}; errors first.
+    """What keeps the task from running or should be looked at: {severity, key, text, remedy};
+    errors first.
 
     `where` gives the node of each action that is offered; None leaves offers out.
     """
@@ -84,7 +87,7 @@ def imported(form: str, text: str) -> str:
         raise FormatError(f"not a place/transition net in PNML: {error}") from error
 
 
-# --- as orders -------------------------------------------------------------------------------------------------------
+# --- as orders --------------------------------------------------------------------------------
 
 
 def _store(tasks: str, shipped: str) -> TaskStore:
@@ -114,22 +117,35 @@ def _open(tasks: str, shipped: str, name: str, where: Where) -> dict[str, Any]:
 
 
 def _save(
-    tasks: str, shipped: str, name: str, where: Where, base: str | None, content: dict[str, Any], renames: list[Any]
+    tasks: str,
+    shipped: str,
+    name: str,
+    where: Where,
+    base: str | None,
+    content: dict[str, Any],
+    renames: list[Any],
 ) -> dict[str, Any]:
-    """`content` is {document}, or {text} to settle a conflict. A conflict is refused with both versions."""
+    """`content` is {document}, or {text} to settle a conflict. A conflict is refused with both
+    versions."""
     store = _store(tasks, shipped)
     try:
         if "text" in content:
             return _described(store.save_text(name, base, content["text"]), where)
         return _described(store.save(name, base, content["document"], _renames(renames)), where)
     except Conflict as conflict:
-        both = {"conflict": str(conflict), "yours": conflict.yours, "theirs": _described(conflict.theirs, where)}
+        both = {
+            "conflict": str(conflict),
+            "yours": conflict.yours,
+            "theirs": _described(conflict.theirs, where),
+        }
         raise RefusedError(409, str(conflict), both) from conflict
     except StoreError as fault:
         raise _refused(fault) from fault
 
 
-def _drawn(tasks: str, shipped: str, name: str, document: dict[str, Any], renames: list[Any]) -> dict[str, Any]:
+def _drawn(
+    tasks: str, shipped: str, name: str, document: dict[str, Any], renames: list[Any]
+) -> dict[str, Any]:
     """The text that a drawing would be saved as: {text}."""
     store = _store(tasks, shipped)
     try:

@@ -1,11 +1,15 @@
 """Learning automata: schemes that move a vector of choice probabilities.
 
-- Nikolic and Fu: Z. J. Nikolic and K. S. Fu, "An algorithm for learning without external supervision and its application to
-  learning control systems", IEEE Trans. Automatic Control AC-11 (1966) 414-422; used for robotic tasks by P. U. Lima and
-  G. N. Saridis, Design of Intelligent Control Systems Based on Hierarchical Stochastic Automata, World Scientific 1996.
-  Estimate R and C of the chosen action, order by J, move: p_i += gamma_k (lambda_i - p_i), lambda = 1 at the lowest J.
-- Linear reward-inaction: K. S. Narendra and M. A. L. Thathachar, Learning Automata, Prentice Hall 1989 (S-model).
-- Discretised pursuit: B. J. Oommen and J. K. Lanctot, "Discretized pursuit learning automata", IEEE Trans. Systems, Man and
+- Nikolic and Fu: Z. J. Nikolic and K. S. Fu, "An algorithm for learning without external
+  supervision and its application to
+  learning control systems", IEEE Trans. Automatic Control AC-11 (1966) 414-422; used for robotic
+  tasks by P. U. Lima and G. N. Saridis, Design of Intelligent Control Systems Based on Hierarchical
+  Stochastic Automata, World Scientific 1996. Estimate R and C of the chosen action, order by J,
+  move: p_i += gamma_k (lambda_i - p_i), lambda = 1 at the lowest J.
+- Linear reward-inaction: K. S. Narendra and M. A. L. Thathachar, Learning Automata, Prentice Hall
+  1989 (S-model).
+- Discretised pursuit: B. J. Oommen and J. K. Lanctot, "Discretized pursuit learning automata", IEEE
+  Trans. Systems, Man and
   Cybernetics 20 (1990) 931-938 (reward-inaction).
 """
 
@@ -15,18 +19,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coordinator.learning.batch import Array, Batch, Index, Mask, Trial, drawn, restricted
-from coordinator.learning.rule import forced, one_hot
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Trial, drawn, restricted
+from petrobot.coordinator.learning.rule import forced, one_hot
 
 
 @dataclass(frozen=True)
 class NikolicFu:
     """The paper's scheme. gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
 
-    Each action is chosen `trials` times first. With `mixing` m > 0 the draw is from (1 - eps_k) p + eps_k e, eps_k =
-    min(1, m n / k). e explores: a share `even` over all actions alike, the rest over the contenders, those whose J less
-    `focus` standard errors is not above what some action's J plus as many is. The textbook gain has exponent 1, 0 < c <= 1
-    and no mixing; docs/learning.md says which parameters converge with probability 1.
+    Each action is chosen `trials` times first. With `mixing` m > 0 the draw is from (1 - eps_k) p +
+    eps_k e, eps_k = min(1, m n / k). e explores: a share `even` over all actions alike, the rest
+    over the contenders, those whose J less `focus` standard errors is not above what some action's
+    J plus as many is. The textbook gain has exponent 1, 0 < c <= 1 and no mixing; docs/learning.md
+    says which parameters converge with probability 1.
     """
 
     name: str = "nikolic_fu"
@@ -65,7 +70,8 @@ class NikolicFu:
         return self.even / batch.n + (1.0 - self.even) * shares
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
-        """p with its share of exploration; certain while an action is still owed its first trials."""
+        """p with its share of exploration; certain while an action is still owed its first
+        trials."""
         mixed = batch.p
         if self.mixing:
             eps = self.exploration(batch)
@@ -98,10 +104,11 @@ class NikolicFu:
 
 @dataclass(frozen=True)
 class RewardInaction:
-    """L_R-I: the chosen action's probability grows by step * payoff * (1 - p), the others shrink; a bad payoff does nothing.
+    """L_R-I: the chosen action's probability grows by step * payoff * (1 - p), the others shrink; a
+    bad payoff does nothing.
 
-    It keeps no estimates to choose by. It ends at some action with probability 1, at the best one with a probability that
-    nears 1 as the step nears 0 (epsilon-optimal).
+    It keeps no estimates to choose by. It ends at some action with probability 1, at the best one
+    with a probability that nears 1 as the step nears 0 (epsilon-optimal).
     """
 
     name: str = "reward_inaction"
@@ -120,7 +127,8 @@ class RewardInaction:
         return drawn(self.probabilities(batch, offered), u[:, 0])
 
     def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
-        """Move towards the chosen action as far as it paid; not at all towards one that is not eligible."""
+        """Move towards the chosen action as far as it paid; not at all towards one that is not
+        eligible."""
         batch.counting(trial)
         pay = batch.payoff(trial)
         if eligible is not None:
@@ -135,7 +143,8 @@ class RewardInaction:
 
 @dataclass(frozen=True)
 class DiscretisedPursuit:
-    """DP_R-I: after each success, probability moves in steps of 1 / (n * resolution) to the action with the lowest J.
+    """DP_R-I: after each success, probability moves in steps of 1 / (n * resolution) to the action
+    with the lowest J.
 
     Each action is tried `trials` times first, so that the estimates mean something.
     """

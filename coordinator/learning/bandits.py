@@ -1,8 +1,10 @@
 """Bandit rules: they choose by what is known and how well, and keep no probabilities of their own.
 
-- UCB1: P. Auer, N. Cesa-Bianchi and P. Fischer, "Finite-time analysis of the multiarmed bandit problem", Machine Learning 47
+- UCB1: P. Auer, N. Cesa-Bianchi and P. Fischer, "Finite-time analysis of the multiarmed bandit
+  problem", Machine Learning 47
   (2002) 235-256.
-- Thompson sampling: W. R. Thompson, Biometrika 25 (1933) 285-294; S. Agrawal and N. Goyal, COLT 2012.
+- Thompson sampling: W. R. Thompson, Biometrika 25 (1933) 285-294; S. Agrawal and N. Goyal, COLT
+  2012.
 """
 
 from __future__ import annotations
@@ -12,20 +14,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betaincinv
 
-from coordinator.learning.batch import Array, Batch, Index, Mask, Trial
-from coordinator.learning.rule import forced, one_hot
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Trial
+from petrobot.coordinator.learning.rule import forced, one_hot
 
 POINTS = 512
 """Fixed points at which Thompson's choice probabilities are worked out for people and forecasts."""
 
 
 def _follow(batch: Batch, eligible: Mask | None) -> None:
-    """p of a bandit rule: all on what it would recommend now, for people and for a frozen selector."""
+    """p of a bandit rule: all on what it would recommend now, for people and for a frozen
+    selector."""
     batch.p[:] = one_hot(batch.best(eligible), batch.n)
 
 
 def _allowed(batch: Batch, offered: Mask) -> Mask:
-    """Offered actions, without those that a target reliability rules out unless that leaves none."""
+    """Offered actions, without those that a target reliability rules out unless that leaves
+    none."""
     ruled_out = batch.own["ruled_out"] > 0
     left: Mask = offered & ~ruled_out
     return np.where(left.any(axis=1, keepdims=True), left, offered)
@@ -46,7 +50,8 @@ def _learn(batch: Batch, trial: Trial, eligible: Mask | None) -> None:
 
 @dataclass(frozen=True)
 class UCB1:
-    """The action with the largest mean payoff + sqrt(width * 2 ln k / n_a); the payoff is affine in J, within [0, 1]."""
+    """The action with the largest mean payoff + sqrt(width * 2 ln k / n_a); the payoff is affine in
+    J, within [0, 1]."""
 
     name: str = "ucb1"
     width: float = 1.0
@@ -60,9 +65,13 @@ class UCB1:
         """Upper confidence bound of each action's mean payoff; inf where it was never tried."""
         weight = batch.weight()
         gain = batch.availability() * batch.reliability()
-        mean = np.where(weight > 0, 0.5 * (gain + 1 - np.clip(weight * batch.mean_cost(), 0, 1)), gain)
+        mean = np.where(
+            weight > 0, 0.5 * (gain + 1 - np.clip(weight * batch.mean_cost(), 0, 1)), gain
+        )
         n = batch.runs + batch.missing
-        bonus = np.sqrt(2 * self.width * np.log(np.maximum(batch.k, 1.0))[:, None] / np.maximum(n, 1e-300))
+        bonus = np.sqrt(
+            2 * self.width * np.log(np.maximum(batch.k, 1.0))[:, None] / np.maximum(n, 1e-300)
+        )
         return np.where(n > 0, mean + bonus, np.inf)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
@@ -85,12 +94,15 @@ class UCB1:
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Its bound."""
         bound = float(self.index(batch)[0, action])
-        return "never tried" if bound == np.inf else f"largest upper bound {bound:.3f} of the payoff"
+        return (
+            "never tried" if bound == np.inf else f"largest upper bound {bound:.3f} of the payoff"
+        )
 
 
 @dataclass(frozen=True)
 class Thompson:
-    """The lowest J after drawing each R from its posterior Beta(1 + successes, 1 + others); costs are taken as their means."""
+    """The lowest J after drawing each R from its posterior Beta(1 + successes, 1 + others); costs
+    are taken as their means."""
 
     name: str = "thompson"
 
@@ -108,7 +120,8 @@ class Thompson:
         return share / POINTS
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """Draw each R by the inverse of its posterior, and compare J. Untried actions are taken to cost what the cheapest does."""
+        """Draw each R by the inverse of its posterior, and compare J. Untried actions are taken to
+        cost what the cheapest does."""
         r = betaincinv(1 + batch.successes, 1 + batch.runs - batch.successes, u)
         known = np.where(batch.costed > 0, batch.mean_cost(), np.inf)
         cheapest = known.min(axis=1, keepdims=True)
@@ -128,7 +141,8 @@ class Thompson:
 
 
 def _plastic(n: int) -> float:
-    """The root above 1 of x^(n+1) = x + 1: generator of an even additive sequence in n dimensions (M. Roberts, 2018)."""
+    """The root above 1 of x^(n+1) = x + 1: generator of an even additive sequence in n dimensions
+    (M. Roberts, 2018)."""
     x = 2.0
     for _ in range(64):
         x = (1.0 + x) ** (1.0 / (n + 1))

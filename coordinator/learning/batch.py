@@ -1,8 +1,8 @@
 """State of many learners side by side, one a row, and the order of their actions by J.
 
-The simulations of docs/learning.md play a thousand rows, the selector of a mission run has one: both run the same rules on the
-same arrays, so what is measured is what is shipped. All sums are kept as sums, and every J is computed from them afresh with
-the one rho of its row.
+The simulations of docs/learning.md play a thousand rows, the selector of a mission run has one:
+both run the same rules on the same arrays, so what is measured is what is shipped. All sums are
+kept as sums, and every J is computed from them afresh with the one rho of its row.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Batch:
         self.missing[rows, trial.action] += 1 - executed
         self.k += 1
 
-    # --- figures from the sums -------------------------------------------------------------------------------------
+    # --- figures from the sums ----------------------------------------------------------------
 
     def reliability(self) -> Array:
         """R; 0 where nothing is known."""
@@ -120,7 +120,8 @@ class Batch:
         return np.where(self.runs + self.missing > 0, j, np.inf)
 
     def spread(self) -> Array:
-        """Standard error of J: of R with one success and one failure added, so that it is never 0, and of rho C."""
+        """Standard error of J: of R with one success and one failure added, so that it is never 0,
+        and of rho C."""
         n = np.maximum(self.runs, 1.0)
         share = (self.successes + 1.0) / (self.runs + 2.0)
         costed = np.maximum(self.costed, 1.0)
@@ -129,7 +130,8 @@ class Batch:
         return error
 
     def best(self, eligible: Mask | None = None) -> Index:
-        """The action with the lowest J in each row, of the eligible ones if any is; the first of equals."""
+        """The action with the lowest J in each row, of the eligible ones if any is; the first of
+        equals."""
         j = self.objective()
         if eligible is not None:
             some = np.any(eligible & (j < np.inf), axis=1, keepdims=True)
@@ -138,7 +140,8 @@ class Batch:
         return best
 
     def payoff(self, trial: Trial) -> Array:
-        """A trial's gain in [0, 1], affine in its share of J: success, and cost where costs count; shape (rows,)."""
+        """A trial's gain in [0, 1], affine in its share of J: success, and cost where costs count;
+        shape (rows,)."""
         rows = np.arange(len(self.k))
         weight = self.weight()[:, 0]
         mean = self.mean_cost()[rows, trial.action]
@@ -147,7 +150,7 @@ class Batch:
         gain = trial.success * trial.executed
         return np.where(matters, 0.5 * (gain + 1.0 - cost), gain)
 
-    # --- plain data ------------------------------------------------------------------------------------------------
+    # --- plain data ---------------------------------------------------------------------------
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data of a batch of one row."""
@@ -178,7 +181,8 @@ class Batch:
 
 
 def drawn(probabilities: Array, u: Array) -> Index:
-    """The action of each row at a uniform number u in [0, 1), shape (rows,), by the inverse of the distribution."""
+    """The action of each row at a uniform number u in [0, 1), shape (rows,), by the inverse of the
+    distribution."""
     bounds = np.cumsum(probabilities, axis=1)
     bounds /= bounds[:, -1:]
     chosen: Index = np.minimum((bounds <= u[:, None]).sum(axis=1), probabilities.shape[1] - 1)
@@ -189,4 +193,8 @@ def restricted(probabilities: Array, offered: Mask) -> Array:
     """Probabilities of the offered actions alone; equal ones where they had none."""
     left = np.where(offered, probabilities, 0.0)
     whole = left.sum(axis=1, keepdims=True)
-    return np.where(whole > 0, left / np.where(whole > 0, whole, 1.0), offered / offered.sum(axis=1, keepdims=True))
+    return np.where(
+        whole > 0,
+        left / np.where(whole > 0, whole, 1.0),
+        offered / offered.sum(axis=1, keepdims=True),
+    )

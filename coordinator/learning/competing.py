@@ -1,7 +1,9 @@
-"""Competing risks: how runs end and when, where some were cut off (O. O. Aalen and S. Johansen, Scand. J. Statistics 5 (1978)).
+"""Competing risks: how runs end and when, where some were cut off (O. O. Aalen and S. Johansen,
+Scand. J. Statistics 5 (1978)).
 
-The cumulative incidence of cause s is CIF_s(t) = sum over t_i <= t of S(t_i-) d_s,i / n_i, with n_i the runs still going on and S
-the probability of none of the causes so far. Cut-off runs count among the n_i only.
+The cumulative incidence of cause s is CIF_s(t) = sum over t_i <= t of S(t_i-) d_s,i / n_i, with n_i
+the runs still going on and S the probability of none of the causes so far. Cut-off runs count among
+the n_i only.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from math import sqrt
 
 import numpy as np
 
-from coordinator.learning.batch import Array
+from petrobot.coordinator.learning.batch import Array
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,8 @@ class Incidence:
 def incidences(times: Sequence[float], causes: Sequence[str | None]) -> dict[str, Incidence]:
     """Cumulative incidence of each cause; None: cut off. `times` in s.
 
-    What is left of S behind the last time (it was cut off) goes to the causes in proportion to what they have: more is not
-    known of it.
+    What is left of S behind the last time (it was cut off) goes to the causes in proportion to what
+    they have: more is not known of it.
     """
     at = np.sort(np.asarray(times, dtype=float))
     of = [cause for _, cause in sorted(zip(times, causes, strict=True), key=lambda pair: pair[0])]

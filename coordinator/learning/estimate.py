@@ -1,9 +1,11 @@
-"""What is known of one primitive action in one context: counts by status and cause, durations, CPU time, costs, availability.
+"""What is known of one primitive action in one context: counts by status and cause, durations, CPU
+time, costs, availability.
 
-A `Tally` is immutable and merges: the tally of two sets of runs is the merge of their tallies, so several machines' runs add
-up. Reliability R is the relative frequency of SUCCESS among the runs that were executed and not censored (paper, section 3);
-an ERROR counts as a failure, `executed = unknown` too; an ERROR that never executed lowers the availability A alone. A
-preempted run that counts `none` is censored: it says only that it had lasted so long.
+A `Tally` is immutable and merges: the tally of two sets of runs is the merge of their tallies, so
+several machines' runs add up. Reliability R is the relative frequency of SUCCESS among the runs
+that were executed and not censored (paper, section 3); an ERROR counts as a failure, `executed =
+unknown` too; an ERROR that never executed lowers the availability A alone. A preempted run that
+counts `none` is censored: it says only that it had lasted so long.
 """
 
 from __future__ import annotations
@@ -12,10 +14,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from coordinator.learning.intervals import clopper_pearson, wilson
-from coordinator.learning.moments import EMPTY, Moments, merged, whole
-from coordinator.learning.sample import Sample, quantile
-from coordinator.task import Executed, Status
+from petrobot.coordinator.learning.intervals import clopper_pearson, wilson
+from petrobot.coordinator.learning.moments import EMPTY, Moments, merged, whole
+from petrobot.coordinator.learning.sample import Sample, quantile
+from petrobot.coordinator.task import Executed, Status
 
 CENSORED = "none"
 COUNT = "count"
@@ -24,7 +26,8 @@ COUNT = "count"
 
 @dataclass(frozen=True, slots=True, order=True)
 class Key:
-    """Whose tally: an action as translation of a primitive task, in a context ("" where contexts are not told apart)."""
+    """Whose tally: an action as translation of a primitive task, in a context ("" where contexts
+    are not told apart)."""
 
     primitive_task: str
     action: str
@@ -42,15 +45,18 @@ class Observation:
     executed: Executed = Executed.YES
     cpu_seconds: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
-    """Numbers of the run's result, any of which may be a cost measure of its own (images averaged, ...)."""
+    """Numbers of the run's result, any of which may be a cost measure of its own (images averaged,
+    ...)."""
     preempted_by: str | None = None
     """The transition that cancelled it ("" for an abort); None: it ended by itself."""
     waited: float | None = None
-    """Seconds that its token was in its place beyond `seconds`: choosing, waiting for the device, messages under way."""
+    """Seconds that its token was in its place beyond `seconds`: choosing, waiting for the device,
+    messages under way."""
 
     @property
     def exit(self) -> str:
-        """`success`, `failure`, `error`; with `:transition` behind it, or `none:transition`, for a preempted run."""
+        """`success`, `failure`, `error`; with `:transition` behind it, or `none:transition`, for a
+        preempted run."""
         counted = CENSORED if self.status is None else self.status.value
         return counted if self.preempted_by is None else f"{counted}:{self.preempted_by}"
 
@@ -84,7 +90,7 @@ class Tally:
     """How often it was added to or corrected: the later of two versions has more."""
     sample: Sample = field(default_factory=Sample)
 
-    # --- reading ---------------------------------------------------------------------------------------------------
+    # --- reading ------------------------------------------------------------------------------
 
     @property
     def runs(self) -> int:
@@ -132,8 +138,8 @@ class Tally:
     def cost(self, measure: str = "wall") -> Moments:
         """The cost by a measure, over the counted runs: `wall`, `cpu` (s), `count` or `value:NAME`.
 
-        `count` is how many things a run used, as it reports in its value `count` (images averaged, tries); one that reports
-        none counts as 1.
+        `count` is how many things a run used, as it reports in its value `count` (images averaged,
+        tries); one that reports none counts as 1.
         """
         if measure == "wall":
             return self.wall
@@ -145,33 +151,43 @@ class Tally:
             return said.merged(Moments(silent, 1.0, 0.0, 1.0, 1.0)) if silent else said
         kind, _, name = measure.partition(":")
         if kind != "value" or not name:
-            raise ValueError(f"{measure!r} is no cost measure: write wall, cpu, count or value:NAME")
+            raise ValueError(
+                f"{measure!r} is no cost measure: write wall, cpu, count or value:NAME"
+            )
         return self.values.get(name, EMPTY)
 
     def quantile(self, q: float, measure: str = "wall") -> float:
-        """The q-quantile of durations or CPU times (s) over the kept sample of counted runs; nan where there is none."""
+        """The q-quantile of durations or CPU times (s) over the kept sample of counted runs; nan
+        where there is none."""
         if measure == "cpu":
             return quantile(self.sample.cpu_seconds(), q)
         if measure != "wall":
             raise ValueError(f"quantiles are kept of wall and cpu, not of {measure!r}")
         return quantile(self.sample.seconds(e for e in self.durations if is_counted(e)), q)
 
-    # --- changing --------------------------------------------------------------------------------------------------
+    # --- changing -----------------------------------------------------------------------------
 
     def adding(self, seen: Observation, salt: str = "") -> Tally:
-        """With one more run. `salt` names whoever counts, so that samples of several counters do not coincide.
+        """With one more run. `salt` names whoever counts, so that samples of several counters do
+        not coincide.
 
         A run that was cancelled before it began says nothing and changes nothing.
         """
         if seen.executed is Executed.NO:
             if seen.status is None or seen.preempted_by is not None:
                 return self
-            return replace(self, not_executed=_more(self.not_executed, seen.cause), changes=self.changes + 1)
+            return replace(
+                self, not_executed=_more(self.not_executed, seen.cause), changes=self.changes + 1
+            )
         exit_ = seen.exit
-        durations = _put(self.durations, exit_, self.durations.get(exit_, EMPTY).adding(seen.seconds))
+        durations = _put(
+            self.durations, exit_, self.durations.get(exit_, EMPTY).adding(seen.seconds)
+        )
         sample = self.sample.adding(f"{salt}/{self.changes}", seen.seconds, seen.cpu_seconds, exit_)
         waited = self.waited if seen.waited is None else self.waited.adding(seen.waited)
-        grown = replace(self, durations=durations, waited=waited, sample=sample, changes=self.changes + 1)
+        grown = replace(
+            self, durations=durations, waited=waited, sample=sample, changes=self.changes + 1
+        )
         return grown if seen.status is None else grown._counted(seen, seen.status)
 
     def _counted(self, seen: Observation, status: Status) -> Tally:
@@ -187,7 +203,8 @@ class Tally:
         )
 
     def correcting(self, was: Observation, status: Status, cause: str = "") -> Tally:
-        """With the deferred verdict on a run that was added before: its status is replaced. Raises KeyError if none is there."""
+        """With the deferred verdict on a run that was added before: its status is replaced. Raises
+        KeyError if none is there."""
         if was.status is None:
             raise KeyError("a censored run has no status to correct")
         before, after = was.exit, replace(was, status=status).exit
@@ -203,7 +220,7 @@ class Tally:
             changes=self.changes + 1,
         )
 
-    # --- plain data ------------------------------------------------------------------------------------------------
+    # --- plain data ---------------------------------------------------------------------------
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data for JSON and msgpack."""
@@ -224,18 +241,28 @@ class Tally:
     def of_plain(cls, data: Mapping[str, Any]) -> Tally:
         """What `to_plain` gave. Raises ValueError, KeyError or TypeError for anything else.
 
-        Numbers that no sequence of runs could have left (negative ones, more times than runs, ...) are refused: merged, they
-        would spoil every figure.
+        Numbers that no sequence of runs could have left (negative ones, more times than runs, ...)
+        are refused: merged, they would spoil every figure.
         """
-        counts = {(str(Status(status)), str(cause)): whole(n, "runs") for status, cause, n in data["counts"]}
+        counts = {
+            (str(Status(status)), str(cause)): whole(n, "runs")
+            for status, cause, n in data["counts"]
+        }
         read = cls(
             counts,
             {str(exit_): Moments.of_plain(m) for exit_, m in data["durations"].items()},
             Moments.of_plain(data["cpu"]),
             {str(name): Moments.of_plain(m) for name, m in data["values"].items()},
             Moments.of_plain(data["waited"]),
-            {str(cause): whole(n, "runs that never began") for cause, n in data["not_executed"].items()},
-            whole(data["unknown"], "runs of which it is not known whether they were executed", sum(counts.values())),
+            {
+                str(cause): whole(n, "runs that never began")
+                for cause, n in data["not_executed"].items()
+            },
+            whole(
+                data["unknown"],
+                "runs of which it is not known whether they were executed",
+                sum(counts.values()),
+            ),
             whole(data["corrected"], "corrections"),
             whole(data["changes"], "changes"),
             Sample.of_plain(data["sample"]),
@@ -246,10 +273,13 @@ class Tally:
     def _check(self) -> None:
         """Raise ValueError where the parts do not belong together."""
         for status in Status:
-            timed = sum(m.n for exit_, m in self.durations.items() if exit_.partition(":")[0] == status)
+            timed = sum(
+                m.n for exit_, m in self.durations.items() if exit_.partition(":")[0] == status
+            )
             if timed != self.count(status):
                 raise ValueError(
-                    f"{self.count(status)} runs ended with {status}, but {timed} such runs have a duration"
+                    f"{self.count(status)} runs ended with {status}, but {timed} such runs "
+                    "have a duration"
                 )
         executed = self.runs + self.censored
         if sum(m.n for m in self.durations.values()) != executed:
@@ -296,7 +326,8 @@ def _without(counts: Mapping[Any, int], key: Any) -> dict[Any, int]:
 
 
 def _put(entries: Mapping[Any, Any], key: Any, value: Any) -> dict[Any, Any]:
-    """Entries with one of them replaced or put where sorting wants it; moments without numbers are left out."""
+    """Entries with one of them replaced or put where sorting wants it; moments without numbers are
+    left out."""
     out = {**entries, key: value}
     if isinstance(value, Moments) and not value.n:
         del out[key]

@@ -1,6 +1,8 @@
-"""Two states of one selector, learned apart (on two machines, or in a file and its copy), as one: context by context.
+"""Two states of one selector, learned apart (on two machines, or in a file and its copy), as one:
+context by context.
 
-Probabilities cannot be added, so of each context the learner that has learned from more trials is kept whole.
+Probabilities cannot be added, so of each context the learner that has learned from more trials is
+kept whole.
 """
 
 from __future__ import annotations
@@ -13,15 +15,17 @@ State = Mapping[str, Any]
 
 
 def trials(state: State) -> float:
-    """Trials that a state has learned from, in all contexts. Raises KeyError, TypeError or ValueError if it is no state."""
+    """Trials that a state has learned from, in all contexts. Raises KeyError, TypeError or
+    ValueError if it is no state."""
     return sum(float(learner["k"]) for learner in state["learners"].values())
 
 
 def joined(mine: State, other: State) -> dict[str, Any]:
     """Of each context the learner with more trials; `frozen` as in `mine`.
 
-    States over other actions do not mix: the one with more trials is kept whole. Contexts come out sorted, ties are settled by
-    the learners' text, so that files which met agree whoever took in whom.
+    States over other actions do not mix: the one with more trials is kept whole. Contexts come out
+    sorted, ties are settled by the learners' text, so that files which met agree whoever took in
+    whom.
     """
     if list(mine["actions"]) != list(other["actions"]):
         return {**(other if _rank(other) > _rank(mine) else mine), "frozen": mine["frozen"]}

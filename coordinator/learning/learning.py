@@ -1,7 +1,9 @@
-"""All that a task has learned: tallies by action and context, how transitions wait, and a selector for each primitive task.
+"""All that a task has learned: tallies by action and context, how transitions wait, and a selector
+for each primitive task.
 
-It changes by records alone (`Choice`, `End`, `Correction`, `Passage`), all of them plain data: whoever keeps the records, in a
-journal or in the table of a campaign, derives the same state again by `apply` in the same order.
+It changes by records alone (`Choice`, `End`, `Correction`, `Passage`), all of them plain data:
+whoever keeps the records, in a journal or in the table of a campaign, derives the same state again
+by `apply` in the same order.
 """
 
 from __future__ import annotations
@@ -13,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.learning.estimate import Key, Tally, merge
-from coordinator.learning.objective import Comparison, Question, compare
-from coordinator.learning.passage import Flow, PassageKey
-from coordinator.learning.passage import merge as merge_flows
-from coordinator.learning.records import Choice, Correction, End, Passage, Record
-from coordinator.learning.selectors import DEFAULT, RuleSelector, make
-from coordinator.task import Task
+from petrobot.coordinator.learning.estimate import Key, Tally, merge
+from petrobot.coordinator.learning.objective import Comparison, Question, compare
+from petrobot.coordinator.learning.passage import Flow, PassageKey
+from petrobot.coordinator.learning.passage import merge as merge_flows
+from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.learning.selectors import DEFAULT, RuleSelector, make
+from petrobot.coordinator.task import Task
 
 NOTHING = Tally()
 
@@ -38,9 +40,14 @@ class Estimates:
 
     def merged(self, other: Estimates) -> Estimates:
         """Of both sets of runs."""
-        tallies = {k: merge(self.tally(k), other.tally(k)) for k in sorted({*self.tallies, *other.tallies})}
+        tallies = {
+            k: merge(self.tally(k), other.tally(k)) for k in sorted({*self.tallies, *other.tallies})
+        }
         keys = sorted({*self.flows, *other.flows})
-        return Estimates(tallies, {k: merge_flows(self.flows.get(k, Flow()), other.flows.get(k, Flow())) for k in keys})
+        return Estimates(
+            tallies,
+            {k: merge_flows(self.flows.get(k, Flow()), other.flows.get(k, Flow())) for k in keys},
+        )
 
     def tally(self, key: Key) -> Tally:
         """What is known of an action in a context; an empty tally if nothing is."""
@@ -56,7 +63,9 @@ class Estimates:
 
     def contexts(self, primitive_task: str) -> tuple[str, ...]:
         """Contexts in which actions of a primitive task were seen."""
-        return tuple(sorted({k.context for k in self.tallies if k.primitive_task == primitive_task}))
+        return tuple(
+            sorted({k.context for k in self.tallies if k.primitive_task == primitive_task})
+        )
 
     def apply(self, record: Record, task: str, salt: str) -> None:
         """Count a record."""
@@ -72,7 +81,8 @@ class Estimates:
 
 
 class Learning:
-    """The learning of one task. `known` are the estimates that it starts with; `gained` those of this session alone."""
+    """The learning of one task. `known` are the estimates that it starts with; `gained` those of
+    this session alone."""
 
     def __init__(
         self,
@@ -93,14 +103,21 @@ class Learning:
                 self.selectors[p.name] = make(selector, p.alternatives, self.question(p.name))
 
     def question(self, primitive_task: str) -> Question:
-        """Measure, target and rho for a primitive task: as given, the cost measure as the task file declares it."""
+        """Measure, target and rho for a primitive task: as given, the cost measure as the task file
+        declares it."""
         given = self.given or Question()
-        return Question(self.task.primitive_tasks[primitive_task].cost, given.target, given.rho, given.level)
+        return Question(
+            self.task.primitive_tasks[primitive_task].cost, given.target, given.rho, given.level
+        )
 
-    # --- choosing and learning -------------------------------------------------------------------------------------
+    # --- choosing and learning ----------------------------------------------------------------
 
     def choose(
-        self, primitive_task: str, context: str, alternatives: Sequence[str], rng: np.random.Generator
+        self,
+        primitive_task: str,
+        context: str,
+        alternatives: Sequence[str],
+        rng: np.random.Generator,
     ) -> tuple[str, str]:
         """One of the alternatives, and why. Changes nothing."""
         return self.selectors[primitive_task].choose(context, alternatives, rng)
@@ -122,9 +139,11 @@ class Learning:
         elif isinstance(record, End):
             selector.update(record.context, record.action, record.outcome)
         elif record.was.status is not None:
-            selector.correct(record.context, record.action, record.was.status, record.status, record.age)
+            selector.correct(
+                record.context, record.action, record.was.status, record.status, record.age
+            )
 
-    # --- reading ---------------------------------------------------------------------------------------------------
+    # --- reading ------------------------------------------------------------------------------
 
     @property
     def estimates(self) -> Estimates:
@@ -132,16 +151,24 @@ class Learning:
         return self.known.merged(self.gained)
 
     def comparison(self, primitive_task: str, context: str | None = None) -> Comparison:
-        """The alternatives of a primitive task judged: in one context, or over all of them as scenarios (None).
+        """The alternatives of a primitive task judged: in one context, or over all of them as
+        scenarios (None).
 
-        Over scenarios the target reliability is the one that was given, else the one that the task file declares.
+        Over scenarios the target reliability is the one that was given, else the one that the task
+        file declares.
         """
-        tallies, primitive = self.estimates.of(primitive_task, context), self.task.primitive_tasks[primitive_task]
-        question = self.question(primitive_task) if context is not None else self.asked()[primitive_task]
+        tallies, primitive = (
+            self.estimates.of(primitive_task, context),
+            self.task.primitive_tasks[primitive_task],
+        )
+        question = (
+            self.question(primitive_task) if context is not None else self.asked()[primitive_task]
+        )
         return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
 
     def asked(self) -> dict[str, Question]:
-        """By what the actions of each primitive task are judged over scenarios: the target given, else the declared one."""
+        """By what the actions of each primitive task are judged over scenarios: the target given,
+        else the declared one."""
         found = {}
         for name, primitive in self.task.primitive_tasks.items():
             question = self.question(name)
@@ -150,7 +177,8 @@ class Learning:
         return found
 
     def uncosted(self) -> list[tuple[str, str, str]]:
-        """(primitive task, action, measure) of what was run in this session without ever having a cost by that measure."""
+        """(primitive task, action, measure) of what was run in this session without ever having a
+        cost by that measure."""
         found = []
         for name in self.task.primitive_tasks:
             measure = self.question(name).measure
@@ -160,10 +188,11 @@ class Learning:
                     found.append((name, action, measure))
         return found
 
-    # --- state -----------------------------------------------------------------------------------------------------
+    # --- state --------------------------------------------------------------------------------
 
     def prime(self) -> None:
-        """Have the selectors take their sums from the known estimates: other machines' runs may have come in."""
+        """Have the selectors take their sums from the known estimates: other machines' runs may
+        have come in."""
         for name, selector in self.selectors.items():
             for context in self.known.contexts(name):
                 by_action = self.known.of(name, context)
@@ -174,7 +203,8 @@ class Learning:
         return {name: selector.state() for name, selector in self.selectors.items()}
 
     def restore(self, states: Mapping[str, Mapping[str, Any]]) -> None:
-        """Go on from states of the same kind of selector. Raises ValueError naming the primitive task that does not fit."""
+        """Go on from states of the same kind of selector. Raises ValueError naming the primitive
+        task that does not fit."""
         for name, state in states.items():
             if name not in self.selectors:
                 continue
@@ -184,6 +214,7 @@ class Learning:
                 raise ValueError(f"{name}: {fault}") from fault
 
     def freeze(self, frozen: bool = True, primitive_tasks: Iterable[str] | None = None) -> None:
-        """Stop (or go on) learning: a frozen selector chooses what it has learned to be best. Estimates count on."""
+        """Stop (or go on) learning: a frozen selector chooses what it has learned to be best.
+        Estimates count on."""
         for name in self.selectors if primitive_tasks is None else primitive_tasks:
             self.selectors[name].frozen = frozen

@@ -1,7 +1,8 @@
 """Count, mean and spread of a stream of numbers, mergeable and correctable.
 
-Updating and merging follow T. F. Chan, G. H. Golub and R. J. LeVeque, "Algorithms for computing the sample variance",
-The American Statistician 37 (1983): no catastrophic cancellation, whatever the order of merges.
+Updating and merging follow T. F. Chan, G. H. Golub and R. J. LeVeque, "Algorithms for computing the
+sample variance", The American Statistician 37 (1983): no catastrophic cancellation, whatever the
+order of merges.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ class Moments:
             return Moments()
         n = self.n - 1
         mean = self.mean - (x - self.mean) / n
-        return Moments(n, mean, max(0.0, self.m2 - (x - self.mean) * (x - mean)), self.low, self.high)
+        return Moments(
+            n, mean, max(0.0, self.m2 - (x - self.mean) * (x - mean)), self.low, self.high
+        )
 
     def merged(self, other: Moments) -> Moments:
         """Of both streams together."""
@@ -79,7 +82,9 @@ class Moments:
         n, (mean, m2, low, high) = whole(data[0], "numbers"), (float(x) for x in data[1:])
         slack = 1e-6 * max(abs(low), abs(high))  # means are rounded
         if n < 1 or not m2 >= 0 or not low - slack <= mean <= high + slack:
-            raise ValueError(f"{data} are no moments: n >= 1, m2 >= 0 and low <= mean <= high are needed")
+            raise ValueError(
+                f"{data} are no moments: n >= 1, m2 >= 0 and low <= mean <= high are needed"
+            )
         return cls(n, mean, m2, low, high)
 
 
@@ -89,7 +94,9 @@ EMPTY = Moments()
 def whole(n: Any, what: str, most: float = inf) -> int:
     """A count from plain data. Raises ValueError unless it is a whole number from 0 to `most`."""
     if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n <= most:
-        raise ValueError(f"{n!r} {what}: a whole number from 0{'' if most == inf else f' to {most:g}'} is needed")
+        raise ValueError(
+            f"{n!r} {what}: a whole number from 0{'' if most == inf else f' to {most:g}'} is needed"
+        )
     return n
 
 

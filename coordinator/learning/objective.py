@@ -1,11 +1,13 @@
-"""The cost function J = 1 - A R + rho C of primitive actions, and the questions that can be asked of it (paper, section 3).
+"""The cost function J = 1 - A R + rho C of primitive actions, and the questions that can be asked
+of it (paper, section 3).
 
-Over several scenarios an action is judged by its worst case. R is its reliability in the scenario that is hardest for it, never
-the share over all its runs: actions that were run in unequal shares of easy and hard scenarios would be put in the wrong order
-(E. H. Simpson, J. Royal Statistical Society B 13 (1951) 238). C is its mean cost in the hardest scenario whose reliability is
-not below the target R_d; which those are is decided by the lower confidence bound, with hysteresis. rho = 1 / max C over the
-actions of the one primitive task, or declared. All J of a comparison are computed from sums with one rho; J made under
-different rho are never averaged.
+Over several scenarios an action is judged by its worst case. R is its reliability in the scenario
+that is hardest for it, never the share over all its runs: actions that were run in unequal shares
+of easy and hard scenarios would be put in the wrong order (E. H. Simpson, J. Royal Statistical
+Society B 13 (1951) 238). C is its mean cost in the hardest scenario whose reliability is not below
+the target R_d; which those are is decided by the lower confidence bound, with hysteresis. rho = 1 /
+max C over the actions of the one primitive task, or declared. All J of a comparison are computed
+from sums with one rho; J made under different rho are never averaged.
 """
 
 from __future__ import annotations
@@ -15,12 +17,13 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from math import inf, isnan, nan
 
-from coordinator.learning.estimate import Tally, merge
+from petrobot.coordinator.learning.estimate import Tally, merge
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked: the cost measure, the target reliability R_d, rho (None: 1 / max C) and the confidence level."""
+    """What is asked: the cost measure, the target reliability R_d, rho (None: 1 / max C) and the
+    confidence level."""
 
     measure: str = "wall"
     target: float | None = None
@@ -53,7 +56,8 @@ class Figures:
     largest_cost: float
     """The largest mean cost over those scenarios, beside the one in the hardest."""
     j: float
-    """J with the comparison's common rho; inf for an inadmissible action, nan where nothing is known."""
+    """J with the comparison's common rho; inf for an inadmissible action, nan where nothing is
+    known."""
 
     @property
     def effective(self) -> float:
@@ -73,8 +77,8 @@ class Comparison:
     rho: float
     figures: tuple[Figures, ...]
     scenarios: tuple[str, ...]
-    """Scenarios in which every action that was run was run, over which all are judged; empty: there is none, so each was
-    judged over its own, and the order means little."""
+    """Scenarios in which every action that was run was run, over which all are judged; empty: there
+    is none, so each was judged over its own, and the order means little."""
     unmet: bool
     """No action meets the target in any scenario, so J was made without it."""
 
@@ -85,7 +89,8 @@ class Comparison:
 
     @property
     def best(self) -> str | None:
-        """The action with the lowest J, of the admissible ones if there is any; None while nothing is known of any."""
+        """The action with the lowest J, of the admissible ones if there is any; None while nothing
+        is known of any."""
         known = [f for f in self.figures if not isnan(f.j) and f.j < inf]
         return min(known, key=lambda f: f.j).action if known else None
 
@@ -98,7 +103,8 @@ class Comparison:
 
 
 def cost_weight(costs: Iterable[float]) -> float:
-    """The paper's typical rho: 1 / max C over the actions of which a cost is known; 0 if there is none above 0."""
+    """The paper's typical rho: 1 / max C over the actions of which a cost is known; 0 if there is
+    none above 0."""
     largest = max((c for c in costs if not isnan(c) and c < inf), default=0.0)
     return 1.0 / largest if largest > 0 else 0.0
 
@@ -108,16 +114,21 @@ def objective(reliability: float, cost: float, rho: float, availability: float =
     return 1.0 - availability * reliability + rho * cost
 
 
-# --- scenarios ---------------------------------------------------------------------------------------------------------
+# --- scenarios --------------------------------------------------------------------------------
 
 
 def admitted(
-    by_scenario: Mapping[str, Tally], target: float | None, before: Iterable[str] = (), level: float = 0.95
+    by_scenario: Mapping[str, Tally],
+    target: float | None,
+    before: Iterable[str] = (),
+    level: float = 0.95,
 ) -> tuple[str, ...]:
-    """Scenarios in which an action meets the target reliability, given those in which it did `before`.
+    """Scenarios in which an action meets the target reliability, given those in which it did
+    `before`.
 
-    One comes in when the lower confidence bound of R reaches the target, and goes out when R itself falls below it: between
-    the two it stays what it was, so the set does not flicker. Without a target all scenarios with runs are in.
+    One comes in when the lower confidence bound of R reaches the target, and goes out when R itself
+    falls below it: between the two it stays what it was, so the set does not flicker. Without a
+    target all scenarios with runs are in.
     """
     inside = set(before)
     out = []
@@ -142,13 +153,18 @@ def compare(
 ) -> Comparison:
     """Judge the alternatives of a primitive task. `actions` are each action's tallies by scenario.
 
-    `before` is the set of admitted scenarios by action of the last comparison (hysteresis). All actions are judged over the
-    scenarios in which all of them were run, R in the worst of these, C in the hardest admitted one. While no action meets the
-    target in any scenario, none is ruled out.
+    `before` is the set of admitted scenarios by action of the last comparison (hysteresis). All
+    actions are judged over the scenarios in which all of them were run, R in the worst of these, C
+    in the hardest admitted one. While no action meets the target in any scenario, none is ruled
+    out.
     """
     was, common = before or {}, shared(actions)
-    over = {a: {s: t for s, t in by.items() if not common or s in common} for a, by in actions.items()}
-    inside = {a: admitted(by, question.target, was.get(a, ()), question.level) for a, by in over.items()}
+    over = {
+        a: {s: t for s, t in by.items() if not common or s in common} for a, by in actions.items()
+    }
+    inside = {
+        a: admitted(by, question.target, was.get(a, ()), question.level) for a, by in over.items()
+    }
     unmet = not any(inside.values())
     rows = []
     for action, by_scenario in over.items():
@@ -210,11 +226,12 @@ def _judged(figures: Figures, rho: float) -> Figures:
     return replace(figures, j=j)
 
 
-# --- questions ---------------------------------------------------------------------------------------------------------
+# --- questions --------------------------------------------------------------------------------
 
 
 def break_even(one: Figures, other: Figures) -> float | None:
-    """The rho above 0 at which two actions have the same J: below it the more reliable one is better; None if there is none.
+    """The rho above 0 at which two actions have the same J: below it the more reliable one is
+    better; None if there is none.
 
     `one` beats `other` iff A R_one - A R_other > rho (C_one - C_other).
     """
@@ -228,7 +245,8 @@ def break_even(one: Figures, other: Figures) -> float | None:
 def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
     """The actions that no other one beats in both reliability and cost, cheapest first."""
     known = sorted(
-        (f for f in figures if not isnan(f.effective) and f.cost < inf), key=lambda f: (f.cost, -f.effective, f.action)
+        (f for f in figures if not isnan(f.effective) and f.cost < inf),
+        key=lambda f: (f.cost, -f.effective, f.action),
     )
     front: list[Figures] = []
     for f in known:
@@ -237,9 +255,16 @@ def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
     return tuple(front)
 
 
-def cost_to_reach(figures: Iterable[Figures], target: float, *, surely: bool = False) -> Figures | None:
-    """The cheapest action whose reliability (`surely`: its lower confidence bound) reaches the target; None: none does."""
-    enough = [f for f in figures if f.availability * (f.lower if surely else f.reliability) >= target and f.cost < inf]
+def cost_to_reach(
+    figures: Iterable[Figures], target: float, *, surely: bool = False
+) -> Figures | None:
+    """The cheapest action whose reliability (`surely`: its lower confidence bound) reaches the
+    target; None: none does."""
+    enough = [
+        f
+        for f in figures
+        if f.availability * (f.lower if surely else f.reliability) >= target and f.cost < inf
+    ]
     return min(enough, key=lambda f: (f.cost, -f.effective, f.action), default=None)
 
 

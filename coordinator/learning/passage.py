@@ -1,4 +1,5 @@
-"""How often transitions fire and how long those that wait for events wait: rates belong to the place that waits."""
+"""How often transitions fire and how long those that wait for events wait: rates belong to the
+place that waits."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from coordinator.learning.moments import EMPTY, Moments, whole
+from petrobot.coordinator.learning.moments import EMPTY, Moments, whole
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -1,4 +1,5 @@
-"""What learning learns from: records of choices, ends of runs, corrected verdicts and passages, as plain data and back."""
+"""What learning learns from: records of choices, ends of runs, corrected verdicts and passages, as
+plain data and back."""
 
 from __future__ import annotations
 
@@ -6,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from coordinator.learning.estimate import Observation
-from coordinator.task import Executed, Status
+from petrobot.coordinator.learning.estimate import Observation
+from petrobot.coordinator.task import Executed, Status
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,8 @@ class Correction:
     status: Status
     cause: str = ""
     age: int = 0
-    """Trials of the primitive task in this context since that run ended: of what fades, so much less is corrected."""
+    """Trials of the primitive task in this context since that run ended: of what fades, so much
+    less is corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,8 @@ class Passage:
     transition: str
     context: str
     waited: float | None = None
-    """Seconds from the marking that enabled it to its firing, for transitions that only wait for events."""
+    """Seconds from the marking that enabled it to its firing, for transitions that only wait for
+    events."""
 
 
 Record = Choice | End | Correction | Passage
@@ -59,8 +62,17 @@ Record = Choice | End | Correction | Passage
 def to_plain(record: Record) -> dict[str, Any]:
     """Plain data for journals and tables."""
     if isinstance(record, Passage):
-        return {"kind": "Passage", "transition": record.transition, "context": record.context, "waited": record.waited}
-    about = {"primitive_task": record.primitive_task, "action": record.action, "context": record.context}
+        return {
+            "kind": "Passage",
+            "transition": record.transition,
+            "context": record.context,
+            "waited": record.waited,
+        }
+    about = {
+        "primitive_task": record.primitive_task,
+        "action": record.action,
+        "context": record.context,
+    }
     if isinstance(record, End):
         return {"kind": "End", **about, "outcome": _observation(record.outcome)}
     if isinstance(record, Correction):

@@ -6,11 +6,12 @@ from typing import Protocol
 
 import numpy as np
 
-from coordinator.learning.batch import Array, Batch, Index, Mask, Trial
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Trial
 
 
 class Rule(Protocol):
-    """A rule has parameters and no state: all state is in the batch, and all chance in the uniform numbers passed in."""
+    """A rule has parameters and no state: all state is in the batch, and all chance in the uniform
+    numbers passed in."""
 
     @property
     def name(self) -> str:
@@ -23,17 +24,20 @@ class Rule(Protocol):
         """With which each action is chosen next, shape (rows, n)."""
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """The next action of each row. `u` are uniform numbers in [0, 1) of shape (rows, n); nothing changes."""
+        """The next action of each row. `u` are uniform numbers in [0, 1) of shape (rows, n);
+        nothing changes."""
 
     def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
-        """Learn from a trial of each row. Only eligible actions (None: all) may be taken for the best."""
+        """Learn from a trial of each row. Only eligible actions (None: all) may be taken for the
+        best."""
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
         """Why the first row would choose this action: a few words and numbers."""
 
 
 def forced(batch: Batch, offered: Mask, least: float) -> tuple[Mask, Index]:
-    """Rows in which some offered action has been chosen fewer than `least` times, and the least chosen one of each row."""
+    """Rows in which some offered action has been chosen fewer than `least` times, and the least
+    chosen one of each row."""
     tries = np.where(offered, batch.tries, np.inf)
     return tries.min(axis=1) < least, np.argmin(tries, axis=1)
 

@@ -1,7 +1,9 @@
-"""A bounded uniform sample of runs that merges: the entries with the smallest priorities are kept (bottom-k sampling).
+"""A bounded uniform sample of runs that merges: the entries with the smallest priorities are kept
+(bottom-k sampling).
 
-Priorities are hashes of a name that is given to each run once, so the sample of a merge is the merge of the samples, in any
-order and however often. Source: E. Cohen and H. Kaplan, "Summarizing data using bottom-k sketches", PODC 2007.
+Priorities are hashes of a name that is given to each run once, so the sample of a merge is the
+merge of the samples, in any order and however often. Source: E. Cohen and H. Kaplan, "Summarizing
+data using bottom-k sketches", PODC 2007.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ from hashlib import blake2b
 from typing import Any, NamedTuple
 
 SIZE = 512
-"""Runs kept of each action and context: a 90 % quantile is then known to about +-1.3 points of probability."""
+"""Runs kept of each action and context: a 90 % quantile is then known to about +-1.3 points of
+probability."""
 
 
 class Kept(NamedTuple):
@@ -77,7 +80,8 @@ class Sample:
 
 
 def _priority(name: str) -> int:
-    """63 bits that look random and depend on the name alone (SQLite and JSON readers hold them exactly)."""
+    """63 bits that look random and depend on the name alone (SQLite and JSON readers hold them
+    exactly)."""
     return int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "big") >> 1
 
 

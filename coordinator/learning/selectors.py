@@ -1,7 +1,8 @@
-"""Selectors of one primitive task: a rule, its learners by context, the target reliability, and what people may do to them.
+"""Selectors of one primitive task: a rule, its learners by context, the target reliability, and
+what people may do to them.
 
-A selector chooses one of the alternatives and says why with its numbers. It learns from `update` alone, so whoever keeps the
-choices and the ends of runs can derive its state again.
+A selector chooses one of the alternatives and says why with its numbers. It learns from `update`
+alone, so whoever keeps the choices and the ends of runs can derive its state again.
 """
 
 from __future__ import annotations
@@ -11,20 +12,22 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
-from coordinator.learning.bandits import UCB1, Thompson
-from coordinator.learning.batch import SUMS, Batch, Mask, Trial
-from coordinator.learning.estimate import COUNT, Observation, Tally
-from coordinator.learning.objective import Question
-from coordinator.learning.rule import Rule
-from coordinator.learning.target import eligible
-from coordinator.learning.tracking import Tracking
-from coordinator.learning.unlearned import Fixed, RoundRobin
-from coordinator.task import Executed, Status
+from petrobot.coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
+from petrobot.coordinator.learning.bandits import UCB1, Thompson
+from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Trial
+from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.rule import Rule
+from petrobot.coordinator.learning.target import eligible
+from petrobot.coordinator.learning.tracking import Tracking
+from petrobot.coordinator.learning.unlearned import Fixed, RoundRobin
+from petrobot.coordinator.task import Executed, Status
 
 RULES: Mapping[str, Callable[[], Rule]] = {
     "nikolic_fu": NikolicFu,
-    "nikolic_fu_fast": lambda: NikolicFu("nikolic_fu_fast", k0=0.0, exponent=0.5, mixing=20.0, even=0.2, focus=1.5),
+    "nikolic_fu_fast": lambda: NikolicFu(
+        "nikolic_fu_fast", k0=0.0, exponent=0.5, mixing=20.0, even=0.2, focus=1.5
+    ),
     "tracking": Tracking,
     "reward_inaction": RewardInaction,
     "discretised_pursuit": DiscretisedPursuit,
@@ -42,7 +45,9 @@ class Selector(Protocol):
 
     name: str
 
-    def choose(self, context: str, alternatives: Sequence[str], rng: np.random.Generator) -> tuple[str, str]:
+    def choose(
+        self, context: str, alternatives: Sequence[str], rng: np.random.Generator
+    ) -> tuple[str, str]:
         """One of the alternatives, and why. Changes nothing."""
 
     def chosen(self, context: str, action: str) -> None:
@@ -61,10 +66,13 @@ class Selector(Protocol):
 class RuleSelector:
     """Implements `Selector` with a rule: one learner for each context, all over the same actions.
 
-    `question` gives cost measure, target reliability and rho. `frozen`: nothing is learned, and the learned best is chosen.
+    `question` gives cost measure, target reliability and rho. `frozen`: nothing is learned, and the
+    learned best is chosen.
     """
 
-    def __init__(self, rule: Rule, actions: Iterable[str], question: Question | None = None) -> None:
+    def __init__(
+        self, rule: Rule, actions: Iterable[str], question: Question | None = None
+    ) -> None:
         self.rule = rule
         self.name = rule.name
         self.actions = tuple(actions)
@@ -73,7 +81,8 @@ class RuleSelector:
         self.learners: dict[str, Batch] = {}
 
     def learner(self, context: str) -> Batch:
-        """The learner of a context; one that knows nothing if it has learned nothing yet (it is not kept then)."""
+        """The learner of a context; one that knows nothing if it has learned nothing yet (it is not
+        kept then)."""
         return self.learners[context] if context in self.learners else self._fresh(self.actions)
 
     def _kept(self, context: str) -> Batch:
@@ -85,9 +94,11 @@ class RuleSelector:
         batch.own["admitted"] = np.zeros((1, len(actions)))
         return batch
 
-    # --- choosing --------------------------------------------------------------------------------------------------
+    # --- choosing -----------------------------------------------------------------------------
 
-    def choose(self, context: str, alternatives: Sequence[str], rng: np.random.Generator) -> tuple[str, str]:
+    def choose(
+        self, context: str, alternatives: Sequence[str], rng: np.random.Generator
+    ) -> tuple[str, str]:
         """One of the alternatives, and why."""
         batch, offered = self.learner(context), self._offered(alternatives)
         if self.frozen:
@@ -96,7 +107,9 @@ class RuleSelector:
         else:
             action = int(self.rule.choose(batch, offered, rng.random((1, batch.n)))[0])
             why = self.rule.says(batch, offered, action)
-        return self.actions[action], f"{self.name}: {why}; {self._figures(batch, action)}{_of(context)}"
+        return self.actions[
+            action
+        ], f"{self.name}: {why}; {self._figures(batch, action)}{_of(context)}"
 
     def _learned(self, batch: Batch) -> np.ndarray:
         """p; for rules that count only, all on the lowest J."""
@@ -107,7 +120,9 @@ class RuleSelector:
     def _offered(self, alternatives: Sequence[str]) -> Mask:
         offered = np.array([[name in alternatives for name in self.actions]])
         if not offered.any():
-            raise ValueError(f"none of {', '.join(alternatives)} is among {', '.join(self.actions)}")
+            raise ValueError(
+                f"none of {', '.join(alternatives)} is among {', '.join(self.actions)}"
+            )
         return offered
 
     def _figures(self, batch: Batch, action: int) -> str:
@@ -122,24 +137,30 @@ class RuleSelector:
         mine = f"J {j[action]:.3f}, R {r:.3f} of {runs[action]:g} runs, C {c:.3g}"
         return mine if best == action else f"{mine}; lowest J {j[best]:.3f} {self.actions[best]}"
 
-    def probabilities(self, context: str, alternatives: Sequence[str] | None = None) -> dict[str, float]:
+    def probabilities(
+        self, context: str, alternatives: Sequence[str] | None = None
+    ) -> dict[str, float]:
         """With which each alternative (None: all) is chosen next in a context."""
         batch = self.learner(context)
         offered = self._offered(self.actions if alternatives is None else alternatives)
         if self.frozen:
             best = int(np.argmax(np.where(offered, self._learned(batch), -1.0)[0]))
             return {name: float(i == best) for i, name in enumerate(self.actions)}
-        return dict(zip(self.actions, self.rule.probabilities(batch, offered)[0].tolist(), strict=True))
+        return dict(
+            zip(self.actions, self.rule.probabilities(batch, offered)[0].tolist(), strict=True)
+        )
 
     def learned(self, context: str) -> dict[str, float]:
         """The learned probabilities p, without exploration."""
-        return dict(zip(self.actions, self._learned(self.learner(context))[0].tolist(), strict=True))
+        return dict(
+            zip(self.actions, self._learned(self.learner(context))[0].tolist(), strict=True)
+        )
 
     def objective(self, context: str) -> dict[str, float]:
         """J of each action from the learner's own sums; inf where it was never tried."""
         return dict(zip(self.actions, self.learner(context).objective()[0].tolist(), strict=True))
 
-    # --- learning --------------------------------------------------------------------------------------------------
+    # --- learning -----------------------------------------------------------------------------
 
     def chosen(self, context: str, action: str) -> None:
         """Count a choice."""
@@ -160,10 +181,13 @@ class RuleSelector:
         self.rule.learn(batch, trial, self._eligible(batch))
 
     def learns_from(self, action: str, outcome: Observation) -> bool:
-        """Whether a run is a trial: of one of the actions, and neither censored nor cancelled before it began."""
+        """Whether a run is a trial: of one of the actions, and neither censored nor cancelled
+        before it began."""
         if action not in self.actions:
             return False
-        return _is_missing(outcome) or (outcome.status is not None and outcome.executed is not Executed.NO)
+        return _is_missing(outcome) or (
+            outcome.status is not None and outcome.executed is not Executed.NO
+        )
 
     def _eligible(self, batch: Batch) -> Mask | None:
         """Actions that meet the target, judged on what was known before this trial."""
@@ -175,10 +199,11 @@ class RuleSelector:
         return now
 
     def correct(self, context: str, action: str, was: Status, status: Status, age: int = 0) -> None:
-        """A deferred verdict on the run `age` trials ago: the sums change once; what was chosen meanwhile stays chosen.
+        """A deferred verdict on the run `age` trials ago: the sums change once; what was chosen
+        meanwhile stays chosen.
 
-        As much is corrected as the sums still hold of that run (a rule may fade or drop them), and a success more or less
-        never leaves 0 to all runs.
+        As much is corrected as the sums still hold of that run (a rule may fade or drop them), and
+        a success more or less never leaves 0 to all runs.
         """
         if self.frozen or action not in self.actions:
             return
@@ -189,7 +214,8 @@ class RuleSelector:
         batch.successes[0, i] = min(max(0.0, batch.successes[0, i] + change), batch.runs[0, i])
 
     def prime(self, context: str, tallies: Mapping[str, Tally]) -> None:
-        """Take the sums over from estimates (other machines' runs came in); rules that fade their sums keep their own."""
+        """Take the sums over from estimates (other machines' runs came in); rules that fade their
+        sums keep their own."""
         if self.frozen or isinstance(self.rule, Tracking):
             return
         batch = self._kept(context)
@@ -202,7 +228,7 @@ class RuleSelector:
             batch.missing[0, i] = missing
             batch.tries[0, i] = max(batch.tries[0, i], tally.runs + missing)
 
-    # --- by hand ---------------------------------------------------------------------------------------------------
+    # --- by hand ------------------------------------------------------------------------------
 
     def reset(self, context: str | None = None) -> None:
         """Forget what was learned, in one context or in all."""
@@ -216,11 +242,14 @@ class RuleSelector:
             "actions": list(self.actions),
             "frozen": self.frozen,
             "cost": self.question.measure,
-            "learners": {context: batch.to_plain() for context, batch in sorted(self.learners.items())},
+            "learners": {
+                context: batch.to_plain() for context, batch in sorted(self.learners.items())
+            },
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state()`. Actions that are new are unknown yet, those that are gone are left out."""
+        """Go on from a `state()`. Actions that are new are unknown yet, those that are gone are
+        left out."""
         if state["selector"] != self.name:
             raise ValueError(f"a state of {state['selector']}, not of {self.name}")
         self.frozen = bool(state["frozen"])
@@ -232,7 +261,8 @@ class RuleSelector:
                 self._take_moved(context, list(state["actions"]), data)
 
     def _take_moved(self, context: str, actions: list[str], data: Mapping[str, Any]) -> None:
-        """A state over other actions: sums go with their actions; a new action gets an equal share, the rest is scaled."""
+        """A state over other actions: sums go with their actions; a new action gets an equal share,
+        the rest is scaled."""
         batch, old = self._kept(context), self._fresh(actions)
         old.take_plain(data)
         pairs = [(i, actions.index(a)) for i, a in enumerate(self.actions) if a in actions]
@@ -243,7 +273,8 @@ class RuleSelector:
             if kept > 0:
                 batch.p[0, i] = old.p[0, j] / kept * len(pairs) / batch.n
         batch.p /= batch.p.sum()
-        # the gain starts again, so that a newcomer can still win; the sums of the others are not lost
+        # the gain starts again, so that a newcomer can still win; the sums of the others are not
+        # lost
 
 
 def _is_missing(outcome: Observation) -> bool:

@@ -1,8 +1,9 @@
-"""The scheme of Nikolic and Fu for a world that changes: it follows, it no longer converges with probability 1.
+"""The scheme of Nikolic and Fu for a world that changes: it follows, it no longer converges with
+probability 1.
 
-Sums fade by a forgetting factor, the gain and every choice probability have floors, and a two-sided Page-Hinkley test on the
-successes and costs of each action starts the learner afresh when one of them has moved (E. S. Page, Biometrika 41 (1954) 100;
-D. V. Hinkley, Biometrika 58 (1971) 509).
+Sums fade by a forgetting factor, the gain and every choice probability have floors, and a two-sided
+Page-Hinkley test on the successes and costs of each action starts the learner afresh when one of
+them has moved (E. S. Page, Biometrika 41 (1954) 100; D. V. Hinkley, Biometrika 58 (1971) 509).
 """
 
 from __future__ import annotations
@@ -11,17 +12,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coordinator.learning.batch import SUMS, Array, Batch, Index, Mask, Trial, drawn, restricted
-from coordinator.learning.rule import forced, one_hot
+from petrobot.coordinator.learning.batch import (
+    SUMS,
+    Array,
+    Batch,
+    Index,
+    Mask,
+    Trial,
+    drawn,
+    restricted,
+)
+from petrobot.coordinator.learning.rule import forced, one_hot
 
 TESTS = ("success_up", "success_down", "cost_up", "cost_down")
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """Parameters: `memory` trials (the sums fade by 1 - 1 / memory each trial), floors of gain and probability, and the test.
+    """Parameters: `memory` trials (the sums fade by 1 - 1 / memory each trial), floors of gain and
+    probability, and the test.
 
-    The test ignores moves below `slack` and alarms when what is beyond adds up to `threshold`; it begins after `settle` runs.
+    The test ignores moves below `slack` and alarms when what is beyond adds up to `threshold`; it
+    begins after `settle` runs.
     """
 
     name: str = "tracking"
@@ -64,9 +76,11 @@ class Tracking:
         batch.p += gain[:, None] * (one_hot(batch.best(eligible), batch.n) - batch.p)
 
     def correcting(self, batch: Batch, action: int, change: float, age: int) -> float:
-        """What is left in the sums of the trial `age` trials ago of the change of its success; one row.
+        """What is left in the sums of the trial `age` trials ago of the change of its success; one
+        row.
 
-        Nothing of a trial before the last restart. The test's own mean since the restart does not fade.
+        Nothing of a trial before the last restart. The test's own mean since the restart does not
+        fade.
         """
         since = batch.k[0] - (batch.own["restarts"][0, 0] > 0)  # a restart leaves k at 1
         if age >= since:
@@ -86,7 +100,10 @@ class Tracking:
         own["seen_success"][at] += executed * trial.success
         own["seen_cost"][at] += executed * cost
         seen = np.maximum(own["seen"][at], 1.0)
-        moves = (trial.success - own["seen_success"][at] / seen, (cost - own["seen_cost"][at] / seen) / scale)
+        moves = (
+            trial.success - own["seen_success"][at] / seen,
+            (cost - own["seen_cost"][at] / seen) / scale,
+        )
         ready = executed & (own["seen"][at] > self.settle)
         alarm = np.zeros(len(batch.k), dtype=bool)
         for name, move in zip(TESTS, (moves[0], -moves[0], moves[1], -moves[1]), strict=True):
@@ -96,7 +113,8 @@ class Tracking:
         return alarm
 
     def _restart(self, batch: Batch, alarm: Mask) -> None:
-        """Forget what was, but for the probabilities: they are the best guess until something better is known."""
+        """Forget what was, but for the probabilities: they are the best guess until something
+        better is known."""
         if not alarm.any():
             return
         for name in SUMS:

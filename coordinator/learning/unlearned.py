@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from coordinator.learning.batch import Array, Batch, Index, Mask, Trial
-from coordinator.learning.rule import forced, one_hot
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Trial
+from petrobot.coordinator.learning.rule import forced, one_hot
 
 
 @dataclass(frozen=True)

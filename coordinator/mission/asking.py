@@ -1,4 +1,5 @@
-"""Asks the nodes of services.toml whether they are up, what they offer and how their devices are."""
+"""Asks the nodes of services.toml whether they are up, what they offer and how their devices
+are."""
 
 from __future__ import annotations
 
@@ -7,20 +8,21 @@ import secrets
 from datetime import UTC, datetime
 from typing import Any
 
-from coordinator.mission.realtime import credentials_of
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.directory import Directory
-from services.comm.messages import Command, Hello
-from services.comm.notice import Answered, Notice, PeerLost
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.coordinator.mission.realtime import credentials_of
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.messages import Command, Hello
+from petrobot.services.comm.notice import Answered, Notice, PeerLost
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 
 
 async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
-    """What each node answers within `timeout` s: address, whether it is up, what it offers, its status; else why not.
+    """What each node answers within `timeout` s: address, whether it is up, what it offers, its
+    status; else why not.
 
-    `status` has the node's `devices`, those that an emergency stop holds in `emergency`, and what is told of its actions
-    without a device in `general`.
+    `status` has the node's `devices`, those that an emergency stop holds in `emergency`, and what
+    is told of its actions without a device in `general`.
 
     With mutual TLS also when the certificate ends that the node shows.
     """
@@ -30,7 +32,11 @@ async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
 
 async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any]:
     entry, name = directory.nodes[node], f"asking-{secrets.token_hex(4)}"
-    caller = Caller(node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name, 0, directory.hash), auto_ack=True)
+    caller = Caller(
+        node,
+        Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name, 0, directory.hash),
+        auto_ack=True,
+    )
     told: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
     refused: list[str] = []
 
@@ -42,9 +48,14 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
                 refused.append(notice.reason)
 
     proves = credentials_of(directory)
-    client = Client(entry.host, entry.port, caller, on_notices=hear, key=proves.key, tls=proves.client())
+    client = Client(
+        entry.host, entry.port, caller, on_notices=hear, key=proves.key, tls=proves.client()
+    )
     client.start()
-    answer: dict[str, Any] = {"address": f"{entry.host}:{entry.port}", "up": await client.connected(timeout)}
+    answer: dict[str, Any] = {
+        "address": f"{entry.host}:{entry.port}",
+        "up": await client.connected(timeout),
+    }
     try:
         if answer["up"]:
             caller.command(client.now(), Command(f"{name}/status", "status"))
@@ -61,14 +72,18 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
         else:
             answer["why"] = refused[-1] if refused else client.trouble
     except TimeoutError:
-        answer |= {"up": False, "why": f"it welcomed us, but did not say how it is within {timeout:g} s"}
+        answer |= {
+            "up": False,
+            "why": f"it welcomed us, but did not say how it is within {timeout:g} s",
+        }
     finally:
         await client.close()
     return answer
 
 
 def _status(status: dict[str, Any], node: str, directory: Directory) -> dict[str, Any]:
-    """A node's status with devices alone under `devices`: it tells of its actions without one under its own name."""
+    """A node's status with devices alone under `devices`: it tells of its actions without one under
+    its own name."""
     answers, devices = dict(status.get("answers", {})), dict(status.get("devices", {}))
     general = {}
     if node not in directory.devices and node in answers:

@@ -1,7 +1,9 @@
-"""Runs in the hands of nodes: the engine's orders become calls, and what nodes say of them becomes stimuli.
+"""Runs in the hands of nodes: the engine's orders become calls, and what nodes say of them becomes
+stimuli.
 
-A machine without clock or sockets; its calls are in its callers. It keeps every device fenced whose last run is not known to be
-over, and after a resume it asks the nodes for the runs that an earlier process gave them (docs/semantics.md, section 12).
+A machine without clock or sockets; its calls are in its callers. It keeps every device fenced whose
+last run is not known to be over, and after a resume it asks the nodes for the runs that an earlier
+process gave them (docs/semantics.md, section 12).
 """
 
 from __future__ import annotations
@@ -10,8 +12,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from coordinator.engine import Instruction, State, Stimulus
-from coordinator.engine.instructions import (
+from petrobot.coordinator.engine import Instruction, State, Stimulus
+from petrobot.coordinator.engine.instructions import (
     ArmTimer,
     CancelRun,
     DisarmTimer,
@@ -21,18 +23,28 @@ from coordinator.engine.instructions import (
     ReleaseTimer,
     StartRun,
 )
-from coordinator.engine.stimuli import Hold, Pause, RunEnded, RunHeld, RunStarted, StopConfirmed, StopFailed, TimerFired
-from coordinator.mission.fences import FOR_GOOD, FORGOTTEN, UNSURE, Fences
-from coordinator.mission.timekeeping import Timers
-from coordinator.task import Executed, Status
-from services.comm import messages
-from services.comm.caller import Caller
-from services.comm.directory import Directory
-from services.comm.messages import Answer, Call, Command, Outcome
-from services.comm.plain import NotPlainError
+from petrobot.coordinator.engine.stimuli import (
+    Hold,
+    Pause,
+    RunEnded,
+    RunHeld,
+    RunStarted,
+    StopConfirmed,
+    StopFailed,
+    TimerFired,
+)
+from petrobot.coordinator.mission.fences import FOR_GOOD, FORGOTTEN, UNSURE, Fences
+from petrobot.coordinator.mission.timekeeping import Timers
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm import messages
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.messages import Answer, Call, Command, Outcome
+from petrobot.services.comm.plain import NotPlainError
 
 ESCALATION: Final = 3.0
-"""Seconds after a run's own time to stop that its node needs at most for the stop routine and the kill of its worker."""
+"""Seconds after a run's own time to stop that its node needs at most for the stop routine and the
+kill of its worker."""
 RESUMED: Final = "resumed"
 NO_BOOT: Final = "unknown"
 """Names no boot of a node: boots are drawn as hexadecimal numbers."""
@@ -43,7 +55,8 @@ _TIMERS: Final = (ArmTimer, DisarmTimer, HoldTimer, ReleaseTimer)
 
 @dataclass
 class Flight:
-    """A run that was handed to a node (or waits for its device's fence); `begun` is when the engine ordered it (s)."""
+    """A run that was handed to a node (or waits for its device's fence); `begun` is when the engine
+    ordered it (s)."""
 
     start: StartRun
     node: str
@@ -53,9 +66,11 @@ class Flight:
     """For the fence of its device."""
     cancelled: bool = False
     boot: str = ""
-    """The boot of its node that an earlier process may have called already; empty: no process has."""
+    """The boot of its node that an earlier process may have called already; empty: no process
+    has."""
     abandon: bool = False
-    """If its node says that it still goes on, it is ended here: its action's `on_resume` is `error`."""
+    """If its node says that it still goes on, it is ended here: its action's `on_resume` is
+    `error`."""
 
     @property
     def if_unsent(self) -> Executed:
@@ -64,9 +79,12 @@ class Flight:
 
 
 class Dispatch:
-    """Hands runs to nodes. `callers` has one caller for each node of the directory; call ids are `mission/run`."""
+    """Hands runs to nodes. `callers` has one caller for each node of the directory; call ids are
+    `mission/run`."""
 
-    def __init__(self, directory: Directory, callers: Mapping[str, Caller], mission: str, seed: int) -> None:
+    def __init__(
+        self, directory: Directory, callers: Mapping[str, Caller], mission: str, seed: int
+    ) -> None:
         self.directory = directory
         self.callers = callers
         self.flights: dict[str, Flight] = {}
@@ -74,7 +92,8 @@ class Dispatch:
         self._seed = seed
         self._fences = Fences()
         self._parting: dict[str, Flight] = {}
-        """Runs that this side is done with, or is stopping, and that their node has not said to be over."""
+        """Runs that this side is done with, or is stopping, and that their node has not said to be
+        over."""
         self._timers = Timers()
         self._commands: dict[str, str] = {}
         self._command_count = 0
@@ -118,7 +137,8 @@ class Dispatch:
         return f"{self._mission}/{run}"
 
     def run_of(self, call: str) -> str | None:
-        """The run that a call of this mission run was made for, None if it was made for none that is under way."""
+        """The run that a call of this mission run was made for, None if it was made for none that
+        is under way."""
         run = call.removeprefix(self._mission + "/")
         return run if run in self.flights else None
 
@@ -127,7 +147,7 @@ class Dispatch:
         """Whether a node still has to say whether it holds."""
         return bool(self._commands)
 
-    # --- orders ------------------------------------------------------------------------------------------------------
+    # --- orders -------------------------------------------------------------------------------
 
     def _start(self, now: float, start: StartRun) -> list[Stimulus]:
         entry = self.directory.actions.get(start.action)
@@ -141,16 +161,26 @@ class Dispatch:
         return self._call(now, flight)
 
     def _call(self, now: float, flight: Flight) -> list[Stimulus]:
-        """Call the flight's action; gives its end where its arguments are what no message carries."""
+        """Call the flight's action; gives its end where its arguments are what no message
+        carries."""
         flight.waits = False
         start, boot = flight.start, flight.boot
         arguments = {**self.directory.actions[start.action].args, **start.arguments}
-        call = Call(self.call_id(start.run), start.action, arguments, start.deadline, boot=boot, seed=self._seed)
+        call = Call(
+            self.call_id(start.run),
+            start.action,
+            arguments,
+            start.deadline,
+            boot=boot,
+            seed=self._seed,
+        )
         try:
             self.callers[flight.node].call(now, replace(call, again=bool(boot)))
         except NotPlainError as fault:
             del self.flights[start.run]
-            return [RunEnded(start.run, Status.ERROR, "bad_arguments", str(fault), flight.if_unsent)]
+            return [
+                RunEnded(start.run, Status.ERROR, "bad_arguments", str(fault), flight.if_unsent)
+            ]
         return []
 
     def _cancel(self, now: float, cancel: CancelRun) -> list[Stimulus]:
@@ -178,10 +208,14 @@ class Dispatch:
         key = f"{self._mission}/{epoch}/{verb}#{self._command_count}"
         if verb == "hold":
             self._commands[key] = run
-        self.callers[flight.node].command(now, Command(key, verb, flight.device, {"run": self.call_id(run)}))
+        self.callers[flight.node].command(
+            now, Command(key, verb, flight.device, {"run": self.call_id(run)})
+        )
         return []
 
-    def _timer(self, now: float, order: ArmTimer | DisarmTimer | HoldTimer | ReleaseTimer) -> list[Stimulus]:
+    def _timer(
+        self, now: float, order: ArmTimer | DisarmTimer | HoldTimer | ReleaseTimer
+    ) -> list[Stimulus]:
         if isinstance(order, ArmTimer):
             self._timers.arm(now, order.key, order.seconds)
         elif isinstance(order, DisarmTimer):
@@ -192,7 +226,7 @@ class Dispatch:
             self._timers.release(now, order.key)
         return []
 
-    # --- what nodes say ----------------------------------------------------------------------------------------------
+    # --- what nodes say -----------------------------------------------------------------------
 
     def accepted(self, now: float, call: str) -> list[Stimulus]:
         """The node took a call, or says that it goes on."""
@@ -217,15 +251,24 @@ class Dispatch:
         if not flight.cancelled:
             return [_run_ended(run, outcome)]
         if outcome.cause == "no_answer":
-            return [StopFailed(run, f"{outcome.text}, neither by its stop routine nor by the end of its worker")]
+            return [
+                StopFailed(
+                    run, f"{outcome.text}, neither by its stop routine nor by the end of its worker"
+                )
+            ]
         return [] if flight.device else [_run_ended(run, outcome)]
 
     def _parted(self, outcome: Outcome) -> bool:
-        """Whether a node says (not this side decides) that a run is over which was given up here."""
-        return outcome.id.removeprefix(self._mission + "/") in self._parting and outcome.cause not in _GIVEN_UP
+        """Whether a node says (not this side decides) that a run is over which was given up
+        here."""
+        return (
+            outcome.id.removeprefix(self._mission + "/") in self._parting
+            and outcome.cause not in _GIVEN_UP
+        )
 
     def late(self, now: float, outcome: Outcome) -> list[Stimulus]:
-        """A node's own word on a run that had ended here: it is recorded, moves nothing, and frees the device."""
+        """A node's own word on a run that had ended here: it is recorded, moves nothing, and frees
+        the device."""
         run = outcome.id.removeprefix(self._mission + "/")
         if run == outcome.id or "#" not in run:
             return []
@@ -241,7 +284,9 @@ class Dispatch:
         flight = self.flights.get(run) if run is not None else None
         if run is None or flight is None:
             return []
-        said = str(answer.data.get("answers", {}).get(flight.device or flight.node, "")).replace(" ", "_")
+        said = str(answer.data.get("answers", {}).get(flight.device or flight.node, "")).replace(
+            " ", "_"
+        )
         known = {Hold.HELD.value: Hold.HELD, Hold.STOPPED.value: Hold.STOPPED}
         held = known.get(said, Hold.CANNOT) if answer.ok else Hold.CANNOT
         if held is Hold.HELD:
@@ -255,7 +300,7 @@ class Dispatch:
         self._boots[node] = boot
         self._kept[node] = runs
 
-    # --- time --------------------------------------------------------------------------------------------------------
+    # --- time ---------------------------------------------------------------------------------
 
     def advance(self, now: float) -> list[Stimulus]:
         """What is over: timers, fences, and the patience of runs that wait for one."""
@@ -265,9 +310,14 @@ class Dispatch:
             if flight is not None and flight.cancelled:
                 stimuli.append(StopConfirmed(fence.run, Executed.UNKNOWN))
             stimuli += self._go_on(now, device)
-        for run, flight in [(r, f) for r, f in self.flights.items() if f.waits and now >= f.begun + f.start.deadline]:
+        for run, flight in [
+            (r, f) for r, f in self.flights.items() if f.waits and now >= f.begun + f.start.deadline
+        ]:
             del self.flights[run]
-            text = f"{flight.device} is not known to stand still after {self._fences[flight.device].run}"
+            text = (
+                f"{flight.device} is not known to stand still after "
+                f"{self._fences[flight.device].run}"
+            )
             stimuli.append(RunEnded(run, Status.ERROR, "device_fenced", text, flight.if_unsent))
         return stimuli
 
@@ -278,19 +328,26 @@ class Dispatch:
 
     @property
     def idle(self) -> bool:
-        """Whether time alone can change nothing: no timer, no fence (and so no run that waits for one)."""
+        """Whether time alone can change nothing: no timer, no fence (and so no run that waits for
+        one)."""
         return not self._timers and not self._fences
 
     def due(self) -> float | None:
         """When `advance` has something to do next."""
         times = [self._timers.due(), self._fences.due()]
-        times += [flight.begun + flight.start.deadline for flight in self.flights.values() if flight.waits]
+        times += [
+            flight.begun + flight.start.deadline for flight in self.flights.values() if flight.waits
+        ]
         return min((t for t in times if t is not None), default=None)
 
-    # --- after a resume ----------------------------------------------------------------------------------------------
+    # --- after a resume -----------------------------------------------------------------------
 
     def relive(
-        self, now: float, stimulus: Stimulus, instructions: Iterable[Instruction], boots: Mapping[str, str]
+        self,
+        now: float,
+        stimulus: Stimulus,
+        instructions: Iterable[Instruction],
+        boots: Mapping[str, str],
     ) -> None:
         """A step that an earlier process took at `now`: its timers and fences still count."""
         self._boots.update(boots)
@@ -307,7 +364,10 @@ class Dispatch:
                 self.carry_out(now, instruction)
             elif isinstance(instruction, StartRun):
                 entry = self.directory.actions.get(instruction.action)
-                self._earlier[instruction.run] = instruction, boots.get(entry.node, "") if entry else ""
+                self._earlier[instruction.run] = (
+                    instruction,
+                    boots.get(entry.node, "") if entry else "",
+                )
 
     def _relive_end(self, now: float, end: RunEnded | StopConfirmed) -> None:
         cause = end.cause if isinstance(end, RunEnded) else ""
@@ -322,11 +382,16 @@ class Dispatch:
         start, _ = self._earlier.get(run, (None, ""))
         entry = self.directory.actions.get(start.action) if start is not None else None
         if start is not None and entry is not None and entry.device:
-            self._parting[run] = Flight(start, entry.node, entry.device, now, cancelled=cause == "no_answer")
-            self._fences.put(entry.device, run, entry.node, self._fences.after(cause, now, entry.orphan_time))
+            self._parting[run] = Flight(
+                start, entry.node, entry.device, now, cancelled=cause == "no_answer"
+            )
+            self._fences.put(
+                entry.device, run, entry.node, self._fences.after(cause, now, entry.orphan_time)
+            )
 
     def adopt(self, now: float, orders: Iterable[Instruction], state: State) -> list[Stimulus]:
-        """Carry out again the orders that an earlier process left open, and settle what the nodes still keep of its runs."""
+        """Carry out again the orders that an earlier process left open, and settle what the nodes
+        still keep of its runs."""
         stimuli = self.advance(now)
         for order in orders:
             if isinstance(order, StartRun):
@@ -342,7 +407,8 @@ class Dispatch:
         return stimuli
 
     def settle(self, now: float, node: str) -> None:
-        """Of the runs that a node keeps for this mission run: stop those that are of no use, let it forget the others."""
+        """Of the runs that a node keeps for this mission run: stop those that are of no use, let it
+        forget the others."""
         caller = self.callers[node]
         for id_ in self._kept.pop(node, ()):
             run = id_.removeprefix(self._mission + "/")
@@ -354,7 +420,8 @@ class Dispatch:
                 caller.disown(now, id_)
 
     def _rejoin(self, now: float, start: StartRun) -> list[Stimulus]:
-        """Ask for a run under its old id: the node goes on with it or gives its stored result; another boot answers unknown."""
+        """Ask for a run under its old id: the node goes on with it or gives its stored result;
+        another boot answers unknown."""
         entry = self.directory.actions.get(start.action)
         if entry is None:
             return self._start(now, start)
@@ -362,21 +429,27 @@ class Dispatch:
         if start.run in self.flights:
             self.flights[start.run].abandon = entry.on_resume == "error"
             if entry.on_resume == "ask":
-                stimuli.append(Pause(f"{start.action} was active when the coordinator ended: continue it?"))
+                stimuli.append(
+                    Pause(f"{start.action} was active when the coordinator ended: continue it?")
+                )
         return stimuli
 
     def _ask_again(self, now: float, start: StartRun, stopping: bool = False) -> list[Stimulus]:
-        """Call a run again that an earlier process may have called. One that its node had accepted and neither executes nor
-        keeps any more was forgotten there: it ends without a call."""
+        """Call a run again that an earlier process may have called. One that its node had accepted
+        and neither executes nor keeps any more was forgotten there: it ends without a call."""
         entry = self.directory.actions[start.action]
         present, id_ = self.callers[entry.node].boot, self.call_id(start.run)
         known = id_ in self._kept.get(entry.node, ())
         boot = present if known else self._earlier.get(start.run, (start, ""))[1]
-        flight = Flight(start, entry.node, entry.device, now, cancelled=stopping, boot=boot or NO_BOOT)
+        flight = Flight(
+            start, entry.node, entry.device, now, cancelled=stopping, boot=boot or NO_BOOT
+        )
         self.flights[start.run] = flight
         if not known and boot == present and start.run in self._accepted:
             text = f"{entry.node} had accepted it and keeps neither the run nor its result any more"
-            return self.ended(now, Outcome(id_, Status.ERROR, {}, FORGOTTEN, text, messages.Executed.UNKNOWN))
+            return self.ended(
+                now, Outcome(id_, Status.ERROR, {}, FORGOTTEN, text, messages.Executed.UNKNOWN)
+            )
         if entry.device in self._fences and not entry.at_once and not known:
             flight.waits = True
             return []
@@ -388,7 +461,10 @@ class Dispatch:
         if flight.device:
             self._parting[run] = flight
             self._fences.put(flight.device, run, flight.node, FOR_GOOD)
-        text = f"the coordinator ended while it went on, and {flight.start.action} is not to be rejoined"
+        text = (
+            f"the coordinator ended while it went on, and {flight.start.action} is not to "
+            "be rejoined"
+        )
         return [RunEnded(run, Status.ERROR, RESUMED, text, Executed.YES)]
 
     def _cancel_again(self, now: float, cancel: CancelRun, state: State) -> list[Stimulus]:

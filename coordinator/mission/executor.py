@@ -1,7 +1,9 @@
-"""The executor: where net and network meet. It feeds the engine, and has its instructions carried out.
+"""The executor: where net and network meet. It feeds the engine, and has its instructions carried
+out.
 
-A machine without clock or sockets: `take` what a caller noticed, `advance` to a time, and the calls it makes are in its
-callers. Every stimulus is handed to the store before its effects leave, and effects leave after the store's `sync`.
+A machine without clock or sockets: `take` what a caller noticed, `advance` to a time, and the calls
+it makes are in its callers. Every stimulus is handed to the store before its effects leave, and
+effects leave after the store's `sync`.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from coordinator.engine import Engine
-from coordinator.engine.instructions import (
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.engine.instructions import (
     CancelRun,
     Choose,
     Finished,
@@ -25,20 +27,43 @@ from coordinator.engine.instructions import (
     StartRun,
     Subject,
 )
-from coordinator.engine.stimuli import Chosen, EventOccurred, RunRaised, Stimulus, VariableChanged, Verdict
-from coordinator.mission.dispatch import Dispatch
-from coordinator.mission.partners import FirstAlternative, Forgetful, Observer, Selector, Store
-from coordinator.record.recording import Step
-from coordinator.task import Scope, Status, Task
-from services.comm.caller import Caller
-from services.comm.directory import Directory
-from services.comm.messages import Answer, Event, Outcome
-from services.comm.notice import Accepted, Answered, Ended, EventArrived, Late, Notice, PeerBack, Progress
-from services.comm.verdicts import VERDICT_EVENTS, VerdictSaid, verdict_event
+from petrobot.coordinator.engine.stimuli import (
+    Chosen,
+    EventOccurred,
+    RunRaised,
+    Stimulus,
+    VariableChanged,
+    Verdict,
+)
+from petrobot.coordinator.mission.dispatch import Dispatch
+from petrobot.coordinator.mission.partners import (
+    FirstAlternative,
+    Forgetful,
+    Observer,
+    Selector,
+    Store,
+)
+from petrobot.coordinator.record.recording import Step
+from petrobot.coordinator.task import Scope, Status, Task
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.messages import Answer, Event, Outcome
+from petrobot.services.comm.notice import (
+    Accepted,
+    Answered,
+    Ended,
+    EventArrived,
+    Late,
+    Notice,
+    PeerBack,
+    Progress,
+)
+from petrobot.services.comm.verdicts import VERDICT_EVENTS, VerdictSaid, verdict_event
 
 MEMORY_EVENTS: Final = "memory:"
 SYNC_WITHIN: Final = 0.5
-"""Seconds after which what waits for a sync is synced although no effect calls for it, so that nodes may forget results."""
+"""Seconds after which what waits for a sync is synced although no effect calls for it, so that
+nodes may forget results."""
 _LEAVES_THE_PROCESS: Final = (StartRun, CancelRun, HoldRun, ReleaseRun)
 
 
@@ -67,19 +92,23 @@ class Executor:
         self._effects: list[Instruction] = []
         self._acks: list[Callable[[], None]] = []
         self._unsafe_since: float | None = None
-        self._external = {e.name for e in self.task.flat.events.values() if e.scope is Scope.EXTERNAL}
+        self._external = {
+            e.name for e in self.task.flat.events.values() if e.scope is Scope.EXTERNAL
+        }
 
-    # --- in --------------------------------------------------------------------------------------------------------
+    # --- in -----------------------------------------------------------------------------------
 
     def subscribe(self, now: float) -> None:
-        """Have the events and variables that the task knows, and verdicts on its runs, sent by every node."""
+        """Have the events and variables that the task knows, and verdicts on its runs, sent by
+        every node."""
         known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
         names = sorted(known | {verdict_event(self.mission)})
         for caller in self.callers.values():
             caller.subscribe(now, names)
 
     def relive(self, now: float, step: Step) -> None:
-        """Take in a step that an earlier process recorded at `now`; observers see it, nothing is carried out again."""
+        """Take in a step that an earlier process recorded at `now`; observers see it, nothing is
+        carried out again."""
         self.state = step.state
         self.dispatch.relive(now, step.stimulus, step.instructions, step.boots)
         for observer in self.observers:
@@ -87,7 +116,9 @@ class Executor:
             for instruction in step.instructions:
                 observer.instruction(now, instruction)
             observer.settled(now, step.state)
-        self.finished = next((i for i in step.instructions if isinstance(i, Finished)), self.finished)
+        self.finished = next(
+            (i for i in step.instructions if isinstance(i, Finished)), self.finished
+        )
 
     def adopt(self, now: float) -> None:
         """Go on from the steps relived: ask nodes for the runs, give the orders again."""
@@ -121,8 +152,11 @@ class Executor:
         self._work(now)
 
     def advance(self, now: float) -> None:
-        """Fire the timers that are over, start what waited for a fence, sync what has waited for long."""
-        if self.dispatch.idle and self._unsafe_since is None:  # asked at each tick of a lock-step cell
+        """Fire the timers that are over, start what waited for a fence, sync what has waited for
+        long."""
+        if (
+            self.dispatch.idle and self._unsafe_since is None
+        ):  # asked at each tick of a lock-step cell
             return
         due = self.due()
         if due is None or now < due:
@@ -138,7 +172,7 @@ class Executor:
         safe_by = self._unsafe_since + SYNC_WITHIN
         return safe_by if due is None else min(due, safe_by)
 
-    # --- one stimulus after the other ------------------------------------------------------------------------------
+    # --- one stimulus after the other ---------------------------------------------------------
 
     def _work(self, now: float) -> None:
         while self._queue:
@@ -151,16 +185,20 @@ class Executor:
         self._make_safe(now)
 
     def _make_safe(self, now: float) -> None:
-        """Before effects leave: what moves hardware, or is the end, is synced; everything else survives this process.
+        """Before effects leave: what moves hardware, or is the end, is synced; everything else
+        survives this process.
 
-        Independent effects of one turn share one sync. What waits is synced within `SYNC_WITHIN`, and acknowledged then.
+        Independent effects of one turn share one sync. What waits is synced within `SYNC_WITHIN`,
+        and acknowledged then.
         """
         if self.store.safe:
             self._unsafe_since = None
             self._acknowledge()
             return
         leaving = [effect for effect in self._effects if isinstance(effect, _LEAVES_THE_PROCESS)]
-        moves = any(self.store.durable or self.dispatch.moves_hardware(effect) for effect in leaving)
+        moves = any(
+            self.store.durable or self.dispatch.moves_hardware(effect) for effect in leaving
+        )
         waited = self._unsafe_since is not None and now >= self._unsafe_since + SYNC_WITHIN
         if moves or waited or self.finished is not None:
             self.store.sync()
@@ -197,14 +235,22 @@ class Executor:
             fixed = self.state.overrides.get(choose.of)
             if fixed is not None:
                 return Chosen(choose.key, fixed, "chosen by the operator")
-            offered = tuple(a for a in choose.alternatives if a in self.directory.actions) or choose.alternatives
-            return Chosen(choose.key, *self.selector.choose(choose.of, choose.key, offered, self.state.variables))
-        draw = np.random.default_rng([self.seed, *choose.key.encode()]).random() * sum(choose.weights)
+            offered = (
+                tuple(a for a in choose.alternatives if a in self.directory.actions)
+                or choose.alternatives
+            )
+            return Chosen(
+                choose.key,
+                *self.selector.choose(choose.of, choose.key, offered, self.state.variables),
+            )
+        draw = np.random.default_rng([self.seed, *choose.key.encode()]).random() * sum(
+            choose.weights
+        )
         bounds = np.cumsum(choose.weights)
         index = min(int(np.searchsorted(bounds, draw, side="right")), len(bounds) - 1)
         return Chosen(choose.key, choose.alternatives[index], f"draw {draw:.4f} of {bounds[-1]:g}")
 
-    # --- what nodes say --------------------------------------------------------------------------------------------
+    # --- what nodes say -----------------------------------------------------------------------
 
     def _ended(self, now: float, node: str, outcome: Outcome) -> None:
         self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
@@ -223,12 +269,17 @@ class Executor:
             run = self.dispatch.run_of(event.run)
             if run is not None:
                 self._queue.append(RunRaised(run, event.name))
-        elif event.name in self._external and (event.number or self.engine.awaits(self.state, event.name)):
+        elif event.name in self._external and (
+            event.number or self.engine.awaits(self.state, event.name)
+        ):
             self._queue.append(EventOccurred(event.name, event.source, event.number))
 
     def verdict(self, said: VerdictSaid) -> Verdict:
-        """What somebody says of a run, as the engine takes it. One on another mission run's run names none of this one."""
-        return Verdict(said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text)
+        """What somebody says of a run, as the engine takes it. One on another mission run's run
+        names none of this one."""
+        return Verdict(
+            said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text
+        )
 
     def _progress(self, now: float, notice: Progress) -> None:
         run = self.dispatch.run_of(notice.id)

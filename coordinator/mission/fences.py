@@ -1,4 +1,5 @@
-"""Devices that may still move although nobody here leads them: no run starts on one before it is known to stand still."""
+"""Devices that may still move although nobody here leads them: no run starts on one before it is
+known to stand still."""
 
 from __future__ import annotations
 
@@ -7,21 +8,23 @@ from dataclasses import dataclass
 from typing import Final
 
 STOP_MARGIN: Final = 2.0
-"""Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md, cancel)."""
+"""Seconds that a node's stop routine may take after a run's orphan time (docs/semantics.md,
+cancel)."""
 REBOOTED: Final = "rebooted"
 FORGOTTEN: Final = "forgotten"
 UNSURE: Final = frozenset({"lost", "no_answer", "not_accepted", "refused", REBOOTED, FORGOTTEN})
 """Causes after which a device may still be moving if executed = unknown.
 
-The node has not said that the run is over, or cannot say how it ended. Or it is another process, and
-the devices of the former one may be in the middle of their stop routines.
+The node has not said that the run is over, or cannot say how it ended. Or it is another process,
+and the devices of the former one may be in the middle of their stop routines.
 """
 FOR_GOOD: Final = math.inf
 
 
 @dataclass(frozen=True, slots=True)
 class Fence:
-    """A device is kept free because of a run, until a time (s) or until its node says that the run is over."""
+    """A device is kept free because of a run, until a time (s) or until its node says that the run
+    is over."""
 
     run: str
     node: str
@@ -50,9 +53,9 @@ class Fences:
     def after(self, cause: str, now: float, orphan_time: float | None) -> float:
         """Until when a device is fenced whose run ended for this cause.
 
-        A node that was lost stops the run itself once it has missed its coordinator for the orphan time. One that was started
-        again, or has forgotten the run, does not execute it any more. One that is there and does not say that the run has
-        stopped can be waited for only.
+        A node that was lost stops the run itself once it has missed its coordinator for the orphan
+        time. One that was started again, or has forgotten the run, does not execute it any more.
+        One that is there and does not say that the run has stopped can be waited for only.
         """
         if cause == "no_answer":
             return FOR_GOOD
@@ -66,7 +69,8 @@ class Fences:
         return devices
 
     def rebooted(self, now: float, node: str) -> None:
-        """The node is another process: the runs of the former one ended with it, at the latest by its devices' stop routines."""
+        """The node is another process: the runs of the former one ended with it, at the latest by
+        its devices' stop routines."""
         for device, fence in self._fences.items():
             if fence.node == node:
                 self._fences[device] = Fence(fence.run, node, min(fence.until, now + STOP_MARGIN))

@@ -1,20 +1,22 @@
-"""The coordinator as a party of a lock-step cell: a mission run whose callers speak through envelopes."""
+"""The coordinator as a party of a lock-step cell: a mission run whose callers speak through
+envelopes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from coordinator.mission.mission import Mission, Stage
-from services.comm.directory import Directory
-from services.comm.messages import Call, Message, Refuse, Welcome
-from services.comm.party import Envelope
+from petrobot.coordinator.mission.mission import Mission, Stage
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.messages import Call, Message, Refuse, Welcome
+from petrobot.services.comm.party import Envelope
 
 NAME = "coordinator"
 
 
 class CoordinatorParty:
-    """Implements `services.comm.party.Party`. `watch(now)` is called once a tick, for progress shown to people; `begin(now)`
-    once every node is there (the mission's start, unless a recorded run is to go on)."""
+    """Implements `services.comm.party.Party`. `watch(now)` is called once a tick, for progress
+    shown to people; `begin(now)` once every node is there (the mission's start, unless a recorded
+    run is to go on)."""
 
     def __init__(
         self,
@@ -40,14 +42,17 @@ class CoordinatorParty:
         return self.mission.stage is Stage.OVER
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Take a node's message, and what comes of it at once: so the order of arrival counts, not that of the nodes."""
+        """Take a node's message, and what comes of it at once: so the order of arrival counts, not
+        that of the nodes."""
         self._now = now
         node = self._nodes.get(envelope.source)
         if node is None:
             node = self._nodes[envelope.source] = self._directory.party(envelope.source)
         caller = self.mission.callers[node]
         if not caller.up and not isinstance(envelope.body, Welcome | Refuse):
-            return  # meant for a predecessor of this process: its connection is gone, and what was on its way with it
+            # meant for a predecessor of this process: its connection is gone, and what was on its
+            # way with it
+            return
         caller.receive(now, envelope.body)
         if notices := caller.notices():
             self.mission.take(now, node, notices)
@@ -62,7 +67,9 @@ class CoordinatorParty:
             if notices := caller.notices():
                 mission.take(now, node, notices)
         mission.advance(now)
-        if mission.stage is Stage.CONNECTING and all(caller.up for caller in mission.callers.values()):
+        if mission.stage is Stage.CONNECTING and all(
+            caller.up for caller in mission.callers.values()
+        ):
             self._begin(now)
         if self._watch is not None:
             self._watch(now)

@@ -1,4 +1,5 @@
-"""A mission run from beginning to end: prepare the cell, execute the task, ask for the score. A machine like its parts."""
+"""A mission run from beginning to end: prepare the cell, execute the task, ask for the score. A
+machine like its parts."""
 
 from __future__ import annotations
 
@@ -7,24 +8,34 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
-from coordinator.engine import Mode, State
-from coordinator.engine.instructions import Corrected, Fired, Instruction, Report, RunRecorded, Severity, StartRun
-from coordinator.engine.stimuli import Begin, Point, Stimulus
-from coordinator.mission.executor import Executor
-from coordinator.net import Marking
-from coordinator.record.recording import PREPARED, SCORED, Step
-from coordinator.task import Status
-from services.comm.caller import Caller
-from services.comm.directory import Directory, DirectoryError
-from services.comm.messages import Call, Outcome
-from services.comm.notice import Ended, Notice, PeerBack, PeerLost, Progress
-from services.comm.verdicts import VerdictSaid
+from petrobot.coordinator.engine import Mode, State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Fired,
+    Instruction,
+    Report,
+    RunRecorded,
+    Severity,
+    StartRun,
+)
+from petrobot.coordinator.engine.stimuli import Begin, Point, Stimulus
+from petrobot.coordinator.mission.executor import Executor
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.record.recording import PREPARED, SCORED, Step
+from petrobot.coordinator.task import Status
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.directory import Directory, DirectoryError
+from petrobot.services.comm.messages import Call, Outcome
+from petrobot.services.comm.notice import Ended, Notice, PeerBack, PeerLost, Progress
+from petrobot.services.comm.verdicts import VerdictSaid
 
 SERVICE_DEADLINE = 20.0
 TOLD_ERRORS = 6
-"""How many of the last runs that ended in ERROR the result of a mission run tells that ended so itself."""
+"""How many of the last runs that ended in ERROR the result of a mission run tells that ended so
+itself."""
 VERDICTS = "verdicts"
-"""Key of a score under which it judges runs that ended provisionally: {run: {status, cause, text}}."""
+"""Key of a score under which it judges runs that ended provisionally: {run: {status, cause,
+text}}."""
 
 
 class Stage(Enum):
@@ -62,7 +73,8 @@ class Cycle:
 
     @property
     def worst(self) -> tuple[Status, str, str]:
-        """The worst status of its runs; of several that are as bad the first, with its cause and text."""
+        """The worst status of its runs; of several that are as bad the first, with its cause and
+        text."""
         rank = {Status.SUCCESS: 0, Status.FAILURE: 1, Status.ERROR: 2}
         worst = max(self.ends.values(), key=lambda end: rank[end[0]], default=None)
         return (Status.SUCCESS, "", "") if worst is None or worst[0] is Status.SUCCESS else worst
@@ -104,7 +116,9 @@ class Tally:
         elif isinstance(instruction, RunRecorded):
             self.runs.append(instruction)
             if self.cycles:
-                self.cycles[-1].count(instruction.run, instruction.status, instruction.cause, instruction.text)
+                self.cycles[-1].count(
+                    instruction.run, instruction.status, instruction.cause, instruction.text
+                )
         elif isinstance(instruction, Corrected):
             self._correct(instruction)
         elif isinstance(instruction, StartRun):
@@ -122,7 +136,8 @@ class Tally:
         """Nothing to count."""
 
     def last_errors(self, directory: Directory) -> list[dict[str, Any]]:
-        """The last runs that ended in ERROR, in the order in which they ended: which action, on which node, and why."""
+        """The last runs that ended in ERROR, in the order in which they ended: which action, on
+        which node, and why."""
         failed = [record for record in self.runs if record.status is Status.ERROR][-TOLD_ERRORS:]
         return [
             {
@@ -140,7 +155,9 @@ class Tally:
         run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
         for n in reversed(range(len(self.runs))):
             if self.runs[n].run == run:
-                self.runs[n] = replace(self.runs[n], status=said[0], cause=said[1], text=said[2], deferred=False)
+                self.runs[n] = replace(
+                    self.runs[n], status=said[0], cause=said[1], text=said[2], deferred=False
+                )
                 break
         for cycle in reversed(self.cycles):
             if run in cycle.ends:
@@ -174,11 +191,13 @@ class Mission:
         self.score: Mapping[str, Any] = {}
         self.begun = self.ended = 0.0
         self.point: Point | None = None
-        """Where the task begins, if not at its own beginning (a simulated run alone: no real world stands elsewhere at will)."""
+        """Where the task begins, if not at its own beginning (a simulated run alone: no real world
+        stands elsewhere at will)."""
         self.lost: dict[str, str] = {}
         """Nodes that are away, with the reason."""
         self.remarks: dict[str, str] = {}
-        """What else the result tells, from whoever drives the mission run: that the host was too busy for it."""
+        """What else the result tells, from whoever drives the mission run: that the host was too
+        busy for it."""
         self._early: list[tuple[str, Notice]] = []
         self._resumed = False
         """Whether an earlier process may have asked for the preparation or the score."""
@@ -193,7 +212,8 @@ class Mission:
         return self.executor.callers
 
     def start(self, now: float) -> None:
-        """The nodes are there: prepare the cell, or begin at once when nothing is to be prepared."""
+        """The nodes are there: prepare the cell, or begin at once when nothing is to be
+        prepared."""
         if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
             self._begin(now)
         else:
@@ -208,7 +228,8 @@ class Mission:
             self.ended = now
 
     def resume(self, now: float, stages: Mapping[str, Mapping[str, Any]]) -> None:
-        """Go on behind the last step relived; `stages` are those that the journal says to be over."""
+        """Go on behind the last step relived; `stages` are those that the journal says to be
+        over."""
         self._resumed = True
         if SCORED in stages:
             self.score, self.stage = stages[SCORED], Stage.OVER
@@ -228,10 +249,13 @@ class Mission:
             self.take(now, node, [notice])
 
     def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
-        """Take what a node's caller noticed. What comes before every node is there waits: nothing is led by halves."""
+        """Take what a node's caller noticed. What comes before every node is there waits: nothing
+        is led by halves."""
         self._note_links(node, notices)
         if self.stage is Stage.CONNECTING:
-            self._early.extend((node, notice) for notice in notices if not isinstance(notice, PeerBack | PeerLost))
+            self._early.extend(
+                (node, notice) for notice in notices if not isinstance(notice, PeerBack | PeerLost)
+            )
             notices = [notice for notice in notices if isinstance(notice, PeerBack | PeerLost)]
         own = [n for n in notices if isinstance(n, Ended) and self._is_own(n.outcome)]
         for notice in own:
@@ -252,9 +276,11 @@ class Mission:
         return self.executor.due() if self.stage is Stage.RUNNING else None
 
     def result(self, mode: str, wall_s: float) -> dict[str, Any]:
-        """The result as the command line writes it; the score's own keys stand beside the general ones.
+        """The result as the command line writes it; the score's own keys stand beside the general
+        ones.
 
-        A mission run that ended in ERROR also has `last_errors`: the actions that ended so, the last one last.
+        A mission run that ended in ERROR also has `last_errors`: the actions that ended so, the
+        last one last.
         """
         finished = self.executor.finished
         failed = finished is None or finished.status is Status.ERROR
@@ -277,7 +303,7 @@ class Mission:
         }
         return {**general, **self.score, **durations}
 
-    # --- stages ----------------------------------------------------------------------------------------------------
+    # --- stages -------------------------------------------------------------------------------
 
     def _preparation(self) -> dict[str, Any]:
         return {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
@@ -296,7 +322,8 @@ class Mission:
         self.stage = Stage.SCORING if asked else Stage.OVER
 
     def _provisional(self, cycle: Cycle) -> dict[str, Any]:
-        """What the score is told of a cycle's runs that are not judged yet; nothing if there are none."""
+        """What the score is told of a cycle's runs that are not judged yet; nothing if there are
+        none."""
         open_, call_id = self.executor.state.deferred, self.executor.dispatch.call_id
         runs = [
             {
@@ -311,13 +338,17 @@ class Mission:
         return {"provisional": runs} if runs else {}
 
     def _ask(self, now: float, what: str, service: str, arguments: Mapping[str, Any]) -> bool:
-        """Call a service of the task's; False when it names none, or none is placed (a real cell has no referee)."""
+        """Call a service of the task's; False when it names none, or none is placed (a real cell
+        has no referee)."""
         if not service or service not in self.executor.directory.services:
             return False
         caller = self.callers[self.executor.directory.where(service)]
         identity = f"{self.executor.mission}/{what}"
         seed = self.executor.seed
-        caller.call(now, Call(identity, service, arguments, SERVICE_DEADLINE, seed=seed, again=self._resumed))
+        caller.call(
+            now,
+            Call(identity, service, arguments, SERVICE_DEADLINE, seed=seed, again=self._resumed),
+        )
         return True
 
     def _is_own(self, outcome: Outcome) -> bool:
@@ -326,7 +357,10 @@ class Mission:
     def _answered(self, now: float, outcome: Outcome) -> None:
         if outcome.status != Status.SUCCESS:
             what = outcome.id.rpartition("/")[2]
-            raise MissionError(f"{what}: {outcome.text or outcome.cause}", bad_input=outcome.cause == "bad_arguments")
+            raise MissionError(
+                f"{what}: {outcome.text or outcome.cause}",
+                bad_input=outcome.cause == "bad_arguments",
+            )
         store = self.executor.store
         if self.stage is Stage.PREPARING:
             store.stage(PREPARED, {})
@@ -334,7 +368,9 @@ class Mission:
             self._begin(now)
         elif self.stage is Stage.SCORING:
             score = {key: value for key, value in outcome.values.items() if key != VERDICTS}
-            self.executor.stimulate(now, *map(self.executor.verdict, _verdicts(outcome.values.get(VERDICTS, {}))))
+            self.executor.stimulate(
+                now, *map(self.executor.verdict, _verdicts(outcome.values.get(VERDICTS, {})))
+            )
             store.stage(SCORED, score)
             store.sync()
             self.score, self.stage = score, Stage.OVER
@@ -349,9 +385,12 @@ class Mission:
 
 
 def _verdicts(said: Any) -> list[VerdictSaid]:
-    """What a score says of runs. Raises MissionError when it is not {run: {status, cause, text}}."""
+    """What a score says of runs. Raises MissionError when it is not {run: {status, cause,
+    text}}."""
     try:
         return [VerdictSaid.of_data({**verdict, "run": run}) for run, verdict in said.items()]
     except (AttributeError, TypeError, ValueError) as fault:
-        text = f"score: {VERDICTS}: {fault}; give {{run: {{status, cause, text}}}} with the runs' ids"
+        text = (
+            f"score: {VERDICTS}: {fault}; give {{run: {{status, cause, text}}}} with the runs' ids"
+        )
         raise MissionError(text) from fault

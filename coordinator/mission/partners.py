@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
-from coordinator.engine import Instruction, State, Stimulus
-from services.comm.notice import Progress
+from petrobot.coordinator.engine import Instruction, State, Stimulus
+from petrobot.services.comm.notice import Progress
 
 
 class Selector(Protocol):
     """Chooses among the alternatives of a primitive task."""
 
     def choose(
-        self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
+        self,
+        task: str,
+        run: str,
+        alternatives: tuple[str, ...],
+        variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
         """One alternative and why. `variables` are global memory and parameters as they are now."""
 
@@ -21,7 +25,9 @@ class Selector(Protocol):
 class Store(Protocol):
     """Where stimuli go before their effects leave."""
 
-    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+    def append(
+        self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
+    ) -> None:
         """Keep a stimulus, and what came of it, with the next sync."""
 
     def node(self, name: str, boot: str) -> None:
@@ -68,7 +74,9 @@ class Forgetful:
     safe = True
     durable = False
 
-    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+    def append(
+        self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
+    ) -> None:
         """Keep nothing."""
 
     def node(self, name: str, boot: str) -> None:
@@ -85,7 +93,8 @@ class Forgetful:
 
 
 class FirstAlternative:
-    """The selector of a run that learns nothing: always the first alternative that some node offers."""
+    """The selector of a run that learns nothing: always the first alternative that some node
+    offers."""
 
     def __init__(self, chosen: Mapping[str, str] | None = None) -> None:
         self._chosen = dict(chosen or {})
@@ -95,7 +104,11 @@ class FirstAlternative:
         return {}
 
     def choose(
-        self, task: str, run: str, alternatives: tuple[str, ...], variables: Mapping[str, Any] | None = None
+        self,
+        task: str,
+        run: str,
+        alternatives: tuple[str, ...],
+        variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
         """The user's choice for this primitive task, else the first."""
         if task in self._chosen:

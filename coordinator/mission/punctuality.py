@@ -1,4 +1,5 @@
-"""How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to wake up in time."""
+"""How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to
+wake up in time."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ LATE: Final = 0.02
 SHARE: Final = 0.01
 """Share of late looks from which the host counts as too busy for a run in real time,"""
 WORST: Final = 3 * LATE
-"""and a single delay (s) from which it does: so long a gap takes a set point of such a stream out of force."""
+"""and a single delay (s) from which it does: so long a gap takes a set point of such a stream out
+of force."""
 
 
 @dataclass
@@ -36,6 +38,7 @@ class Punctuality:
         if self.worst < WORST and self.late <= SHARE * self.looks:
             return ""
         return (
-            f"too busy for real time: the coordinator woke up more than {1e3 * LATE:g} ms late {self.late} of {self.looks} times, "
+            f"too busy for real time: the coordinator woke up more than {1e3 * LATE:g} ms "
+            f"late {self.late} of {self.looks} times, "
             f"by {1e3 * self.worst:.0f} ms at most; what failed may be due to that"
         )

@@ -8,19 +8,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from shlex import quote
 from typing import Final
 
-from coordinator.mission.mission import Mission, MissionError, Stage
-from coordinator.mission.punctuality import PERIOD, Punctuality
-from coordinator.record.journal import JournalError
-from services.comm.client import Client
-from services.comm.credentials import COORDINATOR, Credentials, credentials
-from services.comm.directory import Directory
-from services.comm.notice import Notice, PeerBack, PeerLost
+from petrobot.coordinator.mission.mission import Mission, MissionError, Stage
+from petrobot.coordinator.mission.punctuality import PERIOD, Punctuality
+from petrobot.coordinator.record.journal import JournalError
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import COORDINATOR, Credentials, credentials
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.notice import Notice, PeerBack, PeerLost
 
 LINGER = 1.0
 """Seconds that nothing at the end of a run waits for."""
 LEAVE: Final = 2.5
-"""Seconds after the loss of a node in which it may come back to be told good-bye: a little longer than it keeps the leases of
-one who has gone without a word (`services.comm.results.Keeping.lease`)."""
+"""Seconds after the loss of a node in which it may come back to be told good-bye: a little
+longer than it keeps the leases of one who has gone without a word
+(`services.comm.results.Keeping.lease`)."""
 
 KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
 """Refusals (docs/protocol.md) of one whose key is not that of the node."""
@@ -37,7 +38,9 @@ class UnreachableError(Exception):
 class RealtimeMission:
     """Drives a mission run: what clients notice goes in, what it calls goes out, timers wake it."""
 
-    def __init__(self, mission: Mission, directory: Directory, proves: Credentials | None = None) -> None:
+    def __init__(
+        self, mission: Mission, directory: Directory, proves: Credentials | None = None
+    ) -> None:
         self.mission = mission
         self._loop = asyncio.get_running_loop()
         self._over = asyncio.Event()
@@ -49,7 +52,14 @@ class RealtimeMission:
         self._looking: asyncio.TimerHandle | None = None
         key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
         self.clients: Mapping[str, Client] = {
-            name: Client(node.host, node.port, mission.callers[name], on_notices=self._hear(name), key=key, tls=tls)
+            name: Client(
+                node.host,
+                node.port,
+                mission.callers[name],
+                on_notices=self._hear(name),
+                key=key,
+                tls=tls,
+            )
             for name, node in directory.nodes.items()
         }
 
@@ -57,25 +67,39 @@ class RealtimeMission:
         """Reach every node. Raises UnreachableError that names those that are not there."""
         for client in self.clients.values():
             client.start()
-        reached = await asyncio.gather(*(client.connected(timeout) for client in self.clients.values()))
+        reached = await asyncio.gather(
+            *(client.connected(timeout) for client in self.clients.values())
+        )
         missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
         if missing:
             raise UnreachableError(missing, "; ".join(self._missed(missing)))
 
     def _missed(self, missing: Sequence[str]) -> Iterator[str]:
-        """Why nodes are not reached and what to do: those that run and refuse us need something else than to be launched."""
+        """Why nodes are not reached and what to do: those that run and refuse us need something
+        else than to be launched."""
         source = quote(os.path.normpath(self.mission.executor.directory.source))
         refusing = [name for name in missing if self.clients[name].answered]
         if away := [name for name in missing if name not in refusing]:
-            yield f"no answer from {', '.join(map(self._tried, away))}; launch them with `petrobot up --services {source}`"
+            yield (
+                f"no answer from {', '.join(map(self._tried, away))}; launch them with "
+                f"`petrobot up --services {source}`"
+            )
         if refusing:
-            keys = any(code in self.clients[name].trouble for name in refusing for code in KEY_CODES)
-            remedy = f"; give both sides the same key file: that which keys.file of {source} names" if keys else ""
+            keys = any(
+                code in self.clients[name].trouble for name in refusing for code in KEY_CODES
+            )
+            remedy = (
+                f"; give both sides the same key file: that which keys.file of {source} names"
+                if keys
+                else ""
+            )
             yield f"not let in by {', '.join(map(self._tried, refusing))}{remedy}"
 
     def _tried(self, node: str) -> str:
         client = self.clients[node]
-        return f"{node} at {client.host}:{client.port}" + (f" ({client.trouble})" if client.trouble else "")
+        return f"{node} at {client.host}:{client.port}" + (
+            f" ({client.trouble})" if client.trouble else ""
+        )
 
     async def run(self, begin: Callable[[float], None] | None = None) -> None:
         """Run the mission to its end, from its start or from whatever `begin(now)` makes of it.
@@ -92,8 +116,9 @@ class RealtimeMission:
             raise self._fault
 
     async def close(self) -> None:
-        """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye, which frees its devices for
-        the next run at once. One that was just lost is waited for as long as it would keep them for this one."""
+        """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye,
+        which frees its devices for the next run at once. One that was just lost is waited for as
+        long as it would keep them for this one."""
         self._closed = True
         for timer in (self._timer, self._looking):
             if timer is not None:
@@ -120,7 +145,8 @@ class RealtimeMission:
         self._over.set()
 
     def settle(self) -> None:
-        """Send what was said, and wake up in time for what is due next; call it after each use of the mission."""
+        """Send what was said, and wake up in time for what is due next; call it after each use of
+        the mission."""
         if self._closed:
             return
         for client in self.clients.values():
@@ -134,7 +160,8 @@ class RealtimeMission:
         self._timer = None if due is None else self._loop.call_at(due, self._wake)
 
     def _look_again(self, due: float) -> None:
-        """See how late the loop comes to what is due: if it is, so are the other processes of this host."""
+        """See how late the loop comes to what is due: if it is, so are the other processes of this
+        host."""
 
         def look() -> None:
             self._look_again(self._punctuality.look(due, self._loop.time()))
@@ -160,7 +187,8 @@ class RealtimeMission:
         try:
             step(self._loop.time())
         except (MissionError, JournalError) as fault:
-            # What is not safe has not left: the nodes end its runs as orphans, and `resume` goes on from what is.
+            # What is not safe has not left: the nodes end its runs as orphans, and `resume` goes on
+            # from what is.
             self.fail(fault)
             return
         self._loop.call_soon(self.settle)

@@ -44,7 +44,9 @@ class Timers:
 
     def over(self, now: float) -> list[str]:
         """Take out those that are over, the earliest first."""
-        keys = sorted((t.due, k) for k, t in self._timers.items() if t.held is None and t.due <= now)
+        keys = sorted(
+            (t.due, k) for k, t in self._timers.items() if t.held is None and t.due <= now
+        )
         for _, key in keys:
             del self._timers[key]
         return [key for _, key in keys]

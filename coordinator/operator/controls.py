@@ -1,11 +1,12 @@
-"""Who holds the controls of a mission: one operator acts, the others watch and can ask. It outlives mission runs."""
+"""Who holds the controls of a mission: one operator acts, the others watch and can ask. It outlives
+mission runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from coordinator.hmi.feed import Feed
+from petrobot.coordinator.hmi.feed import Feed
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 """What everybody may say, whoever holds the controls."""
@@ -29,7 +30,10 @@ class Controls:
         """Why somebody may not give a command; None if he may."""
         if verb in FREE or self.holder == who:
             return None
-        return refusal("not_holder", f"{self.holder or 'nobody'} holds the controls; take or ask for them first")
+        return refusal(
+            "not_holder",
+            f"{self.holder or 'nobody'} holds the controls; take or ask for them first",
+        )
 
     def take(self, who: str) -> Answer:
         """Take them when nobody has them."""

@@ -1,9 +1,12 @@
-"""Where a simulated run sets out from a recorded one: the state after one of its records, and what becomes of runs that went on.
+"""Where a simulated run sets out from a recorded one: the state after one of its records, and what
+becomes of runs that went on.
 
-A marking says where the task stood, not where the world stood. So the laboratory of the new run is prepared as for any run, and an
-action that went on at that moment begins again (the default), or counts as ended if the operator says how. Runs that had
-ended and whose token still waited stay ended, with their status and cause. Variables and latched events are as they were; timers
-begin anew; what the operator wanted (pause, breakpoints, choices) is not taken over. Record 0 is the run's own beginning.
+A marking says where the task stood, not where the world stood. So the laboratory of the new run is
+prepared as for any run, and an action that went on at that moment begins again (the default), or
+counts as ended if the operator says how. Runs that had ended and whose token still waited stay
+ended, with their status and cause. Variables and latched events are as they were; timers begin
+anew; what the operator wanted (pause, breakpoints, choices) is not taken over. Record 0 is the
+run's own beginning.
 """
 
 from __future__ import annotations
@@ -13,14 +16,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Engine, Mode, Phase, Point, Run, Standing, State, point_from_plain, to_plain
-from coordinator.experience.learning_session import fixed_by_user, session_of
-from coordinator.launch import Setting, lockstep_id
-from coordinator.mission.partners import FirstAlternative, Observer
-from coordinator.record.journal import Journal, JournalWriter
-from coordinator.record.recording import STIMULUS, JournalStore, clock_reading, replay
-from coordinator.record.runfolder import JOURNAL, header
-from coordinator.task import Kind, Status, Task
+from petrobot.coordinator.engine import (
+    Engine,
+    Mode,
+    Phase,
+    Point,
+    Run,
+    Standing,
+    State,
+    point_from_plain,
+    to_plain,
+)
+from petrobot.coordinator.experience.learning_session import fixed_by_user, session_of
+from petrobot.coordinator.launch import Setting, lockstep_id
+from petrobot.coordinator.mission.partners import FirstAlternative, Observer
+from petrobot.coordinator.record.journal import Journal, JournalWriter
+from petrobot.coordinator.record.recording import STIMULUS, JournalStore, clock_reading, replay
+from petrobot.coordinator.record.runfolder import JOURNAL, header
+from petrobot.coordinator.task import Kind, Status, Task
 
 AGAIN = "again"
 """A run that went on begins anew."""
@@ -46,22 +59,31 @@ class Departure:
 
     def plain(self) -> dict[str, Any]:
         """For the header of the new run's journal."""
-        plain = {"run": self.run, "record": self.record, "time": self.time, "going": dict(self.going)}
+        plain = {
+            "run": self.run,
+            "record": self.record,
+            "time": self.time,
+            "going": dict(self.going),
+        }
         return plain if self.point is None else {**plain, "point": to_plain(self.point)}
 
 
 def departure(
     journal: Journal, engine: Engine, run: str, record: int, going: Mapping[str, str] | str = AGAIN
 ) -> Departure:
-    """The state after a record (of those between two stimuli, the earlier), as a point to set out from.
+    """The state after a record (of those between two stimuli, the earlier), as a point to set out
+    from.
 
-    `going` is one word for all runs that went on, or words by place; places that are not named begin again. Raises DepartureError,
-    and what `replay` raises when the journal cannot be derived again.
+    `going` is one word for all runs that went on, or words by place; places that are not named
+    begin again. Raises DepartureError, and what `replay` raises when the journal cannot be derived
+    again.
     """
     numbers = [r.number for r in journal.records if r.kind == STIMULUS]
     last = numbers[-1] if numbers else 0
     if not 0 <= record <= last:
-        raise DepartureError(f"{run} has records 0 (its beginning) to {last}; {record} is none of them")
+        raise DepartureError(
+            f"{run} has records 0 (its beginning) to {last}; {record} is none of them"
+        )
     state, time = engine.initial(), 0.0
     for step in replay(journal, engine):
         if step.number > record:
@@ -75,7 +97,8 @@ def departure(
 
 
 def departed(then: Mapping[str, Any]) -> Point | None:
-    """The point at which a run set out, from its journal's header; None if at the task's own beginning."""
+    """The point at which a run set out, from its journal's header; None if at the task's own
+    beginning."""
     plain = then.get("from", {}).get("point")
     return None if plain is None else point_from_plain(plain)
 
@@ -88,10 +111,11 @@ def departing(
     seed: int | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Setting:
-    """The setting of the new run: that of the recorded one, but for a `seed` and `parameters` that are given.
+    """The setting of the new run: that of the recorded one, but for a `seed` and `parameters` that
+    are given.
 
-    Who chooses is as at that moment: a selector that learned is brought there, and what it learns from here on is not kept.
-    Raises ValueError, EstimatesError.
+    Who chooses is as at that moment: a selector that learned is brought there, and what it learns
+    from here on is not kept. Raises ValueError, EstimatesError.
     """
     then = journal.header
     session = session_of(task, then)
@@ -99,7 +123,9 @@ def departing(
         _bring(session.selector, journal, engine, departure.record)
     selector = FirstAlternative(fixed_by_user(then)) if session is None else session.selector
     given = {**then["parameters"], **(parameters or {})}
-    return Setting(task, given, then["runs"], then["seed"] if seed is None else seed, selector, departure.point)
+    return Setting(
+        task, given, then["runs"], then["seed"] if seed is None else seed, selector, departure.point
+    )
 
 
 def _bring(selector: Observer, journal: Journal, engine: Engine, record: int) -> None:
@@ -113,9 +139,14 @@ def _bring(selector: Observer, journal: Journal, engine: Engine, record: int) ->
 
 
 def departed_store(
-    journal: Journal, setting: Setting, departure: Departure, folder: Path, more: Mapping[str, Any] | None = None
+    journal: Journal,
+    setting: Setting,
+    departure: Departure,
+    folder: Path,
+    more: Mapping[str, Any] | None = None,
 ) -> JournalStore:
-    """The new run's journal in its own folder; its header says from which run and record it came. Raises JournalError."""
+    """The new run's journal in its own folder; its header says from which run and record it came.
+    Raises JournalError."""
     then = journal.header
     given: dict[str, Any] = {
         "services_path": then["services_path"],
@@ -135,10 +166,13 @@ def departed_store(
 
 
 def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:
-    """A state as a point to set out from; `words` say what becomes of the runs that go on, by place."""
+    """A state as a point to set out from; `words` say what becomes of the runs that go on, by
+    place."""
     task, places = engine.compiled.task, engine.compiled.net.places
     tokens = {place: n for place, n in zip(places, state.marking, strict=True) if n}
-    marking = {place: n for place, n in tokens.items() if task.places[place].kind is not Kind.ACTION}
+    marking = {
+        place: n for place, n in tokens.items() if task.places[place].kind is not Kind.ACTION
+    }
     runs = sorted(state.runs(), key=lambda r: (r.phase is not Phase.DONE, r.ended, r.order))
     over = [Standing(r.place, r.status, r.cause, r.action) for r in runs if r.phase is Phase.DONE]
     live = [_standing(r, words.get(r.place, AGAIN)) for r in runs if r.phase is not Phase.DONE]
@@ -148,14 +182,21 @@ def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:
         verdicts |= {f"{s.place}.status": str(s.status), f"{s.place}.reason": s.cause}
     # an aborted run leaves tokens without runs: they begin again, too
     held = {place: sum(r.place == place for r in runs) for place in tokens}
-    bare = [Standing(p) for p, n in tokens.items() if task.places[p].kind is Kind.ACTION for _ in range(n - held[p])]
+    bare = [
+        Standing(p)
+        for p, n in tokens.items()
+        if task.places[p].kind is Kind.ACTION
+        for _ in range(n - held[p])
+    ]
     standing = (*over, *ended, *(s for s in live if s.status is None), *bare)
     return Point(marking, standing, {**state.variables, **verdicts}, state.flags)
 
 
 def _standing(run: Run, word: str) -> Standing:
     end, _, cause = word.partition(":")
-    return Standing(run.place) if end == AGAIN else Standing(run.place, Status(end), cause, run.action)
+    return (
+        Standing(run.place) if end == AGAIN else Standing(run.place, Status(end), cause, run.action)
+    )
 
 
 def _words(live: set[str], going: Mapping[str, str] | str) -> dict[str, str]:
@@ -173,4 +214,6 @@ def _words(live: set[str], going: Mapping[str, str] | str) -> dict[str, str]:
 def _check(word: str) -> None:
     end, colon, _ = word.partition(":")
     if end not in ENDS or (end == AGAIN and colon):
-        raise DepartureError(f"{word!r}: a run that went on begins {AGAIN}, or ends in {', '.join(ENDS[1:])}[:CAUSE]")
+        raise DepartureError(
+            f"{word!r}: a run that went on begins {AGAIN}, or ends in {', '.join(ENDS[1:])}[:CAUSE]"
+        )

@@ -1,4 +1,5 @@
-"""Where a mission run that goes on can be steered: address and token, in its run folder, for its owner's eyes alone."""
+"""Where a mission run that goes on can be steered: address and token, in its run folder, for its
+owner's eyes alone."""
 
 from __future__ import annotations
 
@@ -10,9 +11,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from coordinator.record.runfolder import DEFAULT, NoRunError, journal_of
-from services.comm.json_text import json_text
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.record.runfolder import DEFAULT, NoRunError, journal_of
+from petrobot.services.comm.json_text import json_text
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 DOOR = "operator.json"
 
@@ -33,7 +34,8 @@ class Door:
 
 @contextmanager
 def door_open(folder: Path, door: Door) -> Iterator[Path]:
-    """Leave the door's address in a run folder for as long as it is open; its owner alone may read it (mode 600)."""
+    """Leave the door's address in a run folder for as long as it is open; its owner alone may read
+    it (mode 600)."""
     path = folder / DOOR
     make_folder(folder)
     write_whole(path, json_text(asdict(door)), mode=0o600)
@@ -54,7 +56,8 @@ def find_door(name: str | None = None, folder: Path = DEFAULT) -> Door:
     doors = [door for path in _newest_first(folder) if (door := _read(path)) is not None]
     if not doors:
         raise NoRunError(
-            f"no run in {folder} goes on; begin one with `petrobot run`, or name its folder with --journal"
+            f"no run in {folder} goes on; begin one with `petrobot run`, or name its folder "
+            "with --journal"
         )
     return doors[0]
 

@@ -1,9 +1,11 @@
-"""The emergency stop: straight to the nodes that own devices, and to their bus where a node does not answer.
+"""The emergency stop: straight to the nodes that own devices, and to their bus where a node does
+not answer.
 
-No coordinator is needed, and none can delay it: each node is asked over a connection of its own, stops its devices at once
-(a drive's quick stop goes out with the next bus cycle) and lets no action use them until `CLEAR` comes. Where a node that
-owns a CAN bus of this host does not answer in time, all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that
-leaves OPERATIONAL while it moves stops, object 6007h).
+No coordinator is needed, and none can delay it: each node is asked over a connection of its own,
+stops its devices at once (a drive's quick stop goes out with the next bus cycle) and lets no action
+use them until `CLEAR` comes. Where a node that owns a CAN bus of this host does not answer in time,
+all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that leaves OPERATIONAL while
+it moves stops, object 6007h).
 """
 
 from __future__ import annotations
@@ -15,15 +17,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from coordinator.supervisor import is_local
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.credentials import Credentials
-from services.comm.directory import Directory
-from services.comm.latch import ALL, LatchError, latch_of
-from services.comm.messages import Command, Hello
-from services.comm.notice import Answered, Notice, PeerLost
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.coordinator.supervisor import is_local
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import Credentials
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.latch import ALL, LatchError, latch_of
+from petrobot.services.comm.messages import Command, Hello
+from petrobot.services.comm.notice import Answered, Notice, PeerLost
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 
 STOP = "emergency_stop"
 CLEAR = "clear_emergency"
@@ -65,14 +67,18 @@ class Stopped:
 
 def nodes_with_devices(directory: Directory) -> list[str]:
     """The nodes that own devices with a driver: those that an emergency stop goes to."""
-    return list(dict.fromkeys(device.node for device in directory.devices.values() if device.driver))
+    return list(
+        dict.fromkeys(device.node for device in directory.devices.values() if device.driver)
+    )
 
 
 def buses_of(directory: Directory, node: str) -> list[Mapping[str, Any]]:
     """CAN buses of a node's devices, as `services.comm.can_ports.open_can` takes them."""
     found = []
     for device in directory.devices.values():
-        can = device.config.get("can") or {k: device.config[k] for k in _CAN_KEYS if k in device.config}
+        can = device.config.get("can") or {
+            k: device.config[k] for k in _CAN_KEYS if k in device.config
+        }
         if device.node == node and {"interface", "channel"} <= can.keys() and can not in found:
             found.append(can)
     return found
@@ -82,12 +88,15 @@ _CAN_KEYS = ("interface", "channel", "bitrate")
 
 
 class EmergencyLine:
-    """A connection to one node for emergency stops alone. It fits every services.toml: a stop must not fail for a hash."""
+    """A connection to one node for emergency stops alone. It fits every services.toml: a stop must
+    not fail for a hash."""
 
     def __init__(self, directory: Directory, node: str, credentials: Credentials) -> None:
         name = f"estop-{secrets.token_hex(4)}"
         entry = directory.nodes[node]
-        caller = Caller(node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name), auto_ack=True)
+        caller = Caller(
+            node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name), auto_ack=True
+        )
         self.node = node
         self.why = ""
         self.note = ""
@@ -97,7 +106,12 @@ class EmergencyLine:
         self._device_names = frozenset(directory.devices)
         self._answers: dict[str, asyncio.Future[Mapping[str, Any]]] = {}
         self.client = Client(
-            entry.host, entry.port, caller, on_notices=self._hear, key=credentials.key, tls=credentials.client()
+            entry.host,
+            entry.port,
+            caller,
+            on_notices=self._hear,
+            key=credentials.key,
+            tls=credentials.client(),
         )
 
     async def connect(self, timeout: float) -> bool:
@@ -106,7 +120,9 @@ class EmergencyLine:
         up = self.reached = await self.client.connected(timeout)
         if not up and not self.why:
             trouble = f": {self.client.trouble}" if self.client.answered else ""
-            self.why = f"{self.node} does not answer on {self.client.host}:{self.client.port}{trouble}"
+            self.why = (
+                f"{self.node} does not answer on {self.client.host}:{self.client.port}{trouble}"
+            )
         return up
 
     async def order(self, verb: str, timeout: float) -> dict[str, str] | None:
@@ -132,7 +148,8 @@ class EmergencyLine:
         return None
 
     def devices_of(self, answers: Mapping[str, str]) -> dict[str, str]:
-        """Answers of devices: that under the node's own name is of its actions without one, unless a device is called so."""
+        """Answers of devices: that under the node's own name is of its actions without one, unless
+        a device is called so."""
         own = {self.node} - self._device_names
         return {device: answer for device, answer in answers.items() if device not in own}
 
@@ -153,12 +170,17 @@ class EmergencyLine:
 async def order_all(
     directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: bool = False
 ) -> list[Stopped]:
-    """Give an order to every node that owns devices, all at once; with `bus` stop their buses without waiting for them."""
+    """Give an order to every node that owns devices, all at once; with `bus` stop their buses
+    without waiting for them."""
     nodes = nodes_with_devices(directory)
-    return list(await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes)))
+    return list(
+        await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes))
+    )
 
 
-async def _order(directory: Directory, credentials: Credentials, node: str, verb: str, bus: bool) -> Stopped:
+async def _order(
+    directory: Directory, credentials: Credentials, node: str, verb: str, bus: bool
+) -> Stopped:
     stopped = Stopped(node)
     line = EmergencyLine(directory, node, credentials)
     asking = asyncio.create_task(_ask(line, stopped, verb))
@@ -167,7 +189,8 @@ async def _order(directory: Directory, credentials: Credentials, node: str, verb
             if not bus:
                 await _answered(stopped, asking, NODE_LATE)
             if not bus and not stopped.answered:
-                # The processes of its devices look at the latch themselves: they stop although the node may be frozen.
+                # The processes of its devices look at the latch themselves: they stop although the
+                # node may be frozen.
                 stopped.latch = await _latch(directory, node)
             if bus or not stopped.answered:
                 stopped.bus = await _stop_buses(directory, node)
@@ -186,7 +209,9 @@ async def _order(directory: Directory, credentials: Credentials, node: str, verb
 async def _answered(stopped: Stopped, asking: asyncio.Task[None], timeout: float) -> None:
     """Wait for the node's first answer, at most so many seconds."""
     deadline = asyncio.get_running_loop().time() + timeout
-    while not stopped.answered and not asking.done() and asyncio.get_running_loop().time() < deadline:
+    while (
+        not stopped.answered and not asking.done() and asyncio.get_running_loop().time() < deadline
+    ):
         await asyncio.wait({asking}, timeout=ASK_AGAIN)
 
 
@@ -209,9 +234,13 @@ async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
 
 
 async def _latch(directory: Directory, node: str) -> str:
-    """Keep on disk that the devices of a node are stopped that did not answer: it heeds that when it goes on, or is started."""
+    """Keep on disk that the devices of a node are stopped that did not answer: it heeds that when
+    it goes on, or is started."""
     if not await asyncio.to_thread(is_local, directory.nodes[node].host):
-        return f"not latched: {node} is on another host; run `petrobot estop` there before it is started again"
+        return (
+            f"not latched: {node} is on another host; run `petrobot estop` there before "
+            "it is started again"
+        )
     try:
         path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
     except LatchError as fault:
@@ -220,7 +249,8 @@ async def _latch(directory: Directory, node: str) -> str:
 
 
 async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
-    """Clear on disk the stop of a node that does not run; what was done in words, and whether it is cleared."""
+    """Clear on disk the stop of a node that does not run; what was done in words, and whether it is
+    cleared."""
     if node not in await asyncio.to_thread(still_stopped, directory):
         return "", False
     devices = [name for name, device in directory.devices.items() if device.node == node]
@@ -228,7 +258,11 @@ async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
         await asyncio.to_thread(latch_of(directory.source, node).clear, devices, devices)
     except LatchError as fault:
         return f"not cleared: {fault}", False
-    return "it does not run; its stop is cleared on disk, so its devices take orders when it is started", True
+    return (
+        "it does not run; its stop is cleared on disk, so its devices take orders when it is "
+        "started",
+        True,
+    )
 
 
 def still_stopped(directory: Directory) -> list[str]:
@@ -244,13 +278,18 @@ async def _stop_buses(directory: Directory, node: str) -> str:
     if not buses:
         return ""
     if not await asyncio.to_thread(is_local, directory.nodes[node].host):
-        return "its bus is on another host: run `petrobot estop --bus` there, or press the hardware's emergency stop"
+        return (
+            "its bus is on another host: run `petrobot estop --bus` there, or press the "
+            "hardware's emergency stop"
+        )
     return "; ".join([await asyncio.to_thread(_stop_bus, can) for can in buses])
 
 
 def _stop_bus(can: Mapping[str, Any]) -> str:
-    from services.comm.can_ports import open_can  # python-can takes long to import, and most stops need no bus
-    from services.comm.canopen import NmtCommand, nmt
+    from petrobot.services.comm.can_ports import (
+        open_can,  # python-can takes long to import, and most stops need no bus
+    )
+    from petrobot.services.comm.canopen import NmtCommand, nmt
 
     patience = {"timeout": BUS_PATIENCE} if can["interface"] == "petrobot_stream" else {}
     try:
@@ -259,7 +298,8 @@ def _stop_bus(can: Mapping[str, Any]) -> str:
             for _ in range(BUS_TIMES):
                 port.send(nmt(NmtCommand.STOP))
                 time.sleep(BUS_PAUSE)
-                port.receive()  # what is left unread when a socket closes may cost the other end what we have sent
+                # what is left unread when a socket closes may cost the other end what we have sent
+                port.receive()
         finally:
             port.close()
     except (ConnectionError, ValueError, OSError) as fault:

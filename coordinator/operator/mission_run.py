@@ -1,4 +1,5 @@
-"""One mission run in real time under a station: its journal, its connections to the nodes, its operators, its result."""
+"""One mission run in real time under a station: its journal, its connections to the nodes, its
+operators, its result."""
 
 from __future__ import annotations
 
@@ -8,17 +9,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.hmi.feed import Feed
-from coordinator.launch import Setting, mission_id, realtime_mission, with_runs
-from coordinator.mission.partners import FirstAlternative
-from coordinator.mission.realtime import RealtimeMission, credentials_of
-from coordinator.operator.led_run import LedRun
-from coordinator.operator.start_order import StartOrder
-from coordinator.record.journal import JournalWriter
-from coordinator.record.recording import JournalStore, clock_reading
-from coordinator.record.runfolder import JOURNAL, header
-from coordinator.task import Task
-from services.comm.directory import Directory
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.launch import Setting, mission_id, realtime_mission, with_runs
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.mission.realtime import RealtimeMission, credentials_of
+from petrobot.coordinator.operator.led_run import LedRun
+from petrobot.coordinator.operator.start_order import StartOrder
+from petrobot.coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.recording import JournalStore, clock_reading
+from petrobot.coordinator.record.runfolder import JOURNAL, header
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.directory import Directory
 
 
 class MissionRun(LedRun):
@@ -96,4 +97,6 @@ def _store(
         **begun,
     }
     services = directory.source.read_text(encoding="utf-8")
-    return JournalStore(JournalWriter(folder / JOURNAL, header(mission, text, services, "realtime", given)), origin)
+    return JournalStore(
+        JournalWriter(folder / JOURNAL, header(mission, text, services, "realtime", given)), origin
+    )

@@ -1,7 +1,9 @@
-"""The operator's side of a live mission run: what clients see, and their commands turned into stimuli.
+"""The operator's side of a live mission run: what clients see, and their commands turned into
+stimuli.
 
-Implements `coordinator.hmi.port.MissionPort` over a mission run in real time. Every command is a journaled stimulus; who holds
-the controls is settled here. The emergency stop waits for nobody: it goes straight to the nodes.
+Implements `coordinator.hmi.port.MissionPort` over a mission run in real time. Every command is a
+journaled stimulus; who holds the controls is settled here. The emergency stop waits for nobody: it
+goes straight to the nodes.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Protocol
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
     ForceExit,
@@ -26,16 +28,16 @@ from coordinator.engine import (
     Step,
     Stimulus,
 )
-from coordinator.hmi.feed import Feed
-from coordinator.hmi.narrator import Narrator
-from coordinator.mission.mission import Mission, Stage
-from coordinator.mission.partners import FirstAlternative
-from coordinator.mission.realtime import credentials_of
-from coordinator.operator.controls import Answer, Controls, refusal
-from coordinator.operator.emergency import CLEAR, STOP, order_all
-from coordinator.operator.watching import Watching, shown_selectors
-from coordinator.record.journal import JournalError
-from services.comm.notice import Progress
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.hmi.narrator import Narrator
+from petrobot.coordinator.mission.mission import Mission, Stage
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.mission.realtime import credentials_of
+from petrobot.coordinator.operator.controls import Answer, Controls, refusal
+from petrobot.coordinator.operator.emergency import CLEAR, STOP, order_all
+from petrobot.coordinator.operator.watching import Watching, shown_selectors
+from petrobot.coordinator.record.journal import JournalError
+from petrobot.services.comm.notice import Progress
 
 ANSWERS = 1.5
 """Seconds that nodes have to answer a pause."""
@@ -76,7 +78,8 @@ class Operation:
         starts: bool = False,
         mode: str = "realtime",
     ) -> None:
-        """`feed` and `controls` are those of a page that outlives this run; `starts` says that it can begin another."""
+        """`feed` and `controls` are those of a page that outlives this run; `starts` says that it
+        can begin another."""
         self.shell = shell
         self.mission = shell.mission
         self.executor = shell.mission.executor
@@ -108,7 +111,7 @@ class Operation:
             await asyncio.gather(self._stopping, return_exceptions=True)
         await self.watching.close()
 
-    # --- an observer of the executor -------------------------------------------------------------------------------
+    # --- an observer of the executor ----------------------------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Keep what the engine refuses, for the answer to the command."""
@@ -124,7 +127,7 @@ class Operation:
     def settled(self, now: float, state: State) -> None:
         """Nothing to keep."""
 
-    # --- the port --------------------------------------------------------------------------------------------------
+    # --- the port -----------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
         """The state now."""
@@ -139,7 +142,9 @@ class Operation:
         answer = self.controls.fault(who, verb) or self.controls.carry_out(who, verb, data)
         if answer is not None:
             return answer
-        carry_out: Callable[[str, Mapping[str, Any]], Awaitable[Answer]] | None = getattr(self, f"_do_{verb}", None)
+        carry_out: Callable[[str, Mapping[str, Any]], Awaitable[Answer]] | None = getattr(
+            self, f"_do_{verb}", None
+        )
         if carry_out is None:
             return refusal("unknown", f"no command {verb!r} for a mission run that goes on")
         try:
@@ -147,7 +152,7 @@ class Operation:
         except (KeyError, TypeError, ValueError) as fault:
             return refusal("bad_data", f"{verb}: {fault}")
 
-    # --- commands that are stimuli -----------------------------------------------------------------------------------
+    # --- commands that are stimuli ------------------------------------------------------------
 
     async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
         answer = self._order(Pause(f"by {who}"))
@@ -158,16 +163,23 @@ class Operation:
 
     def _holding(self) -> list[str]:
         """Nodes that have been asked to hold a run and have not answered."""
-        return [run["node"] for run in self.feed.state["runs"].values() if run["state"] == "holding"]
+        return [
+            run["node"] for run in self.feed.state["runs"].values() if run["state"] == "holding"
+        ]
 
     def _complete_pause(self) -> None:
-        """Say of every node with devices how it is: `lost` if it did not answer, `idle` if it had nothing to hold."""
+        """Say of every node with devices how it is: `lost` if it did not answer, `idle` if it had
+        nothing to hold."""
         paused = self.feed.state["paused"]
         if paused is None:
             return
         directory, late = self.executor.directory, self._holding()
         owners = {device.node for device in directory.devices.values() if device.driver}
-        nodes = {node: "lost" if node in self.mission.lost else "idle" for node in directory.nodes if node in owners}
+        nodes = {
+            node: "lost" if node in self.mission.lost else "idle"
+            for node in directory.nodes
+            if node in owners
+        }
         nodes |= paused["nodes"] | dict.fromkeys(late, "lost")
         if nodes != paused["nodes"]:
             self.feed.emit("paused", paused={**paused, "nodes": nodes})
@@ -207,7 +219,10 @@ class Operation:
         task, action = str(data["primitive_task"]), data.get("action")
         primitive = self.executor.task.primitive_tasks[task]
         if action is not None and action not in primitive.alternatives:
-            return refusal("refused", f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}")
+            return refusal(
+                "refused",
+                f"{action} is no alternative of {task}: {', '.join(primitive.alternatives)}",
+            )
         return self._order(Override(task, action or ""))
 
     def _order(self, stimulus: Stimulus) -> Answer:
@@ -224,27 +239,35 @@ class Operation:
         self.shell.settle()
         return refusal("refused", self._refusals[0]) if self._refusals else {"ok": True}
 
-    # --- straight to the nodes ---------------------------------------------------------------------------------------
+    # --- straight to the nodes ----------------------------------------------------------------
 
     async def _do_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
         for node in self.mission.callers:
             self.watching.ask(node, STOP)
         answer = self._order(Abort(f"emergency stop by {who}"))
-        self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
+        self.feed.emit(
+            "mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"}
+        )
         if self._live and (self._stopping is None or self._stopping.done()):
             self._stopping = asyncio.get_running_loop().create_task(self._stop_again())
         return answer if answer["ok"] or answer["code"] != "idle" else {"ok": True}
 
     async def _stop_again(self) -> None:
-        """The same past this process's own connections: a node that is away or frozen is stopped by its bus and latched."""
+        """The same past this process's own connections: a node that is away or frozen is stopped by
+        its bus and latched."""
         directory = self.executor.directory
         for told in await order_all(directory, credentials_of(directory)):
             if not told.answered:
-                text = "; ".join(filter(None, (f"{told.node}: {told.why or 'no answer'}", told.bus, told.latch)))
-                self.feed.emit("notice", notice={"level": "error", "text": text, "at": self.feed.state["time"]})
+                text = "; ".join(
+                    filter(None, (f"{told.node}: {told.why or 'no answer'}", told.bus, told.latch))
+                )
+                self.feed.emit(
+                    "notice", notice={"level": "error", "text": text, "at": self.feed.state["time"]}
+                )
 
     async def _do_clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Devices take orders again; nothing moves by that alone. Refused with the reason when a node still has them stopped."""
+        """Devices take orders again; nothing moves by that alone. Refused with the reason when a
+        node still has them stopped."""
         if not self._live:
             for node in self.mission.callers:
                 self.watching.ask(node, CLEAR)

@@ -1,8 +1,9 @@
-"""One mission run in lock step under a station: the whole cell in this process, in slices of the loop, so that operators see it
-and step in as in real time.
+"""One mission run in lock step under a station: the whole cell in this process, in slices of the
+loop, so that operators see it and step in as in real time.
 
-Nothing of the lock step depends on the slices, the pace or who watches: a run that nobody touches is the same as on the command
-line. While the net is paused and every node has answered, simulated time stands still.
+Nothing of the lock step depends on the slices, the pace or who watches: a run that nobody touches
+is the same as on the command line. While the net is paused and every node has answered, simulated
+time stands still.
 """
 
 from __future__ import annotations
@@ -11,17 +12,17 @@ import asyncio
 import shutil
 import time
 
-from coordinator.engine import Mode
-from coordinator.experience.learning_session import LearningSession
-from coordinator.hmi.feed import Feed
-from coordinator.launch import Setting, Substitutes, lockstep_cell
-from coordinator.mission.lockstep_party import CoordinatorParty
-from coordinator.mission.partners import FirstAlternative
-from coordinator.operator.departure import Departure
-from coordinator.operator.led_run import LedRun
-from coordinator.record.recording import JournalStore
-from services.comm.cell import Cell
-from services.comm.directory import Directory
+from petrobot.coordinator.engine import Mode
+from petrobot.coordinator.experience.learning_session import LearningSession
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.launch import Setting, Substitutes, lockstep_cell
+from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.operator.departure import Departure
+from petrobot.coordinator.operator.led_run import LedRun
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.services.comm.cell import Cell
+from petrobot.services.comm.directory import Directory
 
 SLICE = 0.008
 """Seconds of wall time that ticks may take before others have their turn."""
@@ -32,7 +33,8 @@ AHEAD = 0.01
 
 
 class SimulatedShell:
-    """Ticks of a cell at a pace; what `coordinator.operator.operation.Operation` drives in place of a mission in real time."""
+    """Ticks of a cell at a pace; what `coordinator.operator.operation.Operation` drives in place of
+    a mission in real time."""
 
     def __init__(self, cell: Cell, party: CoordinatorParty, pace: float) -> None:
         self.mission = party.mission
@@ -62,7 +64,11 @@ class SimulatedShell:
     def still(self) -> bool:
         """Whether time stands still: the net is paused and nobody is to answer any more."""
         state = self.mission.executor.state
-        return state.mode is Mode.PAUSED and not state.stopping and not self.mission.executor.dispatch.asked
+        return (
+            state.mode is Mode.PAUSED
+            and not state.stopping
+            and not self.mission.executor.dispatch.asked
+        )
 
     async def run(self, feed: Feed) -> None:
         """Tick until the mission run is over. Raises MissionError, JournalError."""
@@ -79,7 +85,10 @@ class SimulatedShell:
                 behind += time.perf_counter()
             until = time.perf_counter() + SLICE
             while not self._party.over and not self.still and time.perf_counter() < until:
-                if self._pace and self.now() / self._pace > time.perf_counter() - begun - behind + AHEAD:
+                if (
+                    self._pace
+                    and self.now() / self._pace > time.perf_counter() - begun - behind + AHEAD
+                ):
                     break
                 self._cell.step()
             if time.perf_counter() - told >= TELL:
@@ -119,7 +128,9 @@ class SimulatedRun(LedRun):
             shutil.rmtree(folder)
             raise
         self._shell = SimulatedShell(cell, party, pace)
-        self._told = {} if departs is None else {"from": {"run": departs.run, "record": departs.record}}
+        self._told = (
+            {} if departs is None else {"from": {"run": departs.run, "record": departs.record}}
+        )
         super().__init__(folder, self._shell, selector, store, learning)
 
     async def _go(self, feed: Feed) -> None:

@@ -1,7 +1,9 @@
-"""What an operator says when he starts a run from the page: read from plain data, refused with a word, and offered as a form.
+"""What an operator says when he starts a run from the page: read from plain data, refused with a
+word, and offered as a form.
 
-The page can ask for what `petrobot run` can: real time or lock step, number of runs, seed, the task's own parameters, learning
-into an estimates file; and, in lock step, a point of a recorded run to set out from.
+The page can ask for what `petrobot run` can: real time or lock step, number of runs, seed, the
+task's own parameters, learning into an estimates file; and, in lock step, a point of a recorded run
+to set out from.
 """
 
 from __future__ import annotations
@@ -17,16 +19,16 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Item
 
-from coordinator.analysing import RefusedError
-from coordinator.experience.learner import usual_contexts
-from coordinator.experience.learning_session import LearningSession, LearningSetting
-from coordinator.hmi.store import StoreError, TaskStore
-from coordinator.learning.selectors import DEFAULT, RULES
-from coordinator.operator.departure import AGAIN
-from coordinator.task import Task
-from coordinator.taskfile import loads
-from services.comm.directory import Directory
-from services.comm.whole_file import make_folder
+from petrobot.coordinator.analysing import RefusedError
+from petrobot.coordinator.experience.learner import usual_contexts
+from petrobot.coordinator.experience.learning_session import LearningSession, LearningSetting
+from petrobot.coordinator.hmi.store import StoreError, TaskStore
+from petrobot.coordinator.learning.selectors import DEFAULT, RULES
+from petrobot.coordinator.operator.departure import AGAIN
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import loads
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.whole_file import make_folder
 
 REALTIME, LOCKSTEP = "realtime", "lockstep"
 MODES: Final = (REALTIME, LOCKSTEP)
@@ -38,12 +40,15 @@ SUFFIX: Final = ".db"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
 _KINDS: Final = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 _SHORT: Final = reprlib.Repr()
-_KNOWN: Final = frozenset({"task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from", "revision"})
+_KNOWN: Final = frozenset(
+    {"task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from", "revision"}
+)
 
 
 @dataclass(frozen=True)
 class Learn:
-    """Learning that was asked for, as `--learn`, `--selector`, `--target`, `--context` and `--frozen` do."""
+    """Learning that was asked for, as `--learn`, `--selector`, `--target`, `--context` and
+    `--frozen` do."""
 
     path: Path
     selector: str = DEFAULT
@@ -53,8 +58,14 @@ class Learn:
 
     def session(self, task: Task, directory: Directory, mode: str, seed: int) -> LearningSession:
         """Open it. Raises EstimatesError, ValueError."""
-        declared = {a.name: a.compute_time for a in directory.actions.values()} if mode == LOCKSTEP else None
-        given = LearningSetting(self.path, self.selector, self.target, self.contexts, {}, self.frozen, declared)
+        declared = (
+            {a.name: a.compute_time for a in directory.actions.values()}
+            if mode == LOCKSTEP
+            else None
+        )
+        given = LearningSetting(
+            self.path, self.selector, self.target, self.contexts, {}, self.frozen, declared
+        )
         return LearningSession(task, given, seed)
 
 
@@ -85,7 +96,8 @@ class DepartOrder:
 
 
 def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> StartOrder:
-    """What a client asked for. Raises ValueError that names the field, what is wrong with it, and what would do."""
+    """What a client asked for. Raises ValueError that names the field, what is wrong with it, and
+    what would do."""
     _refuse_unknown(data)
     mode = data.get("mode") or REALTIME
     if mode not in MODES:
@@ -113,10 +125,13 @@ def read_depart(task: Task, data: Mapping[str, Any]) -> DepartOrder:
         raise ValueError("from: {run, record, going} is needed")
     for name in ("runs", "learn"):
         if data.get(name) is not None:
-            raise ValueError(f"{name}: a run from a point of another takes none; it stands where the other stood")
+            raise ValueError(
+                f"{name}: a run from a point of another takes none; it stands where the other stood"
+            )
     if data.get("mode", LOCKSTEP) != LOCKSTEP:
         raise ValueError(
-            "mode: a run from a point of another is simulated; a real cell does not stand where a marking says"
+            "mode: a run from a point of another is simulated; a real cell does not stand "
+            "where a marking says"
         )
     going = source.get("going", AGAIN)
     if isinstance(going, Mapping):
@@ -126,7 +141,12 @@ def read_depart(task: Task, data: Mapping[str, Any]) -> DepartOrder:
     seed = None if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED)
     record = _whole("from.record", source.get("record", 0), 0, 2**53)
     return DepartOrder(
-        source["run"], record, going, seed, read_parameters(task, _with_regime(data)), _pace(data.get("pace"))
+        source["run"],
+        record,
+        going,
+        seed,
+        read_parameters(task, _with_regime(data)),
+        _pace(data.get("pace")),
     )
 
 
@@ -136,7 +156,8 @@ def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in given.items():
         if name not in task.parameters:
             raise ValueError(
-                f"{task.name} has no parameter {_shown(name)}; it has: {', '.join(task.parameters) or 'none'}"
+                f"{task.name} has no parameter {_shown(name)}; it has: "
+                f"{', '.join(task.parameters) or 'none'}"
             )
         kind = type(task.parameters[name])
         if kind is float and type(value) is int:
@@ -162,7 +183,8 @@ def learned_of(session: LearningSession, *, interrupted: bool) -> dict[str, Any]
 
 
 def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
-    """What may be asked for when this task is started, with types and defaults; `text` is the task file's."""
+    """What may be asked for when this task is started, with types and defaults; `text` is the task
+    file's."""
     place = task.places.get(task.runs_place) if task.runs_place else None
     remarks = _remarks(text)
     return {
@@ -171,14 +193,21 @@ def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
         "seed": SEED,
         "modes": list(MODES),
         "parameters": [
-            {"name": name, "type": type(value).__name__, "default": value, "text": remarks.get(name, "")}
+            {
+                "name": name,
+                "type": type(value).__name__,
+                "default": value,
+                "text": remarks.get(name, ""),
+            }
             for name, value in task.parameters.items()
         ],
         "learn": {
             "selectors": list(RULES),
             "selector": DEFAULT,
             "contexts": list(usual_contexts(task).parts),
-            "estimates": sorted(p.stem for p in estimates.glob(f"*{SUFFIX}") if _NAME.fullmatch(p.stem)),
+            "estimates": sorted(
+                p.stem for p in estimates.glob(f"*{SUFFIX}") if _NAME.fullmatch(p.stem)
+            ),
         },
     }
 
@@ -186,7 +215,10 @@ def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
 def _refuse_unknown(data: Mapping[str, Any]) -> None:
     unknown = sorted(set(data) - _KNOWN)
     if unknown:
-        raise ValueError(f"start knows no {', '.join(map(_shown, unknown[:8]))}; it knows {', '.join(sorted(_KNOWN))}")
+        raise ValueError(
+            f"start knows no {', '.join(map(_shown, unknown[:8]))}; it knows "
+            f"{', '.join(sorted(_KNOWN))}"
+        )
 
 
 def _shown(value: Any) -> str:
@@ -212,7 +244,10 @@ def _pace(value: Any) -> float:
     if value is None:
         return 1.0
     if type(value) not in (int, float) or not 0 <= value <= 1000:
-        raise ValueError(f"pace: {_shown(value)} is no number from 0 (as fast as it goes) to 1000 times real time")
+        raise ValueError(
+            f"pace: {_shown(value)} is no number from 0 (as fast as it goes) to 1000 times "
+            "real time"
+        )
     return float(value)
 
 
@@ -220,7 +255,9 @@ def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
     given = data.get("parameters") or {}
     if not isinstance(given, Mapping):
         raise ValueError(f"parameters: {_shown(given)} is no object of values by name")
-    return {str(k): v for k, v in given.items()} | ({} if data.get("regime") is None else {"regime": data["regime"]})
+    return {str(k): v for k, v in given.items()} | (
+        {} if data.get("regime") is None else {"regime": data["regime"]}
+    )
 
 
 def _learn(given: Any, folder: Path) -> Learn:
@@ -229,19 +266,32 @@ def _learn(given: Any, folder: Path) -> Learn:
     name, selector = given.get("file"), given.get("selector") or DEFAULT
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ValueError(
-            f"learn.file: {_shown(name)} is no name of letters, digits, _ and -, 64 at most; it is kept in {folder}"
+            f"learn.file: {_shown(name)} is no name of letters, digits, _ and -, 64 at most; "
+            f"it is kept in {folder}"
         )
     if selector not in RULES:
         raise ValueError(f"learn.selector: {_shown(selector)} is none of {', '.join(RULES)}")
-    target, contexts, frozen = given.get("target"), given.get("contexts"), given.get("frozen", False)
+    target, contexts, frozen = (
+        given.get("target"),
+        given.get("contexts"),
+        given.get("frozen", False),
+    )
     if target is not None and (type(target) not in (int, float) or not 0 < target <= 1):
         raise ValueError(f"learn.target: {_shown(target)} is no reliability above 0 and at most 1")
-    if contexts is not None and not (isinstance(contexts, list) and all(isinstance(c, str) for c in contexts)):
+    if contexts is not None and not (
+        isinstance(contexts, list) and all(isinstance(c, str) for c in contexts)
+    ):
         raise ValueError("learn.contexts: a list of names or conditions is needed")
     if type(frozen) is not bool:
         raise ValueError(f"learn.frozen: {_shown(frozen)} is neither true nor false")
     parts = None if contexts is None else tuple(c for c in contexts if c.strip())
-    return Learn(folder / f"{name}{SUFFIX}", selector, None if target is None else float(target), parts, frozen)
+    return Learn(
+        folder / f"{name}{SUFFIX}",
+        selector,
+        None if target is None else float(target),
+        parts,
+        frozen,
+    )
 
 
 def _remarks(text: str) -> dict[str, str]:
@@ -251,7 +301,11 @@ def _remarks(text: str) -> dict[str, str]:
     except (TOMLKitError, KeyError, TypeError):
         return {}
     items = table.items() if hasattr(table, "items") else ()
-    return {name: item.trivia.comment.lstrip("# ").strip() for name, item in items if isinstance(item, Item)}
+    return {
+        name: item.trivia.comment.lstrip("# ").strip()
+        for name, item in items
+        if isinstance(item, Item)
+    }
 
 
 def _form(tasks: str, shipped: str, name: str, estimates: str) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""Makes the mission runs of a station: over the nodes, in lock step, or in lock step from a point of a recorded run."""
+"""Makes the mission runs of a station: over the nodes, in lock step, or in lock step from a point
+of a recorded run."""
 
 from __future__ import annotations
 
@@ -7,24 +8,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Engine
-from coordinator.experience.estimates_file import EstimatesError
-from coordinator.hmi.journals import task_of
-from coordinator.launch import SCRIPTED, Setting, Substitutes, load_object, lockstep_id, mission_id, with_runs
-from coordinator.mission.partners import FirstAlternative
-from coordinator.operator.departure import departed_store, departing, departure
-from coordinator.operator.mission_run import MissionRun
-from coordinator.operator.simulated_run import SimulatedRun
-from coordinator.operator.start_order import StartOrder, read_depart
-from coordinator.record.journal import JournalError, JournalWriter, read_journal
-from coordinator.record.recording import JournalStore, ReplayError, clock_reading
-from coordinator.record.runfolder import JOURNAL, header
-from coordinator.task import Task
-from coordinator.taskfile import TaskFileError
-from services.comm.directory import Directory, DirectoryError, parse
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.experience.estimates_file import EstimatesError
+from petrobot.coordinator.hmi.journals import task_of
+from petrobot.coordinator.launch import (
+    SCRIPTED,
+    Setting,
+    Substitutes,
+    load_object,
+    lockstep_id,
+    mission_id,
+    with_runs,
+)
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.operator.departure import departed_store, departing, departure
+from petrobot.coordinator.operator.mission_run import MissionRun
+from petrobot.coordinator.operator.simulated_run import SimulatedRun
+from petrobot.coordinator.operator.start_order import StartOrder, read_depart
+from petrobot.coordinator.record.journal import JournalError, JournalWriter, read_journal
+from petrobot.coordinator.record.recording import JournalStore, ReplayError, clock_reading
+from petrobot.coordinator.record.runfolder import JOURNAL, header
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import TaskFileError
+from petrobot.services.comm.directory import Directory, DirectoryError, parse
 
 FAULTS = (JournalError, ReplayError, TaskFileError, DirectoryError, EstimatesError, OSError)
-"""What a start may break on beside ValueError and KeyError: files that are not what they should be."""
+"""What a start may break on beside ValueError and KeyError: files that are not what they should
+be."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,9 @@ class Starting:
     def simulated(self, task: Task, text: str, order: StartOrder) -> SimulatedRun:
         """A run in lock step, with the laboratory loaded; for a thread of its own."""
         learn = order.learn
-        session = None if learn is None else learn.session(task, self.directory, order.mode, order.seed)
+        session = (
+            None if learn is None else learn.session(task, self.directory, order.mode, order.seed)
+        )
         selector = FirstAlternative() if session is None else session.selector
         setting = Setting(task, order.parameters, order.runs, order.seed, selector)
         given = {
@@ -61,10 +73,13 @@ class Starting:
         services = self.directory.source.read_text(encoding="utf-8")
         first = header(lockstep_id(setting), text, services, order.mode, given)
         store = JournalStore(JournalWriter(self.runs / mission_id(task) / JOURNAL, first), 0.0)
-        return SimulatedRun(self.directory, setting, store, order.pace, session, self._scripted(self.mock))
+        return SimulatedRun(
+            self.directory, setting, store, order.pace, session, self._scripted(self.mock)
+        )
 
     def departed(self, data: Mapping[str, Any]) -> tuple[Task, SimulatedRun]:
-        """A run in lock step from a point of a recorded one, and its task; for a thread of its own."""
+        """A run in lock step from a point of a recorded one, and its task; for a thread of its
+        own."""
         name = str(data["from"].get("run", "")) if isinstance(data["from"], Mapping) else ""
         if name not in {path.parent.name for path in self.runs.glob(f"*/{JOURNAL}")}:
             raise ValueError(f"from.run: there is no run {name!r}")

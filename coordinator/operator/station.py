@@ -1,8 +1,9 @@
-"""A coordinator that stays: one page over any number of mission runs, idle until the operator starts one.
+"""A coordinator that stays: one page over any number of mission runs, idle until the operator
+starts one.
 
-Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run, which a `MissionRun` or a
-`SimulatedRun` leads. What is idle is looked after here: which nodes are up, breakpoints and choices for the next run, and the
-emergency stop.
+Implements `coordinator.hmi.port.MissionPort`. The feed and who holds the controls outlive each run,
+which a `MissionRun` or a `SimulatedRun` leads. What is idle is looked after here: which nodes are
+up, breakpoints and choices for the next run, and the emergency stop.
 """
 
 from __future__ import annotations
@@ -13,24 +14,24 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from coordinator.analysing import Apart
-from coordinator.hmi.feed import Feed
-from coordinator.hmi.narrator import Narrator
-from coordinator.hmi.picture import picture
-from coordinator.hmi.store import StoreError, TaskStore, TaskText
-from coordinator.mission.asking import ask_all
-from coordinator.mission.partners import FirstAlternative
-from coordinator.mission.realtime import UnreachableError, credentials_of
-from coordinator.operator.controls import Answer, Controls, refusal
-from coordinator.operator.door_file import Door
-from coordinator.operator.emergency import CLEAR, STOP, order_all
-from coordinator.operator.simulated_run import SimulatedRun
-from coordinator.operator.start_order import LOCKSTEP, StartOrder, read_start
-from coordinator.operator.starting import FAULTS, Starting
-from coordinator.operator.watching import shown_selectors
-from coordinator.task import Task
-from coordinator.taskfile import TaskFileError, loads
-from services.comm.directory import Directory
+from petrobot.coordinator.analysing import Apart
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.hmi.narrator import Narrator
+from petrobot.coordinator.hmi.picture import picture
+from petrobot.coordinator.hmi.store import StoreError, TaskStore, TaskText
+from petrobot.coordinator.mission.asking import ask_all
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.mission.realtime import UnreachableError, credentials_of
+from petrobot.coordinator.operator.controls import Answer, Controls, refusal
+from petrobot.coordinator.operator.door_file import Door
+from petrobot.coordinator.operator.emergency import CLEAR, STOP, order_all
+from petrobot.coordinator.operator.simulated_run import SimulatedRun
+from petrobot.coordinator.operator.start_order import LOCKSTEP, StartOrder, read_start
+from petrobot.coordinator.operator.starting import FAULTS, Starting
+from petrobot.coordinator.operator.watching import shown_selectors
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import TaskFileError, loads
+from petrobot.services.comm.directory import Directory
 
 LOOK, PATIENCE = 2.0, 1.5
 """Seconds between questions to idle nodes, and for their answers."""
@@ -55,7 +56,8 @@ class Run(Protocol):
 
 
 class Station:
-    """One cell's coordinator; `runs` is where journals are kept, `door` gives the address that each run leaves in its folder."""
+    """One cell's coordinator; `runs` is where journals are kept, `door` gives the address that each
+    run leaves in its folder."""
 
     def __init__(
         self,
@@ -80,7 +82,9 @@ class Station:
         self._starting = self._stopped = False
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())
-        self.feed.replace(mission={"id": "", "state": "idle", "mode": "realtime", "starts": True, "file": ""})
+        self.feed.replace(
+            mission={"id": "", "state": "idle", "mode": "realtime", "starts": True, "file": ""}
+        )
 
     async def close(self) -> None:
         """Abort the run that goes on and leave."""
@@ -95,7 +99,7 @@ class Station:
             task.cancel()
         await asyncio.gather(going, return_exceptions=True)
 
-    # --- the port --------------------------------------------------------------------------------------------------
+    # --- the port -----------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
         """The state now."""
@@ -113,7 +117,9 @@ class Station:
         if verb in ("estop", "clear_estop"):
             self._stopped = verb == "estop"
         if verb in ("start", "load"):
-            return await self._guarded(self._start if verb == "start" else self._load, verb, who, data)
+            return await self._guarded(
+                self._start if verb == "start" else self._load, verb, who, data
+            )
         if verb == "estop" and isinstance(self._run, SimulatedRun):
             await self._run.command(who, verb, data)
             return await self._estop(who, data)  # whoever presses it means the real devices, too
@@ -144,8 +150,12 @@ class Station:
             return refusal("bad_data", f"{verb}: {fault}")
 
     def offers(self) -> Sequence[Mapping[str, Any]]:
-        """Every action that services.toml places, and whether its node is up and says that it offers it."""
-        return offered(self.directory, lambda action, node: action in self._nodes.get(node, {}).get("offers", ()))
+        """Every action that services.toml places, and whether its node is up and says that it
+        offers it."""
+        return offered(
+            self.directory,
+            lambda action, node: action in self._nodes.get(node, {}).get("offers", ()),
+        )
 
     async def form(self, name: str) -> Mapping[str, Any]:
         """What may be asked for when a task is started. Raises RefusedError."""
@@ -153,10 +163,11 @@ class Station:
         said: dict[str, Any] = json.loads(await self._apart.do("form", given))
         return said
 
-    # --- a task, and a run of it -----------------------------------------------------------------------------------
+    # --- a task, and a run of it --------------------------------------------------------------
 
     async def _load(self, who: str, data: Mapping[str, Any]) -> Answer:
-        """Show a task at its initial marking, to look at it and set breakpoints before it is started."""
+        """Show a task at its initial marking, to look at it and set breakpoints before it is
+        started."""
         if (busy := self._busy()) is not None:
             return busy
         try:
@@ -196,7 +207,9 @@ class Station:
         if not self._starting and self._run is None:
             return None
         mission = self.feed.state["mission"]
-        return refusal("running", f"{mission['id'] or 'a mission run'} goes on; abort it, or wait for its end")
+        return refusal(
+            "running", f"{mission['id'] or 'a mission run'} goes on; abort it, or wait for its end"
+        )
 
     async def _started(self, who: str, data: Mapping[str, Any]) -> Answer:
         if data.get("from") is not None:
@@ -213,7 +226,9 @@ class Station:
         if seen not in ("", text.revision):
             self._show(text, task)
             return refusal(
-                "changed", f"{name} was changed outside since it was shown; now it is shown as it is: start it again"
+                "changed",
+                f"{name} was changed outside since it was shown; now it is shown as it is: "
+                "start it again",
             )
         if (faulty := await self._faults(text)) is not None:
             return faulty
@@ -222,13 +237,17 @@ class Station:
         self._revision = text.revision
         order = read_start(task, data, self._starting_by.estimates)
         if order.mode == LOCKSTEP:
-            return self._simulated(await asyncio.to_thread(self._starting_by.simulated, task, text.text, order))
+            return self._simulated(
+                await asyncio.to_thread(self._starting_by.simulated, task, text.text, order)
+            )
         return await self._live(task, text.text, order)
 
     async def _departed(self, data: Mapping[str, Any]) -> Answer:
         """A simulated run from a point of a recorded one."""
         task, run = await asyncio.to_thread(self._starting_by.departed, data)
-        name = task.name if task.name in self._tasks.names() else ""  # its file may be gone, or called otherwise
+        name = (
+            task.name if task.name in self._tasks.names() else ""
+        )  # its file may be gone, or called otherwise
         if name != self._loaded:
             self._forget(name)
         return self._simulated(run)
@@ -273,13 +292,19 @@ class Station:
         except Exception as fault:  # a run that breaks must not take the station with it
             reason = f"{type(fault).__name__}: {fault}"
             self.feed.emit("mission", mission={"state": "error", "reason": reason})
-            notice = {"level": "error", "text": f"the mission run broke: {reason}", "at": self.feed.state["time"]}
+            notice = {
+                "level": "error",
+                "text": f"the mission run broke: {reason}",
+                "at": self.feed.state["time"],
+            }
             self.feed.emit("notice", notice=notice)
         finally:
             self._run = self._going = None
 
     def _narrator(self, task: Task) -> Narrator:
-        return Narrator(self.feed, task, {a: entry.node for a, entry in self.directory.actions.items()})
+        return Narrator(
+            self.feed, task, {a: entry.node for a, entry in self.directory.actions.items()}
+        )
 
     def _kept(self, task: Task) -> dict[str, Any]:
         """Parts of the snapshot that outlive a mission run."""
@@ -287,7 +312,7 @@ class Station:
         selectors = shown_selectors(task, FirstAlternative())
         return {"nodes": nodes, "controls": self.controls.plain(), "selectors": selectors}
 
-    # --- what may be said while idle ---------------------------------------------------------------------------------
+    # --- what may be said while idle ----------------------------------------------------------
 
     def _forget(self, name: str) -> None:
         self._loaded, self._revision = name, ""
@@ -301,7 +326,10 @@ class Station:
             return refusal("refused", f"no {data['element']} in the task")
         (self._stops.add if data.get("on", True) else self._stops.discard)(name)
         places = {place["name"] for place in self.feed.state["task"]["places"]}
-        named = [f"{'places' if stop in places else 'transitions'}.{stop}" for stop in sorted(self._stops)]
+        named = [
+            f"{'places' if stop in places else 'transitions'}.{stop}"
+            for stop in sorted(self._stops)
+        ]
         self.feed.emit("breakpoints", breakpoints=named)
         return {"ok": True}
 
@@ -309,7 +337,9 @@ class Station:
         """Choices for the next run."""
         name, action = str(data["primitive_task"]), data.get("action")
         known = self.feed.state["selectors"].get(name)
-        if known is None or (action is not None and action not in {a["action"] for a in known["alternatives"]}):
+        if known is None or (
+            action is not None and action not in {a["action"] for a in known["alternatives"]}
+        ):
             return refusal("refused", f"{action or name} is no alternative of {name}")
         self._choices.pop(name, None)
         if action is not None:
@@ -318,7 +348,9 @@ class Station:
         return {"ok": True}
 
     async def _estop(self, who: str, data: Mapping[str, Any]) -> Answer:
-        self.feed.emit("mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"})
+        self.feed.emit(
+            "mission", mission={"state": "stopped", "reason": f"emergency stop by {who}"}
+        )
         return await self._order(STOP)
 
     async def _clear_estop(self, who: str, data: Mapping[str, Any]) -> Answer:
@@ -331,13 +363,15 @@ class Station:
     async def _order(self, verb: str) -> Answer:
         """Straight to the nodes that own devices; an answer that is missing is told."""
         told = await order_all(self.directory, credentials_of(self.directory), verb)
-        missing = [f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered]
+        missing = [
+            f"{one.node}: {one.bus or one.why or 'no answer'}" for one in told if not one.answered
+        ]
         said = [f"{device} {answer}" for one in told for device, answer in one.devices.items()]
         if missing:
             return refusal("unreachable", "; ".join([*missing, *said]))
         return {"ok": True, "text": ", ".join(said)}
 
-    # --- who is there ------------------------------------------------------------------------------------------------
+    # --- who is there -------------------------------------------------------------------------
 
     async def _look(self) -> None:
         """Ask the nodes now and then while no run does; the first time at once."""
@@ -352,20 +386,26 @@ class Station:
         if self._run is not None:
             return  # the run tells itself
         for name, answer in self._nodes.items():
-            state = {"state": "up", "text": ""} if answer["up"] else {"state": "lost", "text": answer.get("why") or ""}
+            state = (
+                {"state": "up", "text": ""}
+                if answer["up"]
+                else {"state": "lost", "text": answer.get("why") or ""}
+            )
             if self.feed.state["nodes"].get(name) != state:
                 self.feed.emit("node", name=name, node=state)
 
 
 def _prepared(text: TaskText) -> Task:
-    """A task with what is derived from it once and takes long for a large net. Raises TaskFileError."""
+    """A task with what is derived from it once and takes long for a large net. Raises
+    TaskFileError."""
     task = loads(text.text, f"{text.name}.toml")
     picture(task)
     return task
 
 
 def offered(directory: Directory, up: Callable[[str, str], bool]) -> list[dict[str, Any]]:
-    """What the designer may choose from: every action of services.toml; `up(action, node)` says whether it is there now."""
+    """What the designer may choose from: every action of services.toml; `up(action, node)` says
+    whether it is there now."""
     return [
         {
             "action": name,

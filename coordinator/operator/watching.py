@@ -1,6 +1,8 @@
-"""What operators see beside the net: how nodes and devices are, what cameras see, how old set points are, what is learned.
+"""What operators see beside the net: how nodes and devices are, what cameras see, how old set
+points are, what is learned.
 
-Nodes are asked only while somebody looks, a few times a second; what they answer goes to the feed as plain data.
+Nodes are asked only while somebody looks, a few times a second; what they answer goes to the feed
+as plain data.
 """
 
 from __future__ import annotations
@@ -11,13 +13,13 @@ from collections.abc import Callable, Mapping
 from math import isfinite
 from typing import Any, Protocol
 
-from coordinator.engine import Corrected, Instruction, RunRecorded, State, Stimulus
-from coordinator.hmi.feed import Feed
-from coordinator.mission.mission import Mission
-from coordinator.mission.partners import FirstAlternative
-from coordinator.task import Task
-from services.comm.messages import Command
-from services.comm.notice import Progress
+from petrobot.coordinator.engine import Corrected, Instruction, RunRecorded, State, Stimulus
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.messages import Command
+from petrobot.services.comm.notice import Progress
 
 POLL = 0.2
 """Seconds between questions to a node, each asked only when the one before is answered."""
@@ -38,7 +40,8 @@ def shown_selectors(task: Task, selector: FirstAlternative) -> dict[str, Any]:
 
 
 def shown_alternatives(task: Task, selector: FirstAlternative, name: str) -> list[dict[str, Any]]:
-    """The alternatives of one primitive task: {action, probability, reliability, cost, j}, as far as known."""
+    """The alternatives of one primitive task: {action, probability, reliability, cost, j}, as far
+    as known."""
     figures = selector.figures(name)
     return [{"action": a, **figures.get(a, {})} for a in task.primitive_tasks[name].alternatives]
 
@@ -56,10 +59,16 @@ class Watched(Protocol):
 
 
 class Watching:
-    """Asks the nodes and observes the executor for one mission run; `watched` says whether anybody looks."""
+    """Asks the nodes and observes the executor for one mission run; `watched` says whether anybody
+    looks."""
 
     def __init__(
-        self, shell: Watched, feed: Feed, selector: FirstAlternative, origin: float, watched: Callable[[], bool]
+        self,
+        shell: Watched,
+        feed: Feed,
+        selector: FirstAlternative,
+        origin: float,
+        watched: Callable[[], bool],
     ) -> None:
         """`origin` is the shell's time at which the mission's clock was 0 (s)."""
         self._shell = shell
@@ -81,7 +90,7 @@ class Watching:
         self._polling.cancel()
         await asyncio.gather(self._polling, return_exceptions=True)
 
-    # --- questions ---------------------------------------------------------------------------------------------------
+    # --- questions ----------------------------------------------------------------------------
 
     def ask(self, node: str, verb: str) -> None:
         """Send a node an operator's command that is no stimulus: nothing waits for its answer."""
@@ -116,7 +125,7 @@ class Watching:
             self._asked[node, verb] = now
             self.ask(node, verb)
 
-    # --- answers -----------------------------------------------------------------------------------------------------
+    # --- answers ------------------------------------------------------------------------------
 
     def _told(self, data: Mapping[str, Any]) -> None:
         """A node's answer about its devices: their states, or the pictures of those that see."""
@@ -134,7 +143,11 @@ class Watching:
 
     def _picture(self, name: str, picture: Mapping[str, Any]) -> None:
         if isinstance(picture.get("data"), bytes):
-            self._feed.emit("image", name=name, image={**picture, "data": b64encode(picture["data"]).decode("ascii")})
+            self._feed.emit(
+                "image",
+                name=name,
+                image={**picture, "data": b64encode(picture["data"]).decode("ascii")},
+            )
 
     def _device(self, name: str, state: Mapping[str, Any]) -> None:
         if not state:
@@ -153,9 +166,11 @@ class Watching:
         now = self._shell.now() - self._origin
         for stream in self._directory.streams.values():
             if stream.to == device and age <= 10 * stream.period:
-                self._feed.emit("setpoint", stream=stream.name, samples=[[round(now, 3), round(age, 6)]])
+                self._feed.emit(
+                    "setpoint", stream=stream.name, samples=[[round(now, 3), round(age, 6)]]
+                )
 
-    # --- an observer of the executor: what is learned ----------------------------------------------------------------
+    # --- an observer of the executor: what is learned -----------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
         """Show what was learned of a run's end."""
@@ -177,20 +192,33 @@ class Watching:
         shown = self._shown(name)
         if len(shown) > 1:
             for figure, word in IN_CURVES.items():
-                self._curve(name, figure, word, {a["action"]: a[figure] for a in shown if figure in a})
+                self._curve(
+                    name, figure, word, {a["action"]: a[figure] for a in shown if figure in a}
+                )
 
     def _curve(self, name: str, figure: str, word: str, values: dict[str, float]) -> None:
         """One more trial of a primitive task on one of its curves."""
         key = name if word == "probability" else f"{name}: {word}"
         rows = [*self._curves.get(key, []), values]
-        trial = len(rows) if len(rows) <= CURVE_KEPT else self._feed.state["reports"][key]["columns"][0][-1] + 1
+        trial = (
+            len(rows)
+            if len(rows) <= CURVE_KEPT
+            else self._feed.state["reports"][key]["columns"][0][-1] + 1
+        )
         rows = rows[-CURVE_KEPT:]
         self._curves[key] = rows
         series = sorted({action for row in rows for action in row})
         trials = list(range(trial - len(rows) + 1, trial + 1))
         columns = [trials, *([row.get(action) for row in rows] for action in series)]
         title = f"{name}: {word} of each alternative"
-        report = {"kind": "curve", "title": title, "x": "trial", "y": word, "series": series, "columns": columns}
+        report = {
+            "kind": "curve",
+            "title": title,
+            "x": "trial",
+            "y": word,
+            "series": series,
+            "columns": columns,
+        }
         self._feed.emit("report", name=key, report=report)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:

@@ -1,4 +1,5 @@
-"""A journal for other tools: JSON lines (everything) and XES (process mining: one trace, an event for each firing and run)."""
+"""A journal for other tools: JSON lines (everything) and XES (process mining: one trace, an event
+for each firing and run)."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from xml.sax.saxutils import quoteattr
 
-from coordinator.engine import Corrected, Fired, RunRecorded, StartRun, to_plain
-from coordinator.record.journal import Journal
-from coordinator.record.recording import Step
-from services.comm.json_text import json_text
+from petrobot.coordinator.engine import Corrected, Fired, RunRecorded, StartRun, to_plain
+from petrobot.coordinator.record.journal import Journal
+from petrobot.coordinator.record.recording import Step
+from petrobot.services.comm.json_text import json_text
 
 
 def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
@@ -27,8 +28,11 @@ def jsonl(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
 
 
 def xes(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
-    """The run as an XES log (IEEE 1849-2016) with one trace; times count from the date in the header."""
-    origin = datetime.fromisoformat(journal.header.get("date", "1970-01-01T00:00:00+00:00")).astimezone(UTC)
+    """The run as an XES log (IEEE 1849-2016) with one trace; times count from the date in the
+    header."""
+    origin = datetime.fromisoformat(
+        journal.header.get("date", "1970-01-01T00:00:00+00:00")
+    ).astimezone(UTC)
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     yield '<log xes.version="1849-2016" xes.features="" xmlns="http://www.xes-standard.org/">'
     for name, prefix in (
@@ -37,8 +41,14 @@ def xes(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
         ("Lifecycle", "lifecycle"),
         ("Organizational", "org"),
     ):
-        yield f'  <extension name="{name}" prefix="{prefix}" uri="http://www.xes-standard.org/{prefix}.xesext"/>'
-    yield f'  <trace><string key="concept:name" value={quoteattr(str(journal.header.get("mission", "")))}/>'
+        yield (
+            f'  <extension name="{name}" prefix="{prefix}" '
+            f'uri="http://www.xes-standard.org/{prefix}.xesext"/>'
+        )
+    yield (
+        '  <trace><string key="concept:name" '
+        f"value={quoteattr(str(journal.header.get('mission', '')))}/>"
+    )
     for step in steps:
         when = (origin + timedelta(seconds=step.time)).isoformat(timespec="milliseconds")
         for instruction in step.instructions:
@@ -51,15 +61,34 @@ def xes(journal: Journal, steps: Iterator[Step]) -> Iterator[str]:
 
 def _xes_event(instruction: object) -> str | None:
     if isinstance(instruction, Fired):
-        return _strings({"concept:name": instruction.transition, "lifecycle:transition": "complete", "kind": "firing"})
+        return _strings(
+            {
+                "concept:name": instruction.transition,
+                "lifecycle:transition": "complete",
+                "kind": "firing",
+            }
+        )
     if isinstance(instruction, StartRun):
         names = {"concept:name": instruction.place, "lifecycle:transition": "start", "kind": "run"}
-        return _strings({**names, "concept:instance": instruction.run, "org:resource": instruction.action})
+        return _strings(
+            {**names, "concept:instance": instruction.run, "org:resource": instruction.action}
+        )
     if isinstance(instruction, RunRecorded):
-        names = {"concept:name": instruction.place, "lifecycle:transition": "complete", "kind": "run"}
+        names = {
+            "concept:name": instruction.place,
+            "lifecycle:transition": "complete",
+            "kind": "run",
+        }
         status = "none" if instruction.status is None else instruction.status.value
         reason = {"status": status, "cause": instruction.cause}
-        return _strings({**names, "concept:instance": instruction.run, "org:resource": instruction.action, **reason})
+        return _strings(
+            {
+                **names,
+                "concept:instance": instruction.run,
+                "org:resource": instruction.action,
+                **reason,
+            }
+        )
     if isinstance(instruction, Corrected):
         names = {
             "concept:name": f"verdict on {instruction.place}",
@@ -67,9 +96,18 @@ def _xes_event(instruction: object) -> str | None:
             "kind": "verdict",
         }
         reason = {"status": instruction.status.value, "cause": instruction.cause}
-        return _strings({**names, "concept:instance": instruction.run, "org:resource": instruction.action, **reason})
+        return _strings(
+            {
+                **names,
+                "concept:instance": instruction.run,
+                "org:resource": instruction.action,
+                **reason,
+            }
+        )
     return None
 
 
 def _strings(values: dict[str, str]) -> str:
-    return "".join(f"<string key={quoteattr(k)} value={quoteattr(v)}/>" for k, v in values.items() if v)
+    return "".join(
+        f"<string key={quoteattr(k)} value={quoteattr(v)}/>" for k, v in values.items() if v
+    )

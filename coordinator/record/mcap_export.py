@@ -1,7 +1,8 @@
-"""A journal as an MCAP file (mcap.dev), to be looked at in Foxglove beside other recordings. Needs the package `mcap`.
+"""A journal as an MCAP file (mcap.dev), to be looked at in Foxglove beside other recordings. Needs
+the package `mcap`.
 
-One channel each for markings, firings, runs and reports, as JSON messages with a schema; a message's time is that of its stimulus,
-counted from the date in the journal's header.
+One channel each for markings, firings, runs and reports, as JSON messages with a schema; a
+message's time is that of its stimulus, counted from the date in the journal's header.
 """
 
 from __future__ import annotations
@@ -13,17 +14,20 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.engine import Corrected, Fired, Instruction, Report, RunRecorded, StartRun
-from coordinator.net import Net
-from coordinator.record.journal import Journal
-from coordinator.record.recording import Step
-from services.comm.json_text import json_text
-from services.comm.whole_file import write_whole
+from petrobot.coordinator.engine import Corrected, Fired, Instruction, Report, RunRecorded, StartRun
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.record.journal import Journal
+from petrobot.coordinator.record.recording import Step
+from petrobot.services.comm.json_text import json_text
+from petrobot.services.comm.whole_file import write_whole
 
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
 CHANNELS: Final[Mapping[str, Mapping[str, Any]]] = {
-    "marking": {"tokens": {"type": "object", "additionalProperties": {"type": "integer"}}, "stimulus": _TEXT},
+    "marking": {
+        "tokens": {"type": "object", "additionalProperties": {"type": "integer"}},
+        "stimulus": _TEXT,
+    },
     "firing": {"transition": _TEXT, "cause": _TEXT, "number": _NUMBER},
     "run": {
         "run": _TEXT,
@@ -50,22 +54,30 @@ def write_mcap(path: Path, journal: Journal, net: Net, steps: Iterable[Step]) ->
     try:
         writing = importlib.import_module("mcap.writer")
     except ImportError:
-        raise McapMissingError("MCAP files need the package mcap: pip install 'petrobot[mcap]'") from None
+        raise McapMissingError(
+            "MCAP files need the package mcap: pip install 'petrobot[mcap]'"
+        ) from None
     count = 0
     with io.BytesIO() as file:
         writer = writing.Writer(file)
         writer.start(profile="petrobot", library="petrobot")
-        writer.add_metadata("petrobot", {k: str(journal.header[k]) for k in ("mission", "mode", "date", "seed")})
+        writer.add_metadata(
+            "petrobot", {k: str(journal.header[k]) for k in ("mission", "mode", "date", "seed")}
+        )
         channels = {name: _channel(writer, name) for name in CHANNELS}
         for count, (name, time, message) in enumerate(messages(journal, net, steps), 1):
             data = json_text(message, ensure_ascii=False).encode()
-            writer.add_message(channels[name], log_time=time, publish_time=time, sequence=count, data=data)
+            writer.add_message(
+                channels[name], log_time=time, publish_time=time, sequence=count, data=data
+            )
         writer.finish()
         write_whole(path, file.getvalue())
     return count
 
 
-def messages(journal: Journal, net: Net, steps: Iterable[Step]) -> Iterator[tuple[str, int, dict[str, Any]]]:
+def messages(
+    journal: Journal, net: Net, steps: Iterable[Step]
+) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Channel, time (ns since 1970) and body of each message, in order."""
     origin = round(datetime.fromisoformat(journal.header["date"]).timestamp() * 1e9)
     for step in steps:
@@ -85,14 +97,24 @@ def _told(one: Instruction) -> tuple[str, dict[str, Any]] | None:
         return "run", {"run": one.run, "place": one.place, "action": one.action, "phase": "started"}
     if isinstance(one, RunRecorded):
         status = "none" if one.status is None else one.status.value
-        how = {"status": status, "cause": one.cause, "text": one.text, "executed": one.executed.value}
+        how = {
+            "status": status,
+            "cause": one.cause,
+            "text": one.text,
+            "executed": one.executed.value,
+        }
         which = {"run": one.run, "place": one.place, "action": one.action, "phase": "ended"}
         return "run", {**which, **how, "seconds": one.seconds}
     if isinstance(one, Corrected):
         which = {"run": one.run, "place": one.place, "action": one.action, "phase": "judged"}
         return "run", {**which, "status": one.status.value, "cause": one.cause, "text": one.text}
     if isinstance(one, Report):
-        return "report", {"severity": one.severity.value, "key": one.key, "text": one.text, "of": one.of}
+        return "report", {
+            "severity": one.severity.value,
+            "key": one.key,
+            "text": one.text,
+            "of": one.of,
+        }
     return None
 
 

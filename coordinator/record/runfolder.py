@@ -1,4 +1,5 @@
-"""Folders of mission runs: where a journal is kept, how a run is named on the command line, and how long it is kept."""
+"""Folders of mission runs: where a journal is kept, how a run is named on the command line, and how
+long it is kept."""
 
 from __future__ import annotations
 
@@ -14,15 +15,19 @@ JOURNAL = "run.journal"
 RESULT = "result.json"
 DEFAULT = Path("runs")
 TIMELESS = "timeless"
-"""Key of a journal's header: what becomes of a net that fires without end; it paused in runs whose header has no such key."""
+"""Key of a journal's header: what becomes of a net that fires without end; it paused in runs whose
+header has no such key."""
 
 
 class NoRunError(Exception):
     """No such mission run; the text says which there are."""
 
 
-def header(mission: str, task: str, services: str, mode: str, rest: Mapping[str, Any]) -> dict[str, Any]:
-    """A journal's header: the texts of task file and services.toml, versions, and whatever else the run was given."""
+def header(
+    mission: str, task: str, services: str, mode: str, rest: Mapping[str, Any]
+) -> dict[str, Any]:
+    """A journal's header: the texts of task file and services.toml, versions, and whatever else the
+    run was given."""
     return {
         "mission": mission,
         "task": task,
@@ -36,7 +41,8 @@ def header(mission: str, task: str, services: str, mode: str, rest: Mapping[str,
 
 
 def journal_of(name: str, folder: Path = DEFAULT) -> Path:
-    """The journal of a run given by its id, by its folder, by its journal's path, or as `last`. Raises NoRunError."""
+    """The journal of a run given by its id, by its folder, by its journal's path, or as `last`.
+    Raises NoRunError."""
     path = Path(name)
     candidates = [path, path / JOURNAL, folder / name / JOURNAL]
     if name == "last":
@@ -50,9 +56,11 @@ def journal_of(name: str, folder: Path = DEFAULT) -> Path:
 
 
 def retain(folder: Path, keep: int) -> list[str]:
-    """Remove the oldest ended runs beyond the newest `keep`; a run without result is never removed. Gives their names."""
+    """Remove the oldest ended runs beyond the newest `keep`; a run without result is never removed.
+    Gives their names."""
     ended = sorted(
-        (p for p in folder.glob(f"*/{RESULT}") if (p.parent / JOURNAL).exists()), key=lambda p: p.stat().st_mtime
+        (p for p in folder.glob(f"*/{RESULT}") if (p.parent / JOURNAL).exists()),
+        key=lambda p: p.stat().st_mtime,
     )
     removed = [path.parent for path in ended[: max(0, len(ended) - keep)]]
     for path in removed:

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from coordinator.engine import State
-from coordinator.engine.instructions import Corrected, Fired, Instruction, Report, RunRecorded, StartRun
-from coordinator.engine.stimuli import Stimulus
-from coordinator.task import Status
-from services.comm.notice import Progress
+from petrobot.coordinator.engine import State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Fired,
+    Instruction,
+    Report,
+    RunRecorded,
+    StartRun,
+)
+from petrobot.coordinator.engine.stimuli import Stimulus
+from petrobot.coordinator.task import Status
+from petrobot.services.comm.notice import Progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,19 +57,35 @@ class Timeline:
         """Keep starts, ends and firings."""
         time = self._since(now)
         if isinstance(instruction, StartRun):
-            self.bars[instruction.run] = Bar(instruction.run, instruction.place, instruction.action, time)
+            self.bars[instruction.run] = Bar(
+                instruction.run, instruction.place, instruction.action, time
+            )
         elif isinstance(instruction, RunRecorded):
-            bar = self.bars.get(instruction.run, Bar(instruction.run, instruction.place, instruction.action, time))
+            bar = self.bars.get(
+                instruction.run, Bar(instruction.run, instruction.place, instruction.action, time)
+            )
             self.bars[instruction.run] = replace(
-                bar, ended=time, status=instruction.status, cause=instruction.cause, text=instruction.text
+                bar,
+                ended=time,
+                status=instruction.status,
+                cause=instruction.cause,
+                text=instruction.text,
             )
         elif isinstance(instruction, Corrected) and instruction.run in self.bars:
             judged = (instruction.status, instruction.cause, instruction.text)
             bar = self.bars[instruction.run]
-            self.bars[instruction.run] = replace(bar, status=judged[0], cause=judged[1], text=judged[2] or bar.text)
+            self.bars[instruction.run] = replace(
+                bar, status=judged[0], cause=judged[1], text=judged[2] or bar.text
+            )
         elif isinstance(instruction, Fired):
             self.firings.append(
-                Firing(time, instruction.number, instruction.transition, instruction.cause, instruction.after)
+                Firing(
+                    time,
+                    instruction.number,
+                    instruction.transition,
+                    instruction.cause,
+                    instruction.after,
+                )
             )
         elif isinstance(instruction, Report):
             self.reports.append((time, instruction))

@@ -1,5 +1,6 @@
-"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures, and two campaigns compared."""
+"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures, and two
+campaigns compared."""
 
-from coordinator.report.run_page import report_html
+from petrobot.coordinator.report.run_page import report_html
 
 __all__ = ["report_html"]

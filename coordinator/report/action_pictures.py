@@ -1,16 +1,17 @@
-"""Pictures of actions that reports of runs and of campaigns share: choices and J over trials, R and C with their intervals."""
+"""Pictures of actions that reports of runs and of campaigns share: choices and J over trials, R and
+C with their intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from coordinator.campaign.observed import regime_of
-from coordinator.learning.estimate import Key, Tally
-from coordinator.learning.learning import Estimates
-from coordinator.report import charts
-from coordinator.report.trials import Curves, Trials
-from coordinator.task import Task
+from petrobot.coordinator.campaign.observed import regime_of
+from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.report import charts
+from petrobot.coordinator.report.trials import Curves, Trials
+from petrobot.coordinator.task import Task
 
 Pictures = dict[str, tuple[str, str]]
 """Heading and SVG by file name."""
@@ -40,20 +41,39 @@ def action_pictures(task: Task, estimates: Estimates) -> Pictures:
     """R and C of every action that ran, by primitive task."""
     out: Pictures = {}
     for primitive in task.primitive_tasks.values():
-        known = [(k, t) for k, t in sorted(estimates.tallies.items()) if k.primitive_task == primitive.name and t.runs]
+        known = [
+            (k, t)
+            for k, t in sorted(estimates.tallies.items())
+            if k.primitive_task == primitive.name and t.runs
+        ]
         reliability = [_reliability(key, tally) for key, tally in known]
-        cost = [_cost(key, tally, primitive.cost) for key, tally in known if tally.cost(primitive.cost).n]
+        cost = [
+            _cost(key, tally, primitive.cost)
+            for key, tally in known
+            if tally.cost(primitive.cost).n
+        ]
         if reliability:
             title = f"{primitive.name}: R with 95 % interval"
-            put(out, f"reliability {primitive.name}", ACTIONS, charts.intervals(title, "R", reliability, unit=True))
+            put(
+                out,
+                f"reliability {primitive.name}",
+                ACTIONS,
+                charts.intervals(title, "R", reliability, unit=True),
+            )
         if cost:
             title = f"{primitive.name}: mean cost with 95 % interval"
-            put(out, f"cost {primitive.name}", ACTIONS, charts.intervals(title, _unit(primitive.cost), cost))
+            put(
+                out,
+                f"cost {primitive.name}",
+                ACTIONS,
+                charts.intervals(title, _unit(primitive.cost), cost),
+            )
     return out
 
 
 LATENCY = "latency"
-"""Numbers of results whose names begin so are drawn: seconds from an image to the set point that it led to, and the like."""
+"""Numbers of results whose names begin so are drawn: seconds from an image to the set point that it
+led to, and the like."""
 
 
 def add_latencies(found: dict[str, list[float]], action: str, values: Mapping[str, Any]) -> None:
@@ -83,10 +103,15 @@ def _cost(key: Key, tally: Tally, measure: str) -> Row:
 
 
 def _unit(measure: str) -> str:
-    return {"wall": "C (s)", "cpu": "C (s of computing)"}.get(measure, f"C ({measure.removeprefix('value:')})")
+    return {"wall": "C (s)", "cpu": "C (s of computing)"}.get(
+        measure, f"C ({measure.removeprefix('value:')})"
+    )
 
 
 def _settled(trials: Trials) -> Curves:
     """J curves without the first few trials, where a single failure hides everything else."""
     last = max((points[-1][0] for points in trials.objective.values()), default=0.0)
-    return {a: [p for p in points if p[0] > 0.02 * last] or points for a, points in trials.objective.items()}
+    return {
+        a: [p for p in points if p[0] > 0.02 * last] or points
+        for a, points in trials.objective.items()
+    }

@@ -1,4 +1,5 @@
-"""A campaign as one HTML page: shares, choices and J over trials, R and C of actions, the task's own pictures, faults."""
+"""A campaign as one HTML page: shares, choices and J over trials, R and C of actions, the task's
+own pictures, faults."""
 
 from __future__ import annotations
 
@@ -6,15 +7,15 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from coordinator.campaign.observed import regime_of
-from coordinator.campaign.plan import Plan
-from coordinator.campaign.rows import Row
-from coordinator.campaign.summary import Summary
-from coordinator.campaign.throws import Throw
-from coordinator.learning.objective import Figures, break_even, pareto
-from coordinator.record.timeline import Bar, Timeline
-from coordinator.report import charts
-from coordinator.report.action_pictures import (
+from petrobot.coordinator.campaign.observed import regime_of
+from petrobot.coordinator.campaign.plan import Plan
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.summary import Summary
+from petrobot.coordinator.campaign.throws import Throw
+from petrobot.coordinator.learning.objective import Figures, break_even, pareto
+from petrobot.coordinator.record.timeline import Bar, Timeline
+from petrobot.coordinator.report import charts
+from petrobot.coordinator.report.action_pictures import (
     ACTIONS,
     TRIALS,
     action_pictures,
@@ -23,12 +24,12 @@ from coordinator.report.action_pictures import (
     put,
     trial_pictures,
 )
-from coordinator.report.combinations import by_combination
-from coordinator.report.page import gallery, html_page, section, table, text
-from coordinator.report.plots import declared
-from coordinator.report.run_page import gantt_svg
-from coordinator.report.trials import learned_curves, objective_curves
-from coordinator.task import Status, Task
+from petrobot.coordinator.report.combinations import by_combination
+from petrobot.coordinator.report.page import gallery, html_page, section, table, text
+from petrobot.coordinator.report.plots import declared
+from petrobot.coordinator.report.run_page import gantt_svg
+from petrobot.coordinator.report.trials import learned_curves, objective_curves
+from petrobot.coordinator.task import Status, Task
 
 DIFFERENCES = "Differences, paired"
 AHEAD = (DIFFERENCES, TRIALS, ACTIONS)
@@ -40,20 +41,25 @@ WORST = 40
 
 
 class CampaignReport:
-    """Pictures and page of a campaign. `pictures` holds every picture by file name, with its heading."""
+    """Pictures and page of a campaign. `pictures` holds every picture by file name, with its
+    heading."""
 
-    def __init__(self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]) -> None:
+    def __init__(
+        self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]
+    ) -> None:
         self.plan, self.task, self.rows = plan, task, rows
         self.summary = Summary.of(task, rows, options=plan.options)
         self.trials = objective_curves(task, rows)
         learned_curves(plan, rows, self.trials)
         word = "choice probability" if plan.batch else "share of choices"
-        self.pictures = trial_pictures(self.trials, word) | action_pictures(task, self.summary.estimates)
+        self.pictures = trial_pictures(self.trials, word) | action_pictures(
+            task, self.summary.estimates
+        )
         self._own(plots)
         self._times()
         self._gantt()
 
-    # --- pictures ----------------------------------------------------------------------------------------------------
+    # --- pictures -----------------------------------------------------------------------------
 
     def _add(self, name: str, heading: str, svg: str) -> None:
         put(self.pictures, name, heading, svg)
@@ -82,17 +88,28 @@ class CampaignReport:
         block = next((row.block for row in self.rows if row.throw is not None), None)
         chosen = [row for row in self.rows if row.block == block and row.throw is not None]
         if chosen:
-            self._add("gantt", f"Runs over time: first cell, seed {chosen[0].seed}", gantt_svg(timeline_of(chosen)))
+            self._add(
+                "gantt",
+                f"Runs over time: first cell, seed {chosen[0].seed}",
+                gantt_svg(timeline_of(chosen)),
+            )
         bad = next(
-            (r for r in self.rows if r.throw and r.throw.status == Status.ERROR.value and r.block != block), None
+            (
+                r
+                for r in self.rows
+                if r.throw and r.throw.status == Status.ERROR.value and r.block != block
+            ),
+            None,
         )
         if bad is not None:
             same = [row for row in self.rows if row.block == bad.block and row.throw is not None]
             self._add(
-                "gantt error", f"Runs over time: a cell with an error, seed {bad.seed}", gantt_svg(timeline_of(same))
+                "gantt error",
+                f"Runs over time: a cell with an error, seed {bad.seed}",
+                gantt_svg(timeline_of(same)),
             )
 
-    # --- page --------------------------------------------------------------------------------------------------------
+    # --- page ---------------------------------------------------------------------------------
 
     def html(self, more: Sequence[str] = ()) -> str:
         """The page; `more` are further sections, put behind the numbers."""
@@ -106,7 +123,10 @@ class CampaignReport:
             *more,
             *(section(h, self._gallery(h)) for h in headings if h in AHEAD),
             section("Actions", "".join(self._judged())),
-            *(section(f"Combinations, regime {r or '-'}", table(rows)) for r, rows in self._combinations().items()),
+            *(
+                section(f"Combinations, regime {r or '-'}", table(rows))
+                for r, rows in self._combinations().items()
+            ),
             *(section(h, self._gallery(h)) for h in headings if h not in AHEAD),
             section("Ends of runs and their causes", table(self._causes())),
             section("What went wrong, firing by firing", self._worst()),
@@ -139,11 +159,14 @@ class CampaignReport:
             front = {f.action for f in pareto(judged.figures)}
             best = next((f for f in judged.figures if f.action == judged.best), None)
             rows = [_action_row(f, front, best) for f in judged.figures]
-            out.append(f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}")
+            out.append(
+                f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}"
+            )
         return out
 
     def _combinations(self) -> dict[str, list[dict[str, Any]]]:
-        """The best combinations of actions by regime, of throws in which each primitive task ran; none of a single one."""
+        """The best combinations of actions by regime, of throws in which each primitive task ran;
+        none of a single one."""
         found = {}
         for regime in self.summary.by_regime:
             judged = by_combination(self.task, [row for row in self.rows if row.regime == regime])
@@ -169,7 +192,11 @@ class CampaignReport:
         ]
 
     def _worst(self) -> str:
-        bad = [row for row in self.rows if row.throw is not None and row.throw.status != Status.SUCCESS.value]
+        bad = [
+            row
+            for row in self.rows
+            if row.throw is not None and row.throw.status != Status.SUCCESS.value
+        ]
         rows = [
             {
                 "n": row.n,
@@ -185,13 +212,17 @@ class CampaignReport:
         if not rows:
             return "<p>Nothing: every run met its specification.</p>"
         left = f"<p>{len(bad) - WORST} more in the table.</p>" if len(bad) > WORST else ""
-        return f"<details open><summary>{len(bad)} runs of the task</summary>{table(rows)}{left}</details>"
+        return (
+            f"<details open><summary>{len(bad)} runs of the "
+            f"task</summary>{table(rows)}{left}</details>"
+        )
 
 
 def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, Any]:
     even = break_even(best, f) if best is not None and best.action != f.action else None
     return {
-        "action": f.action + (" (lowest J)" if best is not None and f.action == best.action else ""),
+        "action": f.action
+        + (" (lowest J)" if best is not None and f.action == best.action else ""),
         "runs": f.runs,
         "R in its hardest regime": f.reliability,
         "95 %": f"{f.lower:.3f} to {f.upper:.3f}",
@@ -214,7 +245,9 @@ def timeline_of(rows: Sequence[Row]) -> Timeline:
             begun = row.throw.begun + run.begun
             key = f"{run.place} of run {row.k}" + (f" ({i})" if i else "")
             status = Status(run.status) if run.status else None
-            made.bars[key] = Bar(key, run.place, run.action, begun, begun + run.took, status, run.cause, run.text)
+            made.bars[key] = Bar(
+                key, run.place, run.action, begun, begun + run.took, status, run.cause, run.text
+            )
     return made
 
 
@@ -223,9 +256,19 @@ def story(throw: Throw) -> str:
     ends = sorted(throw.runs, key=lambda run: run.begun + run.took)
     parts = []
     for run in ends:
-        how = (run.status or "preempted").upper() if run.status != Status.SUCCESS.value else "success"
-        why = f" ({run.cause}: {run.text})" if run.cause and run.text else f" ({run.cause})" if run.cause else ""
-        parts.append(f"{run.begun + run.took:.2f} s {run.action} {how}{why}, {run.taken or 'not taken'}")
+        how = (
+            (run.status or "preempted").upper() if run.status != Status.SUCCESS.value else "success"
+        )
+        why = (
+            f" ({run.cause}: {run.text})"
+            if run.cause and run.text
+            else f" ({run.cause})"
+            if run.cause
+            else ""
+        )
+        parts.append(
+            f"{run.begun + run.took:.2f} s {run.action} {how}{why}, {run.taken or 'not taken'}"
+        )
     return "; ".join(parts)
 
 
@@ -258,7 +301,10 @@ def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
         ]
         if "difference" in row
     ]
-    lead = f"<p>{found['pairs']} pairs of throws with equal seeds; {found['left_out']} throws without a partner.</p>"
+    lead = (
+        f"<p>{found['pairs']} pairs of throws with equal seeds; {found['left_out']} "
+        "throws without a partner.</p>"
+    )
     return section(f"{one} against {other}", lead + table(shares) + table(rest))
 
 
@@ -270,7 +316,9 @@ def _interval(ends: Sequence[float]) -> str:
     return f"{text(ends[0])} to {text(ends[1])}"
 
 
-def comparison_pictures(found: Mapping[str, Any], one: str, other: str) -> dict[str, tuple[str, str]]:
+def comparison_pictures(
+    found: Mapping[str, Any], one: str, other: str
+) -> dict[str, tuple[str, str]]:
     """Differences with their intervals."""
     rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
     rows += [(_objective_name(name), "", *_ends(row)) for name, row in found["J"].items()]

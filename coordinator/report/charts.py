@@ -1,7 +1,7 @@
 """Small charts as SVG: lines over trials, intervals by name, points, segments and histograms.
 
-Colours are those of the page they stand in, by day and by night (`coordinator/report/colours.py`, whose `standalone` makes a file
-of its own of a chart); every mark also differs by shape or dash.
+Colours are those of the page they stand in, by day and by night (`coordinator/report/colours.py`,
+whose `standalone` makes a file of its own of a chart); every mark also differs by shape or dash.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from html import escape
 from itertools import pairwise
 
-from coordinator.report.colours import SERIES
+from petrobot.coordinator.report.colours import SERIES
 
 PALETTE = tuple(f"var(--{name})" for name in SERIES)
 DASHES = ("", "7 3", "2 3", "9 3 2 3", "4 2", "1 2", "12 3", "6 2 2 2")
@@ -49,7 +49,9 @@ def _nice(step: float) -> float:
     return next(power * m for m in (1, 2, 2.5, 5, 10) if power * m >= step * 0.999)
 
 
-def limits(values: Sequence[float], *, zero: bool = False, room: float = 0.04) -> tuple[float, float]:
+def limits(
+    values: Sequence[float], *, zero: bool = False, room: float = 0.04
+) -> tuple[float, float]:
     """Least and largest finite value with some room; with `zero` from 0 on."""
     known = [v for v in values if math.isfinite(v)]
     low, high = (min(known), max(known)) if known else (0.0, 1.0)
@@ -104,7 +106,8 @@ class Chart:
         path = " ".join(f"{xs(x):.1f},{ys(y):.1f}" for x, y in known)
         colour, dash = PALETTE[number % len(PALETTE)], DASHES[number % len(DASHES)]
         self.marks.append(
-            f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2" stroke-dasharray="{dash}" '
+            f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2" '
+            f'stroke-dasharray="{dash}" '
             f'stroke-linejoin="round"><title>{escape(name)}</title></polyline>'
         )
 
@@ -112,31 +115,42 @@ class Chart:
         """A point; its shape goes with its colour."""
         self.marks.append(shape(self.xs(x), self.ys(y), number, tip))
 
-    def segment(self, one: tuple[float, float], other: tuple[float, float], number: int, tip: str) -> None:
+    def segment(
+        self, one: tuple[float, float], other: tuple[float, float], number: int, tip: str
+    ) -> None:
         """A thin line between two points with a mark at its end."""
         (x1, y1), (x2, y2) = ((self.xs(x), self.ys(y)) for x, y in (one, other))
         colour = PALETTE[number % len(PALETTE)]
         self.marks.append(
-            f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{colour}" stroke-opacity="0.3"/>'
-            + shape(x2, y2, number, tip)
+            f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" '
+            f'stroke="{colour}" stroke-opacity="0.3"/>' + shape(x2, y2, number, tip)
         )
 
-    def interval(self, row: float, low: float, value: float, high: float, number: int, tip: str) -> None:
+    def interval(
+        self, row: float, low: float, value: float, high: float, number: int, tip: str
+    ) -> None:
         """An estimate with its interval in a row."""
         xs, y, colour = self.xs, self.ys(row), PALETTE[number % len(PALETTE)]
         ends = "".join(
-            f'<line x1="{xs(v):.1f}" x2="{xs(v):.1f}" y1="{y - 4:.1f}" y2="{y + 4:.1f}" stroke="{colour}"/>'
+            f'<line x1="{xs(v):.1f}" x2="{xs(v):.1f}" y1="{y - 4:.1f}" y2="{y + 4:.1f}" '
+            f'stroke="{colour}"/>'
             for v in (low, high)
         )
-        bar = f'<line x1="{xs(low):.1f}" x2="{xs(high):.1f}" y1="{y:.1f}" y2="{y:.1f}" stroke="{colour}" stroke-width="2"/>'
+        bar = (
+            f'<line x1="{xs(low):.1f}" x2="{xs(high):.1f}" y1="{y:.1f}" y2="{y:.1f}" '
+            f'stroke="{colour}" stroke-width="2"/>'
+        )
         self.marks.append(bar + ends + shape(xs(value), y, number, tip))
 
-    def bar(self, low: float, high: float, base: float, value: float, number: int, tip: str) -> None:
+    def bar(
+        self, low: float, high: float, base: float, value: float, number: int, tip: str
+    ) -> None:
         """A histogram's bar from `base` to `value`."""
         x1, x2, y1, y2 = self.xs(low), self.xs(high), self.ys(value), self.ys(base)
         colour = PALETTE[number % len(PALETTE)]
         self.marks.append(
-            f'<rect x="{x1 + 0.5:.1f}" y="{y1:.1f}" width="{max(0.5, x2 - x1 - 1):.1f}" height="{max(0.0, y2 - y1):.1f}" '
+            f'<rect x="{x1 + 0.5:.1f}" y="{y1:.1f}" width="{max(0.5, x2 - x1 - 1):.1f}" '
+            f'height="{max(0.0, y2 - y1):.1f}" '
             f'fill="{colour}" fill-opacity="0.85"><title>{escape(tip)}</title></rect>'
         )
 
@@ -162,7 +176,8 @@ class Chart:
                 rows.append(0.0)
             y = TOP + 18 * (len(rows) - 1) - 4
             out.append(
-                f'<g transform="translate({x + 10:.1f} {y})">{mark}<text x="14" y="0" fill="{INK}">{escape(name)}</text></g>'
+                f'<g transform="translate({x + 10:.1f} {y})">{mark}<text x="14" y="0" '
+                f'fill="{INK}">{escape(name)}</text></g>'
             )
             x += needs
         return out, rows
@@ -170,10 +185,12 @@ class Chart:
     def svg(self) -> str:
         """The whole picture as a file."""
         return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width} {self.height}" width="{self.width}" '
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width} '
+            f'{self.height}" width="{self.width}" '
             f'height="{self.height}" role="img" {FONT}><title>{escape(self.title)}</title>'
             f'<rect width="100%" height="100%" fill="{PAPER}"/>'
-            f'<text x="{self.left}" y="20" fill="{INK}" font-size="14" font-weight="600">{escape(self.title)}</text>'
+            f'<text x="{self.left}" y="20" fill="{INK}" font-size="14" '
+            f'font-weight="600">{escape(self.title)}</text>'
             f"{''.join(self._placed()[0])}{self._axes()}{''.join(self.marks)}</svg>\n"
         )
 
@@ -183,26 +200,34 @@ class Chart:
         digits = [_digits(scale.ticks) for scale in (xs, ys)]
         parts = [
             f'<line x1="{xs(v):.1f}" x2="{xs(v):.1f}" y1="{top}" y2="{bottom}" stroke="{LINE}"/>'
-            f'<text x="{xs(v):.1f}" y="{bottom + 16}" text-anchor="middle" fill="{SOFT}">{v:.{digits[0]}f}</text>'
+            f'<text x="{xs(v):.1f}" y="{bottom + 16}" text-anchor="middle" '
+            f'fill="{SOFT}">{v:.{digits[0]}f}</text>'
             for v in xs.ticks
         ]
         if self.rows:
             parts += [
-                f'<text x="{self.left - 10}" y="{ys(i) + 4:.1f}" text-anchor="end" fill="{INK}">{escape(name)}</text>'
+                f'<text x="{self.left - 10}" y="{ys(i) + 4:.1f}" text-anchor="end" '
+                f'fill="{INK}">{escape(name)}</text>'
                 for i, name in enumerate(self.rows)
             ]
         else:
             parts += [
-                f'<line x1="{self.left}" x2="{right}" y1="{ys(v):.1f}" y2="{ys(v):.1f}" stroke="{LINE}"/>'
-                f'<text x="{self.left - 8}" y="{ys(v) + 4:.1f}" text-anchor="end" fill="{SOFT}">{v:.{digits[1]}f}</text>'
+                f'<line x1="{self.left}" x2="{right}" y1="{ys(v):.1f}" y2="{ys(v):.1f}" '
+                f'stroke="{LINE}"/>'
+                f'<text x="{self.left - 8}" y="{ys(v) + 4:.1f}" text-anchor="end" '
+                f'fill="{SOFT}">{v:.{digits[1]}f}</text>'
                 for v in ys.ticks
             ]
             parts.append(
-                f'<text transform="translate(16 {(top + bottom) / 2:.0f}) rotate(-90)" text-anchor="middle" '
+                f'<text transform="translate(16 {(top + bottom) / 2:.0f}) rotate(-90)" '
+                'text-anchor="middle" '
                 f'fill="{SOFT}">{escape(self.y_label)}</text>'
             )
         middle = (self.left + right) / 2
-        label = f'<text x="{middle:.0f}" y="{self.height - 8}" text-anchor="middle" fill="{SOFT}">{escape(self.x_label)}</text>'
+        label = (
+            f'<text x="{middle:.0f}" y="{self.height - 8}" text-anchor="middle" '
+            f'fill="{SOFT}">{escape(self.x_label)}</text>'
+        )
         return "".join([*parts, label])
 
 
@@ -219,14 +244,22 @@ def shape(x: float, y: float, number: int, tip: str) -> str:
     if kind == 0:
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}">{title}</circle>'
     if kind == 1:
-        return f'<rect x="{x - 3.5:.1f}" y="{y - 3.5:.1f}" width="7" height="7" fill="{colour}">{title}</rect>'
+        return (
+            f'<rect x="{x - 3.5:.1f}" y="{y - 3.5:.1f}" width="7" height="7" '
+            f'fill="{colour}">{title}</rect>'
+        )
     corners = ((0, -5), (5, 0), (0, 5), (-5, 0)) if kind == 2 else ((0, -5), (4.6, 4), (-4.6, 4))
     points = " ".join(f"{x + dx:.1f},{y + dy:.1f}" for dx, dy in corners)
     return f'<polygon points="{points}" fill="{colour}">{title}</polygon>'
 
 
 def lines(
-    title: str, x_label: str, y_label: str, curves: Mapping[str, Sequence[tuple[float, float]]], *, unit: bool = False
+    title: str,
+    x_label: str,
+    y_label: str,
+    curves: Mapping[str, Sequence[tuple[float, float]]],
+    *,
+    unit: bool = False,
 ) -> str:
     """Curves by name over a common axis; `unit`: y from 0 to 1."""
     xs = [x for points in curves.values() for x, _ in points]
@@ -239,9 +272,14 @@ def lines(
 
 
 def intervals(
-    title: str, x_label: str, rows: Sequence[tuple[str, str, float, float, float]], *, unit: bool = False
+    title: str,
+    x_label: str,
+    rows: Sequence[tuple[str, str, float, float, float]],
+    *,
+    unit: bool = False,
 ) -> str:
-    """Estimates with intervals: (row, series, low, value, high); series of one row stand below each other."""
+    """Estimates with intervals: (row, series, low, value, high); series of one row stand below each
+    other."""
     names = list(dict.fromkeys(row for row, *_ in rows))
     series = list(dict.fromkeys(one for _, one, *_ in rows))
     values = [v for *_, low, value, high in rows for v in (low, value, high)]
@@ -287,9 +325,15 @@ def points(
 
 
 def histogram(
-    title: str, x_label: str, groups: Mapping[str, Sequence[float]], bins: int = 30, *, least: float | None = None
+    title: str,
+    x_label: str,
+    groups: Mapping[str, Sequence[float]],
+    bins: int = 30,
+    *,
+    least: float | None = None,
 ) -> str:
-    """Counts of values in classes of equal width, groups stacked; the first class begins at `least` if that is given."""
+    """Counts of values in classes of equal width, groups stacked; the first class begins at `least`
+    if that is given."""
     every = [v for group in groups.values() for v in group]
     low, high = limits(every if least is None else [least, *every], room=0.0)
     high = high if high > low else low + 1.0

@@ -1,7 +1,8 @@
-"""The colours of report pages and their pictures, by day and by night, and pictures as files of their own.
+"""The colours of report pages and their pictures, by day and by night, and pictures as files of
+their own.
 
-Series are those of M. Okabe and K. Ito, "Color Universal Design" (2008), told apart with every kind of colour vision; by night the
-darkest are lighter shades of the same hues.
+Series are those of M. Okabe and K. Ito, "Color Universal Design" (2008), told apart with every kind
+of colour vision; by night the darkest are lighter shades of the same hues.
 """
 
 from __future__ import annotations
@@ -60,4 +61,8 @@ def variables(colours: Mapping[str, str]) -> str:
 def standalone(svg: str) -> str:
     """A picture of a page as a file of its own: with the page's light colours and a name space."""
     svg = re.sub(r"var\(--([a-z0-9-]+)\)", lambda found: LIGHT.get(found[1], found[0]), svg)
-    return svg if "xmlns=" in svg[:400] else svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    return (
+        svg
+        if "xmlns=" in svg[:400]
+        else svg.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    )

@@ -1,4 +1,5 @@
-"""Fixed combinations of actions side by side: what each came to over the throws in which it was chosen, with one rho for all."""
+"""Fixed combinations of actions side by side: what each came to over the throws in which it was
+chosen, with one rho for all."""
 
 from __future__ import annotations
 
@@ -8,17 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.campaign.rows import Row
-from coordinator.report.comparing import Weighting, objectives
-from coordinator.task import Task
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.report.comparing import Weighting, objectives
+from petrobot.coordinator.task import Task
 
 Combination = tuple[tuple[str, str], ...]
-"""(primitive task, action) of each primitive task with alternatives, in the order of the task file."""
+"""(primitive task, action) of each primitive task with alternatives, in the order of the task
+file."""
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One combination. J is the mean over the primitive tasks with alternatives; `task_objective` that of the whole task."""
+    """One combination. J is the mean over the primitive tasks with alternatives; `task_objective`
+    that of the whole task."""
 
     combination: Combination
     throws: int
@@ -58,8 +61,8 @@ def by_combination(
 ) -> list[Judged]:
     """Every combination in these rows, the lowest J first.
 
-    `planned`: the combination meant for each row; a throw that ended before all of its runs still counts for it. Without it, only
-    throws in which every primitive task ran can be told apart.
+    `planned`: the combination meant for each row; a throw that ended before all of its runs still
+    counts for it. Without it, only throws in which every primitive task ran can be told apart.
     """
     kept = [row for row in rows if row.throw is not None]
     names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
@@ -70,14 +73,24 @@ def by_combination(
         if all(name in chosen for name in names):
             groups.setdefault(tuple((name, chosen[name]) for name in names), []).append(row)
     return sorted(
-        (_judged(task, c, own, weighting) for c, own in groups.items()), key=lambda j: (j.objective, j.combination)
+        (_judged(task, c, own, weighting) for c, own in groups.items()),
+        key=lambda j: (j.objective, j.combination),
     )
 
 
-def _judged(task: Task, combination: Combination, rows: Sequence[Row], weighting: Weighting) -> Judged:
+def _judged(
+    task: Task, combination: Combination, rows: Sequence[Row], weighting: Weighting
+) -> Judged:
     found = objectives(task, rows, weighting)
     times = [row.throw.time for row in rows if row.throw is not None and row.throw.time is not None]
     goal = float(np.mean([row.throw is not None and row.throw.goals > 0 for row in rows]))
     mean = float(np.mean(times)) if times else float("nan")
     known = [value for name, value in found.items() if name != "task" and not np.isnan(value)]
-    return Judged(combination, len(rows), goal, float(np.mean(known)) if known else float("nan"), found["task"], mean)
+    return Judged(
+        combination,
+        len(rows),
+        goal,
+        float(np.mean(known)) if known else float("nan"),
+        found["task"],
+        mean,
+    )

@@ -1,8 +1,9 @@
-"""Two campaigns compared throw by throw: the same seeds met the same throws, so differences are paired.
+"""Two campaigns compared throw by throw: the same seeds met the same throws, so differences are
+paired.
 
-Shares: McNemar's exact test (Q. McNemar 1947, binomial on the discordant pairs), difference with the adjusted Wald interval of
-A. Agresti and Y. Min (2005, half a pair added to each cell). J and costs: percentile bootstrap over pairs, all J from sums with
-one rho.
+Shares: McNemar's exact test (Q. McNemar 1947, binomial on the discordant pairs), difference with
+the adjusted Wald interval of A. Agresti and Y. Min (2005, half a pair added to each cell). J and
+costs: percentile bootstrap over pairs, all J from sums with one rho.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from coordinator.campaign.rows import Row
-from coordinator.task import Status, Task
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.task import Status, Task
 
 REPLICATES = 2000
 Z = 1.959963984540054
@@ -37,23 +38,33 @@ def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
     """Match two tables."""
     first = {(row.regime, row.seed, row.k): row for row in one}
     second = {(row.regime, row.seed, row.k): row for row in other}
-    common = [k for k in first if k in second and first[k].throw is not None and second[k].throw is not None]
+    common = [
+        k
+        for k in first
+        if k in second and first[k].throw is not None and second[k].throw is not None
+    ]
     left = len(first) + len(second) - 2 * len(common)
     return Pairs(tuple(first[k] for k in common), tuple(second[k] for k in common), left)
 
 
 def compare(
-    task: Task, one: Iterable[Row], other: Iterable[Row], weighting: Weighting | None = None, seed: int = 1
+    task: Task,
+    one: Iterable[Row],
+    other: Iterable[Row],
+    weighting: Weighting | None = None,
+    seed: int = 1,
 ) -> dict[str, Any]:
-    """What the first campaign does better (positive differences in shares, negative in J and time) than the second.
+    """What the first campaign does better (positive differences in shares, negative in J and time)
+    than the second.
 
-    `weighting` gives the rho of J, so that several comparisons have one; without it, rho is that of the actions in these two.
-    Raises ValueError when they have no throw in common.
+    `weighting` gives the rho of J, so that several comparisons have one; without it, rho is that of
+    the actions in these two. Raises ValueError when they have no throw in common.
     """
     pairs = paired(one, other)
     if not pairs.one:
         raise ValueError(
-            "the two campaigns have no throw in common: run them with the same --seed, --block and --regime"
+            "the two campaigns have no throw in common: run them with the same --seed, "
+            "--block and --regime"
         )
     random = np.random.default_rng(seed)
     shares = {
@@ -79,7 +90,9 @@ def own_flags(pairs: Pairs) -> list[str]:
     """Truth values of the task's own score that every pair has."""
     names = [n for n, v in pairs.one[0].score.items() if isinstance(v, bool)]
     return [
-        n for n in names if all(isinstance(r.score.get(n), bool) for rows in (pairs.one, pairs.other) for r in rows)
+        n
+        for n in names
+        if all(isinstance(r.score.get(n), bool) for rows in (pairs.one, pairs.other) for r in rows)
     ]
 
 
@@ -88,7 +101,8 @@ def _flag(name: str) -> Callable[[Row], bool]:
 
 
 def share_difference(pairs: Pairs, met: Callable[[Row], bool]) -> dict[str, Any]:
-    """Both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 % interval."""
+    """Both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
+    interval."""
     a = np.array([met(row) for row in pairs.one])
     b = np.array([met(row) for row in pairs.other])
     n, gained, lost = len(a), int(np.sum(a & ~b)), int(np.sum(~a & b))
@@ -101,7 +115,10 @@ def share_difference(pairs: Pairs, met: Callable[[Row], bool]) -> dict[str, Any]
         "only_one": gained,
         "only_other": lost,
         "difference": round((gained - lost) / n, 6),
-        "interval": [round(float(max(-1.0, middle - half)), 6), round(float(min(1.0, middle + half)), 6)],
+        "interval": [
+            round(float(max(-1.0, middle - half)), 6),
+            round(float(min(1.0, middle + half)), 6),
+        ],
         "p": p,
     }
 
@@ -129,29 +146,42 @@ def _time(pairs: Pairs) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Weighting:
-    """rho of each primitive task with alternatives, and of the task (whose cost is the time of a throw)."""
+    """rho of each primitive task with alternatives, and of the task (whose cost is the time of a
+    throw)."""
 
     rho: Mapping[str, float]
     task: float
 
     @classmethod
     def of(cls, task: Task, rows: Sequence[Row]) -> Weighting:
-        """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of their throws."""
+        """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of
+        their throws."""
         names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
-        times = [row.throw.time for row in rows if row.throw is not None and row.throw.time is not None]
+        times = [
+            row.throw.time for row in rows if row.throw is not None and row.throw.time is not None
+        ]
         mean = sum(times) / len(times) if times else 0.0
-        return cls({name: cost_weight(task, name, rows) for name in names}, 1.0 / mean if mean > 0 else 0.0)
+        return cls(
+            {name: cost_weight(task, name, rows) for name in names}, 1.0 / mean if mean > 0 else 0.0
+        )
 
 
 def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[str, float]:
-    """J of each primitive task with alternatives and of the task ("task"), with the given rho; nan where nothing was run."""
+    """J of each primitive task with alternatives and of the task ("task"), with the given rho; nan
+    where nothing was run."""
     whole = np.ones((1, len(rows)))
-    found = {name: float(_objective(_sums(task, name, rows), whole, rho)[0]) for name, rho in weighting.rho.items()}
+    found = {
+        name: float(_objective(_sums(task, name, rows), whole, rho)[0])
+        for name, rho in weighting.rho.items()
+    }
     return found | {"task": float(_objective(_task_sums(rows), whole, weighting.task)[0])}
 
 
-def objective_difference(task: Task, pairs: Pairs, weighting: Weighting, random: np.random.Generator) -> dict[str, Any]:
-    """J of each primitive task with alternatives, their mean, and J of the task (1 - R_goal + rho * time), in both campaigns."""
+def objective_difference(
+    task: Task, pairs: Pairs, weighting: Weighting, random: np.random.Generator
+) -> dict[str, Any]:
+    """J of each primitive task with alternatives, their mean, and J of the task (1 - R_goal + rho *
+    time), in both campaigns."""
     n = len(pairs.one)
     weights = random.multinomial(n, np.full(n, 1 / n), size=REPLICATES)
     whole = np.ones((1, n))
@@ -213,11 +243,16 @@ def _task_sums(rows: Sequence[Row]) -> Sums:
 
 
 def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
-    """rho = 1 / the largest mean cost of an action of the primitive task in these rows; 0 without costs."""
+    """rho = 1 / the largest mean cost of an action of the primitive task in these rows; 0 without
+    costs."""
     costs: dict[str, list[float]] = {}
     for row in rows:
         for run in row.throw.runs if row.throw is not None else ():
-            if run.status and run.cost is not None and task.primitive_task_of(run.place).name == name:
+            if (
+                run.status
+                and run.cost is not None
+                and task.primitive_task_of(run.place).name == name
+            ):
                 costs.setdefault(run.action, []).append(run.cost)
     largest = max((sum(c) / len(c) for c in costs.values()), default=0.0)
     return 1.0 / largest if largest > 0 else 0.0
@@ -227,5 +262,9 @@ def _objective(sums: Sums, weights: Any, rho: float) -> Values:
     """J = 1 - R + rho C for each row of weights."""
     runs, successes, cost, costed = (weights @ s for s in sums)
     with np.errstate(divide="ignore", invalid="ignore"):
-        value: Values = 1.0 - successes / runs + rho * np.where(costed > 0, cost / np.maximum(costed, 1e-300), 0.0)
+        value: Values = (
+            1.0
+            - successes / runs
+            + rho * np.where(costed > 0, cost / np.maximum(costed, 1e-300), 0.0)
+        )
     return value

@@ -1,17 +1,19 @@
-"""What a recorded mission run says of its actions: the steps of its journal shown once more to the observer that learns from runs.
+"""What a recorded mission run says of its actions: the steps of its journal shown once more to the
+observer that learns from runs.
 
-So R, C, J and choice probabilities of a single run are those that `run --learn` counts, drawn as a campaign's are.
+So R, C, J and choice probabilities of a single run are those that `run --learn` counts, drawn as a
+campaign's are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from coordinator.experience.learner import LearningSelector
-from coordinator.learning.learning import Learning
-from coordinator.learning.records import End, Record
-from coordinator.record.recording import Step
-from coordinator.report.action_pictures import (
+from petrobot.coordinator.experience.learner import LearningSelector
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.records import End, Record
+from petrobot.coordinator.record.recording import Step
+from petrobot.coordinator.report.action_pictures import (
     Pictures,
     action_pictures,
     add_latencies,
@@ -19,12 +21,13 @@ from coordinator.report.action_pictures import (
     put,
     trial_pictures,
 )
-from coordinator.report.trials import Curves, recorded_curves
-from coordinator.task import Task
+from petrobot.coordinator.report.trials import Curves, recorded_curves
+from petrobot.coordinator.task import Task
 
 
 class ObservedRun:
-    """Observes the steps of a run. `learner`: the selector that learned in it, as it began; None: nobody learned."""
+    """Observes the steps of a run. `learner`: the selector that learned in it, as it began; None:
+    nobody learned."""
 
     def __init__(self, task: Task, learner: LearningSelector | None = None) -> None:
         self._task = task
@@ -46,7 +49,9 @@ class ObservedRun:
         """The probabilities after each trial that ended."""
         for record in records:
             selector = (
-                None if not isinstance(record, End) else self._selector.learning.selectors.get(record.primitive_task)
+                None
+                if not isinstance(record, End)
+                else self._selector.learning.selectors.get(record.primitive_task)
             )
             if selector is None or not isinstance(record, End) or record.outcome.status is None:
                 continue
@@ -59,7 +64,9 @@ class ObservedRun:
         """Every picture that there are numbers for."""
         trials = recorded_curves(self._task, self._selector.records)
         for one in trials:
-            one.probability = self._probability.get((one.primitive_task, one.context), {}) if self._learns else {}
+            one.probability = (
+                self._probability.get((one.primitive_task, one.context), {}) if self._learns else {}
+            )
         out = trial_pictures(trials, "learned probability") | action_pictures(
             self._task, self._selector.learning.gained
         )

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from coordinator.report.colours import DARK, LIGHT, variables
-from coordinator.task import Status
+from petrobot.coordinator.report.colours import DARK, LIGHT, variables
+from petrobot.coordinator.task import Status
 
 STYLE = (
     f"""
@@ -38,7 +38,8 @@ def html_page(title: str, parts: Iterable[str]) -> str:
     """A whole page that needs nothing else."""
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width,initial-scale=1"><style>{STYLE}</style></head>'
+        '<meta name="viewport" '
+        f'content="width=device-width,initial-scale=1"><style>{STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>\n"
     )
 
@@ -50,9 +51,13 @@ def gallery(pictures: Iterable[str]) -> str:
 
 
 def apart(svg: str, alternative: str) -> str:
-    """A picture that brings a style of its own, so framed that it leaves the rest of the page alone."""
+    """A picture that brings a style of its own, so framed that it leaves the rest of the page
+    alone."""
     data = b64encode(svg.encode("utf-8")).decode("ascii")
-    image = f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(alternative)}" style="max-width:100%">'
+    image = (
+        f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(alternative)}" '
+        'style="max-width:100%">'
+    )
     return f'<div class="picture">{image}</div>'
 
 
@@ -80,7 +85,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Records as a table, columns in the order of their first use."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f"<th>{escape(column)}</th>" for column in columns)
-    body = "".join(f"<tr>{''.join(f'<td>{cell(c, row.get(c))}</td>' for c in columns)}</tr>" for row in rows)
+    body = "".join(
+        f"<tr>{''.join(f'<td>{cell(c, row.get(c))}</td>' for c in columns)}</tr>" for row in rows
+    )
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 

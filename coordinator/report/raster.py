@@ -1,7 +1,9 @@
-"""Pictures of a report as PNG, for papers and mails that take no SVG: rendered by resvg, twice the size of the SVG.
+"""Pictures of a report as PNG, for papers and mails that take no SVG: rendered by resvg, twice the
+size of the SVG.
 
-resvg is one wheel that needs nothing of the system; a browser or Cairo would have to be installed apart, and OpenCV draws no SVG.
-The words are drawn with the font that is shipped beside this file, and with no other, so a picture looks the same on every host.
+resvg is one wheel that needs nothing of the system; a browser or Cairo would have to be installed
+apart, and OpenCV draws no SVG. The words are drawn with the font that is shipped beside this file,
+and with no other, so a picture looks the same on every host.
 """
 
 from __future__ import annotations

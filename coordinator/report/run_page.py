@@ -1,4 +1,5 @@
-"""A mission run as one self-contained HTML page: result, net, Gantt of the runs, firings and reasons of errors."""
+"""A mission run as one self-contained HTML page: result, net, Gantt of the runs, firings and
+reasons of errors."""
 
 from __future__ import annotations
 
@@ -6,10 +7,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from coordinator.record.timeline import Bar, Timeline
-from coordinator.report.page import apart, gallery, html_page, is_table, numbers, picture, section, status, table
-from coordinator.report.plots import declared, finished
-from coordinator.task import Status
+from petrobot.coordinator.record.timeline import Bar, Timeline
+from petrobot.coordinator.report.page import (
+    apart,
+    gallery,
+    html_page,
+    is_table,
+    numbers,
+    picture,
+    section,
+    status,
+    table,
+)
+from petrobot.coordinator.report.plots import declared, finished
+from petrobot.coordinator.task import Status
 
 ROW, LEFT, WIDTH = 26, 150, 1040
 SECOND = 10.0
@@ -32,9 +43,13 @@ def report_html(
     title = f"{result.get('task', 'task')}: {result.get('status', '')}"
     parts = [
         f"<h1>{escape(str(result.get('task', 'task')))}</h1>",
-        f'<p class="lead">{status(result.get("status"))} {escape(str(result.get("reason", "")))}</p>',
+        f'<p class="lead">{status(result.get("status"))} '
+        f"{escape(str(result.get('reason', '')))}</p>",
         numbers(result),
-        section("Of the task itself", gallery([*own_pictures(result).values(), *(pictures or {}).values()])),
+        section(
+            "Of the task itself",
+            gallery([*own_pictures(result).values(), *(pictures or {}).values()]),
+        ),
         section("Runs over time", picture(gantt_svg(timeline))),
         *(section(heading, gallery(svgs)) for heading, svgs in (measured or {}).items()),
         *(section(key.capitalize(), table(rows)) for key, rows in result.items() if is_table(rows)),
@@ -55,7 +70,10 @@ def own_pictures(result: Mapping[str, Any]) -> dict[str, str]:
             rows[i] |= {f"{name}.{key}": value for key, value in record.items()}
     plots = result.get("plots", {})
     drawn = declared(plots, rows) if isinstance(plots, Mapping) else {}
-    return {**{str(plots[name].get("title", name)): svg for name, svg in drawn.items()}, **finished(result)}
+    return {
+        **{str(plots[name].get("title", name)): svg for name, svg in drawn.items()},
+        **finished(result),
+    }
 
 
 def gantt_svg(timeline: Timeline) -> str:
@@ -71,18 +89,22 @@ def gantt_svg(timeline: Timeline) -> str:
     height = ROW * len(places) + 40
     rows = "".join(
         f'<text x="0" y="{ROW * i + 17}" fill="var(--ink)">{escape(place)}</text>'
-        f'<line x1="{left}" x2="{width - 20}" y1="{ROW * (i + 1)}" y2="{ROW * (i + 1)}" stroke="var(--line)"/>'
+        f'<line x1="{left}" x2="{width - 20}" y1="{ROW * (i + 1)}" y2="{ROW * (i + 1)}" '
+        'stroke="var(--line)"/>'
         for i, place in enumerate(places)
     )
     drawn = "".join(_bar(bar, places.index(bar.place), scale, end, left) for bar in bars)
     axis = "".join(
-        f'<text x="{left + t * scale:.1f}" y="{height - 12}" fill="var(--soft)" text-anchor="middle">{t:g} s</text>'
+        f'<text x="{left + t * scale:.1f}" y="{height - 12}" fill="var(--soft)" '
+        f'text-anchor="middle">{t:g} s</text>'
         for t in _ticks(end, 12 * width / WIDTH)
     )
     return (
-        f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" font-size="13" role="img" '
+        f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" '
+        'font-size="13" role="img" '
         f'font-family="system-ui,Segoe UI,Roboto,DejaVu Sans,sans-serif" '
-        f'{"" if width == WIDTH else STYLE_WIDE}aria-label="Gantt chart of the runs">{rows}{drawn}{axis}</svg>'
+        f'{"" if width == WIDTH else STYLE_WIDE}aria-label="Gantt chart of the '
+        f'runs">{rows}{drawn}{axis}</svg>'
     )
 
 
@@ -98,24 +120,29 @@ def _bar(bar: Bar, row: int, scale: float, end: float, left: int) -> str:
     x, width = left + bar.begun * scale, max(1.5, (ended - bar.begun) * scale)
     tip = f"<title>{escape(f'{name}, {how}{why}')}</title>"
     return (
-        f'<rect x="{x:.2f}" y="{ROW * row + 5}" width="{width:.2f}" height="{ROW - 9}" rx="3" fill="{colour}">{tip}</rect>'
-        + _letter(bar, x + width / 2, row)
+        f'<rect x="{x:.2f}" y="{ROW * row + 5}" width="{width:.2f}" height="{ROW - 9}" '
+        f'rx="3" fill="{colour}">{tip}</rect>' + _letter(bar, x + width / 2, row)
     )
 
 
 def _letter(bar: Bar, x: float, row: int) -> str:
-    """What the colour says once more, on the bar, for runs that met no specification: F, E, or P for a preempted one."""
+    """What the colour says once more, on the bar, for runs that met no specification: F, E, or P
+    for a preempted one."""
     if bar.status is Status.SUCCESS:
         return ""
     letter = bar.status.value[0].upper() if bar.status else "P"
     return (
-        f'<text x="{x:.2f}" y="{ROW * row + 18}" text-anchor="middle" font-size="11" font-weight="700" fill="var(--ink)" '
-        f'stroke="var(--paper)" stroke-width="3" paint-order="stroke" pointer-events="none">{letter}</text>'
+        f'<text x="{x:.2f}" y="{ROW * row + 18}" text-anchor="middle" font-size="11" '
+        'font-weight="700" fill="var(--ink)" '
+        'stroke="var(--paper)" stroke-width="3" paint-order="stroke" '
+        f'pointer-events="none">{letter}</text>'
     )
 
 
 def _ticks(end: float, most: float) -> list[float]:
-    step = next((s for s in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if end / s <= most), 1000)
+    step = next(
+        (s for s in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if end / s <= most), 1000
+    )
     return [i * step for i in range(int(end / step) + 1)]
 
 
@@ -132,7 +159,13 @@ def _faults(timeline: Timeline) -> str:
         if bar.status in (Status.FAILURE, Status.ERROR) and bar.ended is not None and bar.status
     ]
     rows += [
-        {"time": f"{time:.2f} s", "place": report.of, "action": "", "status": report.severity.value, "why": report.text}
+        {
+            "time": f"{time:.2f} s",
+            "place": report.of,
+            "action": "",
+            "status": report.severity.value,
+            "why": report.text,
+        }
         for time, report in timeline.reports
     ]
     return table(rows) if rows else "<p>Nothing: every run met its specification.</p>"

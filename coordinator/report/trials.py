@@ -1,4 +1,5 @@
-"""How choices, reliabilities and J went over the trials of a campaign, derived again from its table, or of a recorded run."""
+"""How choices, reliabilities and J went over the trials of a campaign, derived again from its
+table, or of a recorded run."""
 
 from __future__ import annotations
 
@@ -7,14 +8,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
-from coordinator.campaign.block import Bench
-from coordinator.campaign.observed import regime_of
-from coordinator.campaign.plan import Plan
-from coordinator.campaign.policies import Learned, policy_of
-from coordinator.campaign.rows import Row
-from coordinator.learning.records import End, Record
-from coordinator.learning.selectors import cost_of
-from coordinator.task import Status, Task
+from petrobot.coordinator.campaign.block import Bench
+from petrobot.coordinator.campaign.observed import regime_of
+from petrobot.coordinator.campaign.plan import Plan
+from petrobot.coordinator.campaign.policies import Learned, policy_of
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.learning.records import End, Record
+from petrobot.coordinator.learning.selectors import cost_of
+from petrobot.coordinator.task import Status, Task
 
 Curve = list[tuple[float, float]]
 Curves = dict[str, Curve]
@@ -26,14 +27,16 @@ WINDOW = 50
 
 @dataclass
 class Trials:
-    """Curves of one primitive task in one regime, by action; x is the trial (runs of the primitive task in that regime)."""
+    """Curves of one primitive task in one regime, by action; x is the trial (runs of the primitive
+    task in that regime)."""
 
     primitive_task: str
     regime: str
     context: str = ""
     """Of a single run: the context that `regime` was told from."""
     probability: Curves = field(default_factory=dict)
-    """Learned p; of campaigns that do not learn, the share of choices over the last `WINDOW` trials."""
+    """Learned p; of campaigns that do not learn, the share of choices over the last `WINDOW`
+    trials."""
     objective: Curves = field(default_factory=dict)
     """J from the sums so far with the rho so far."""
 
@@ -59,7 +62,11 @@ def recorded_curves(task: Task, records: Iterable[Record]) -> list[Trials]:
     for record in records:
         if isinstance(record, End) and record.outcome.status is not None:
             cost = cost_of(record.outcome, task.primitive_tasks[record.primitive_task].cost)
-            seen = (record.action, record.outcome.status is Status.SUCCESS, None if math.isnan(cost) else cost)
+            seen = (
+                record.action,
+                record.outcome.status is Status.SUCCESS,
+                None if math.isnan(cost) else cost,
+            )
             runs.setdefault((record.primitive_task, record.context), []).append(seen)
     out = []
     for (name, context), seen_runs in runs.items():
@@ -71,14 +78,18 @@ def recorded_curves(task: Task, records: Iterable[Record]) -> list[Trials]:
     return out
 
 
-def _runs(task: Task, primitive: str, rows: Sequence[Row]) -> Iterator[tuple[str, bool, float | None]]:
+def _runs(
+    task: Task, primitive: str, rows: Sequence[Row]
+) -> Iterator[tuple[str, bool, float | None]]:
     for row in rows:
         for run in row.throw.runs if row.throw is not None else ():
             if run.status and task.primitive_task_of(run.place).name == primitive:
                 yield run.action, run.status == Status.SUCCESS.value, run.cost
 
 
-def _fill(made: Trials, runs: Sequence[tuple[str, bool, float | None]], actions: Sequence[str]) -> None:
+def _fill(
+    made: Trials, runs: Sequence[tuple[str, bool, float | None]], actions: Sequence[str]
+) -> None:
     sums = {action: [0, 0, 0.0, 0] for action in actions}
     step = max(1, len(runs) // POINTS)
     for i, (action, success, cost) in enumerate(runs, 1):
@@ -101,7 +112,8 @@ def _fill(made: Trials, runs: Sequence[tuple[str, bool, float | None]], actions:
 
 
 def learned_curves(plan: Plan, rows: Sequence[Row], trials: Sequence[Trials]) -> None:
-    """Replace shares of choices by the probabilities that the selectors had, batch after batch; nothing to do without a learner."""
+    """Replace shares of choices by the probabilities that the selectors had, batch after batch;
+    nothing to do without a learner."""
     bench = Bench.of(plan)
     policy = policy_of(plan, bench.task, bench.directory)
     if not isinstance(policy, Learned):
@@ -120,6 +132,10 @@ def learned_curves(plan: Plan, rows: Sequence[Row], trials: Sequence[Trials]) ->
         state = policy.state()
         for one in trials:
             key = (one.primitive_task, one.regime)
-            counts[key] += sum(1 for _ in _runs(bench.task, key[0], [row for row in taken if row.regime == key[1]]))
-            for action, p in state.get(one.regime, {}).get(one.primitive_task, {}).get("p", {}).items():
+            counts[key] += sum(
+                1 for _ in _runs(bench.task, key[0], [row for row in taken if row.regime == key[1]])
+            )
+            for action, p in (
+                state.get(one.regime, {}).get(one.primitive_task, {}).get("p", {}).items()
+            ):
                 one.probability.setdefault(action, []).append((counts[key], p))

@@ -1,6 +1,7 @@
-"""The robotic task model: records, the expansion of macro places, and what every task must satisfy to mean something."""
+"""The robotic task model: records, the expansion of macro places, and what every task must satisfy
+to mean something."""
 
-from coordinator.task.elements import (
+from petrobot.coordinator.task.elements import (
     Counts,
     Early,
     End,
@@ -24,7 +25,7 @@ from coordinator.task.elements import (
     Variable,
     VariableType,
 )
-from coordinator.task.model import Task
+from petrobot.coordinator.task.model import Task
 
 __all__ = [
     "Counts",

@@ -1,7 +1,8 @@
-"""What every task must satisfy before anything is done with it: names that exist, arcs that mean something, kinds that fit.
+"""What every task must satisfy before anything is done with it: names that exist, arcs that mean
+something, kinds that fit.
 
-These are faults of the description. What a sound description may still do wrong (missing branches, conflicts that nothing
-settles) is for `check`; what its state space does is for the analysis.
+These are faults of the description. What a sound description may still do wrong (missing branches,
+conflicts that nothing settles) is for `check`; what its state space does is for the analysis.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from math import isfinite
 
-from coordinator.conditions import Expression
-from coordinator.conditions.regions import Domain, kind_faults
-from coordinator.conditions.wording import Fault, listed, nearest
-from coordinator.task.elements import (
+from petrobot.coordinator.conditions import Expression
+from petrobot.coordinator.conditions.regions import Domain, kind_faults
+from petrobot.coordinator.conditions.wording import Fault, listed, nearest
+from petrobot.coordinator.task.elements import (
     Early,
     End,
     Event,
@@ -32,9 +33,9 @@ from coordinator.task.elements import (
     Variable,
     VariableType,
 )
-from coordinator.task.macros import macro_faults
-from coordinator.task.model import Task
-from coordinator.task.subnets import CircleError
+from petrobot.coordinator.task.macros import macro_faults
+from petrobot.coordinator.task.model import Task
+from petrobot.coordinator.task.subnets import CircleError
 
 _IDENTIFIER = re.compile(r"[^\W\d]\w*\Z")
 _RESERVED = frozenset({"and", "or", "not", "true", "false", "none"})
@@ -59,9 +60,12 @@ def faults(task: Task) -> tuple[Fault, ...]:
 
 
 def condition_domains(task: Task) -> dict[str, Domain]:
-    """What the names in transitions' conditions can be: variables, parameters, `place.status` and `place.reason`."""
+    """What the names in transitions' conditions can be: variables, parameters, `place.status` and
+    `place.reason`."""
     domains = {v.name: Domain(v.type.value, v.values) for v in task.variables.values()}
-    domains |= {name: Domain(VariableType.of(value).value) for name, value in task.parameters.items()}
+    domains |= {
+        name: Domain(VariableType.of(value).value) for name, value in task.parameters.items()
+    }
     for place in task.places.values():
         if place.kind is Kind.ACTION:
             domains[f"{place.name}.status"] = Domain("str", tuple(s.value for s in Status))
@@ -88,11 +92,17 @@ def _names(task: Task) -> Iterator[Fault]:
         for name in names:
             if not _IDENTIFIER.match(name) or name in _RESERVED:
                 yield Fault(
-                    f"{group}.{name}", f"{name!r} is no name", "use letters, digits and _, and no reserved word"
+                    f"{group}.{name}",
+                    f"{name!r} is no name",
+                    "use letters, digits and _, and no reserved word",
                 )
     for name, value in task.parameters.items():
         if not is_plain(value):
-            yield Fault(f"task.parameters.{name}", f"{value!r} is no default value", "use a finite number, text, ...")
+            yield Fault(
+                f"task.parameters.{name}",
+                f"{value!r} is no default value",
+                "use a finite number, text, ...",
+            )
     for name in set(task.variables) & set(task.parameters):
         yield Fault(f"variables.{name}", "a parameter has this name too", "rename one of them")
     for name in set(task.places) & set(task.transitions):
@@ -102,7 +112,9 @@ def _names(task: Task) -> Iterator[Fault]:
 def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
     key = f"primitive_tasks.{p.name}"
     if not p.goal:
-        yield Fault(f"{key}.goal", "it has no goal", "say in one sentence what is reached when it succeeds")
+        yield Fault(
+            f"{key}.goal", "it has no goal", "say in one sentence what is reached when it succeeds"
+        )
     if not p.alternatives:
         yield Fault(f"{key}.alternatives", "no action translates it", "name at least one action")
     for action, n in Counter(p.alternatives).items():
@@ -111,12 +123,20 @@ def _primitive_task(p: PrimitiveTask) -> Iterator[Fault]:
     for name, seconds in (("deadline", p.deadline), ("stop_within", p.stop_within)):
         if not seconds > 0:
             yield Fault(
-                f"{key}.{name}", f"{seconds} s is no time to do anything in", "give a positive number of seconds"
+                f"{key}.{name}",
+                f"{seconds} s is no time to do anything in",
+                "give a positive number of seconds",
             )
     if not 0 < p.target_reliability <= 1:
-        yield Fault(f"{key}.target_reliability", f"{p.target_reliability} is no probability", "give 0 < R <= 1")
+        yield Fault(
+            f"{key}.target_reliability",
+            f"{p.target_reliability} is no probability",
+            "give 0 < R <= 1",
+        )
     if not _COST.match(p.cost):
-        yield Fault(f"{key}.cost", f"{p.cost!r} is no cost measure", "write wall, cpu, count or value:NAME")
+        yield Fault(
+            f"{key}.cost", f"{p.cost!r} is no cost measure", "write wall, cpu, count or value:NAME"
+        )
     yield from _estimates(p, f"{key}.estimates")
 
 
@@ -124,7 +144,9 @@ def _estimates(p: PrimitiveTask, key: str) -> Iterator[Fault]:
     for status, e in p.estimates.items():
         if not 0 <= e.share <= 1 or not e.mean >= 0 or not e.cv >= 0:
             yield Fault(
-                f"{key}.{status}", "a share lies in 0 to 1, mean and cv are not negative", "correct the numbers"
+                f"{key}.{status}",
+                "a share lies in 0 to 1, mean and cv are not negative",
+                "correct the numbers",
             )
     total = sum(e.share for e in p.estimates.values())
     if p.estimates and abs(total - 1) > 1e-6:
@@ -134,11 +156,21 @@ def _estimates(p: PrimitiveTask, key: str) -> Iterator[Fault]:
 def _variable(task: Task, v: Variable) -> Iterator[Fault]:
     key = f"variables.{v.name}"
     if not v.type.admits(v.initial):
-        yield Fault(f"{key}.initial", f"{v.initial!r} is no {v.type}", "change the value or the type")
+        yield Fault(
+            f"{key}.initial", f"{v.initial!r} is no {v.type}", "change the value or the type"
+        )
     if v.values and v.type is not VariableType.STR:
-        yield Fault(f"{key}.values", f"a {v.type} has no list of values", "drop `values` or make the type str")
+        yield Fault(
+            f"{key}.values",
+            f"a {v.type} has no list of values",
+            "drop `values` or make the type str",
+        )
     elif v.values and v.initial is not None and v.initial not in v.values:
-        yield Fault(f"{key}.initial", f"{v.initial!r} is not among `values`", f"use one of {listed(v.values)}")
+        yield Fault(
+            f"{key}.initial",
+            f"{v.initial!r} is not among `values`",
+            f"use one of {listed(v.values)}",
+        )
 
 
 def _event(task: Task, e: Event) -> Iterator[Fault]:
@@ -147,11 +179,19 @@ def _event(task: Task, e: Event) -> Iterator[Fault]:
         remedy = f"`by` names the one that raises it{nearest(e.by, task.primitive_tasks)}"
         yield Fault(f"{key}.by", f"{e.by!r} is no primitive task", remedy)
     if e.scope is Scope.EXTERNAL and e.by:
-        yield Fault(f"{key}.by", "an external event is raised by no primitive task", "drop `by` or make it internal")
+        yield Fault(
+            f"{key}.by",
+            "an external event is raised by no primitive task",
+            "drop `by` or make it internal",
+        )
     if e.early is Early.KEEP and (e.scope is Scope.INTERNAL or e.memory is Memory.PULSE):
         yield Fault(f"{key}.early", "only a latched external event can be kept", "drop `early`")
     if e.mean_wait is not None and not e.mean_wait > 0:
-        yield Fault(f"{key}.mean_wait", f"{e.mean_wait} s is no mean time", "give a positive number of seconds")
+        yield Fault(
+            f"{key}.mean_wait",
+            f"{e.mean_wait} s is no mean time",
+            "give a positive number of seconds",
+        )
 
 
 def _net(
@@ -170,21 +210,35 @@ def _place(task: Task, key: str, p: Place) -> Iterator[Fault]:
     if p.tokens < 0:
         yield Fault(f"{key}.tokens", f"{p.tokens} tokens", "give 0 or more")
     if p.capacity is not None and p.capacity < max(1, p.tokens):
-        yield Fault(f"{key}.capacity", f"a capacity of {p.capacity} holds no {p.tokens or 1} tokens", "raise it")
+        yield Fault(
+            f"{key}.capacity",
+            f"a capacity of {p.capacity} holds no {p.tokens or 1} tokens",
+            "raise it",
+        )
     if p.kind is Kind.ACTION:
         yield from _action_place(task, key, p)
     elif p.task or p.args or p.out or p.servers is not None:
         yield Fault(
-            key, f"a {p.kind} place runs no action", "drop task, args, out and servers, or make its kind action"
+            key,
+            f"a {p.kind} place runs no action",
+            "drop task, args, out and servers, or make its kind action",
         )
     if p.kind is Kind.MACRO:
         if p.subnet and p.subnet not in task.subnets:
             remedy = f"name one of [subnets]{nearest(p.subnet, task.subnets)}"
             yield Fault(f"{key}.subnet", f"{p.subnet!r} is no subnet", remedy)
         if p.tokens or p.capacity is not None:
-            yield Fault(key, "a macro place holds no tokens of its own", "put them into the places inside it")
+            yield Fault(
+                key,
+                "a macro place holds no tokens of its own",
+                "put them into the places inside it",
+            )
     elif p.subnet:
-        yield Fault(f"{key}.subnet", f"a {p.kind} place stands for no subnet", "drop `subnet` or make its kind macro")
+        yield Fault(
+            f"{key}.subnet",
+            f"a {p.kind} place stands for no subnet",
+            "drop `subnet` or make its kind macro",
+        )
 
 
 def _action_place(task: Task, key: str, p: Place) -> Iterator[Fault]:
@@ -198,7 +252,11 @@ def _action_place(task: Task, key: str, p: Place) -> Iterator[Fault]:
         if isinstance(value, Reference):
             if value.variable not in known:
                 remedy = f"declare it in [variables]{nearest(value.variable, known)}"
-                yield Fault(f"{key}.args.{name}", f"{value.variable!r} is no variable and no parameter", remedy)
+                yield Fault(
+                    f"{key}.args.{name}",
+                    f"{value.variable!r} is no variable and no parameter",
+                    remedy,
+                )
         elif not is_plain(value):
             yield Fault(
                 f"{key}.args.{name}",
@@ -226,28 +284,40 @@ def _arcs(key: str, t: Transition, places: Mapping[str, Place]) -> Iterator[Faul
     ends += [("in", i.place, i.threshold) for i in t.inhibitors]
     for side, name, weight in ends:
         if name not in places:
-            yield Fault(f"{key}.{side}", f"{name!r} is no place{nearest(name, places)}", "declare it in [places]")
+            yield Fault(
+                f"{key}.{side}",
+                f"{name!r} is no place{nearest(name, places)}",
+                "declare it in [places]",
+            )
         if weight < 1:
             yield Fault(f"{key}.{side}", f"an arc of weight {weight} to {name!r}", "give 1 or more")
     named = (("in", [a.place for a in t.inputs]), ("out", [a.place for a in t.outputs]))
     for side, names in (*named, ("in", [i.place for i in t.inhibitors])):
         for name, n in Counter(names).items():
             if n > 1:
-                yield Fault(f"{key}.{side}", f"{n} arcs with {name!r}", f"write one arc, {name}*{n} for its weight")
+                yield Fault(
+                    f"{key}.{side}",
+                    f"{n} arcs with {name!r}",
+                    f"write one arc, {name}*{n} for its weight",
+                )
     for arc in t.inputs:
         if arc.place in places:
             yield from _input(f"{key}.in", arc, places[arc.place])
     for inhibitor in t.inhibitors:
         if inhibitor.place in places and places[inhibitor.place].kind is Kind.MACRO:
             remedy = "let the subnet's transitions keep a control place beside it"
-            yield Fault(f"{key}.in", f"an inhibitor arc from the macro place {inhibitor.place!r}", remedy)
+            yield Fault(
+                f"{key}.in", f"an inhibitor arc from the macro place {inhibitor.place!r}", remedy
+            )
 
 
 def _input(key: str, arc: Input, place: Place) -> Iterator[Fault]:
     name = arc.place
     if place.kind is Kind.ACTION and arc.end is None:
         remedy = f"write {name}:normal, {name}:error, {name}:preempt=COUNTS or {name}:going"
-        yield Fault(key, f"{name!r} is an action place, so its arc says when it takes the token", remedy)
+        yield Fault(
+            key, f"{name!r} is an action place, so its arc says when it takes the token", remedy
+        )
     if place.kind is Kind.MACRO and place.subnet and arc.end not in (End.NORMAL, End.ERROR):
         yield Fault(key, f"{name!r} is a macro place", f"write {name}:normal or {name}:error")
     if place.kind in (Kind.RESOURCE, Kind.CONTROL) and arc.end is not None:
@@ -258,7 +328,11 @@ def _input(key: str, arc: Input, place: Place) -> Iterator[Fault]:
     if arc.end is not End.PREEMPT and arc.counts is not None:
         yield Fault(key, f"only a preempted run counts as {arc.counts}", "drop it")
     if place.kind is Kind.ACTION and place.servers is None and arc.weight > 1:
-        yield Fault(key, f"{name!r} is 1-safe, so {arc.weight} tokens never come together", "give the place `servers`")
+        yield Fault(
+            key,
+            f"{name!r} is 1-safe, so {arc.weight} tokens never come together",
+            "give the place `servers`",
+        )
 
 
 def _trigger(task: Task, key: str, t: Transition) -> Iterator[Fault]:
@@ -273,7 +347,9 @@ def _trigger(task: Task, key: str, t: Transition) -> Iterator[Fault]:
     if len(set(t.events)) < len(t.events):
         yield Fault(f"{key}.event", "an event stands there twice", "name it once")
     if t.after is not None and not t.after > 0:
-        yield Fault(f"{key}.after", f"{t.after} s is no waiting time", "give a positive number of seconds")
+        yield Fault(
+            f"{key}.after", f"{t.after} s is no waiting time", "give a positive number of seconds"
+        )
     if t.after is not None and t.events:
         remedy = "put the timer on a transition of its own beside this one"
         yield Fault(f"{key}.after", "it waits for an event and for a time", remedy)
@@ -294,7 +370,11 @@ def _subnet(task: Task, s: Subnet) -> Iterator[Fault]:
             remedy = f"name one of its places{nearest(place, s.places)}"
             yield Fault(f"{key}.{port}", f"{place!r} is no place of the subnet", remedy)
         elif port != "entry" and s.places[place].kind not in (Kind.CONTROL, Kind.RESOURCE):
-            yield Fault(f"{key}.{port}", f"{place!r} is a {s.places[place].kind} place", "end in a control place")
+            yield Fault(
+                f"{key}.{port}",
+                f"{place!r} is a {s.places[place].kind} place",
+                "end in a control place",
+            )
     for name in set(s.places) & set(s.transitions):
         yield Fault(f"{key}.transitions.{name}", "a place has this name too", "rename one of them")
     for name in (*s.places, *s.transitions):
@@ -338,9 +418,17 @@ def _macro_exits(task: Task) -> Iterator[Fault]:
         for t in transitions.values():
             for arc in t.inputs:
                 place = places[arc.place]
-                if place.kind is Kind.MACRO and arc.end is End.ERROR and not task.subnets[place.subnet].error:
+                if (
+                    place.kind is Kind.MACRO
+                    and arc.end is End.ERROR
+                    and not task.subnets[place.subnet].error
+                ):
                     remedy = f"give subnets.{place.subnet} an `error` place"
-                    yield Fault(f"{prefix}transitions.{t.name}.in", f"{arc.place!r} has no error exit", remedy)
+                    yield Fault(
+                        f"{prefix}transitions.{t.name}.in",
+                        f"{arc.place!r} has no error exit",
+                        remedy,
+                    )
 
 
 def _expression(key: str, expression: Expression, domains: Mapping[str, Domain]) -> Iterator[Fault]:
@@ -349,7 +437,8 @@ def _expression(key: str, expression: Expression, domains: Mapping[str, Domain])
 
 
 def _written_key(task: Task, flat_name: str) -> str:
-    """The key in the task file of a flat transition's condition: that of the subnet in which it is written."""
+    """The key in the task file of a flat transition's condition: that of the subnet in which it is
+    written."""
     *macros, name = flat_name.split(".")
     key, places = "", task.places
     for macro in macros:

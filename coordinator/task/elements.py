@@ -1,4 +1,5 @@
-"""What a robotic task is made of: primitive tasks, places, transitions, events, variables and subnets as immutable records."""
+"""What a robotic task is made of: primitive tasks, places, transitions, events, variables and
+subnets as immutable records."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from coordinator.conditions import Expression
+from petrobot.coordinator.conditions import Expression
 
 Value = Any
 """Plain data: None, bool, int, float, str, or lists and string-keyed mappings of them."""
@@ -39,7 +40,8 @@ class Kind(StrEnum):
     CONTROL = "control"
     """Task flow alone; the operator may put tokens in and take them out."""
     MACRO = "macro"
-    """A part of the net drawn as one place: a subnet of its own, or the places and transitions that name it."""
+    """A part of the net drawn as one place: a subnet of its own, or the places and transitions that
+    name it."""
 
 
 class End(StrEnum):
@@ -69,7 +71,8 @@ class Scope(StrEnum):
     """Who detects an event (paper, section 2)."""
 
     INTERNAL = "internal"
-    """A primitive task raises it while its run goes on; it is latched to that run and gone with it."""
+    """A primitive task raises it while its run goes on; it is latched to that run and gone with
+    it."""
     EXTERNAL = "external"
     """A sensor, a timer, another node or the operator."""
 
@@ -97,7 +100,8 @@ class Start(StrEnum):
 
     WHEN_FREE = "when_free"
     AT_ONCE = "at_once"
-    """For actions such as hold, which must begin although another run on the device has not stopped yet."""
+    """For actions such as hold, which must begin although another run on the device has not stopped
+    yet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +118,8 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class PrimitiveTask:
-    """A step of the task with a goal of its own, translated into one of several primitive actions (paper, section 2)."""
+    """A step of the task with a goal of its own, translated into one of several primitive actions
+    (paper, section 2)."""
 
     name: str
     goal: str
@@ -126,12 +131,14 @@ class PrimitiveTask:
     target_reliability: float = 0.9
     """R_d of docs: cost is taken in the hardest scenario whose reliability is not below it."""
     cost: str = "wall"
-    """`wall` or `cpu` (s), `count` (what the result says in `count`, else 1), or `value:NAME`: a number of that name in it."""
+    """`wall` or `cpu` (s), `count` (what the result says in `count`, else 1), or `value:NAME`: a
+    number of that name in it."""
     error_causes: Mapping[str, str] = field(default_factory=dict)
     """Cause codes that its actions give with ERROR, with a sentence for people."""
     start: Start = Start.WHEN_FREE
     stop_within: float = 2.0
-    """Seconds in which a cancelled run has to stop before its device is stopped and its worker killed."""
+    """Seconds in which a cancelled run has to stop before its device is stopped and its worker
+    killed."""
     estimates: Mapping[Status, Estimate] = field(default_factory=dict)
 
 
@@ -157,11 +164,14 @@ class Place:
     out: Mapping[str, str] = field(default_factory=dict)
     """Action place: which value of the result goes to which variable."""
     servers: int | None = None
-    """Action place: how many runs go on at once, further tokens queue; None: one, and a second token is a fault."""
+    """Action place: how many runs go on at once, further tokens queue; None: one, and a second
+    token is a fault."""
     subnet: str = ""
-    """Macro place: the subnet that it stands for; empty for one that only shows those that name it in `macro`."""
+    """Macro place: the subnet that it stands for; empty for one that only shows those that name it
+    in `macro`."""
     macro: str = ""
-    """Macro place within which it is drawn; empty: none. Its meaning is the same with and without."""
+    """Macro place within which it is drawn; empty: none. Its meaning is the same with and
+    without."""
     label: str = ""
     x: float | None = None
     y: float | None = None
@@ -169,7 +179,8 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Input:
-    """An arc from a place to a transition. `end` is set exactly on arcs out of action places (and macro places)."""
+    """An arc from a place to a transition. `end` is set exactly on arcs out of action places (and
+    macro places)."""
 
     place: str
     weight: int = 1
@@ -212,7 +223,8 @@ class Transition:
     after: float | None = None
     """Fires so many seconds after its arcs became satisfied."""
     error_branch: bool = False
-    """Said to belong to an error branch; those behind an `error` arc belong there without saying so."""
+    """Said to belong to an error branch; those behind an `error` arc belong there without saying
+    so."""
     macro: str = ""  # as of a place
     label: str = ""
     x: float | None = None
@@ -232,7 +244,8 @@ class Event:
     by: str = ""
     """Internal events only: the primitive task that raises it."""
     mean_wait: float | None = None
-    """Expected seconds from the moment something waits for it until it comes, for forecasts before any measurement."""
+    """Expected seconds from the moment something waits for it until it comes, for forecasts before
+    any measurement."""
     text: str = ""
 
 
@@ -263,7 +276,9 @@ class VariableType(StrEnum):
     def of(cls, value: Value) -> VariableType:
         """The narrowest type that admits the value."""
         return next(
-            t for t in (cls.ANY if value is None else cls.BOOL, cls.INT, cls.FLOAT, cls.STR, cls.ANY) if t.admits(value)
+            t
+            for t in (cls.ANY if value is None else cls.BOOL, cls.INT, cls.FLOAT, cls.STR, cls.ANY)
+            if t.admits(value)
         )
 
 
@@ -275,12 +290,14 @@ class Variable:
     type: VariableType
     initial: Value = None
     values: tuple[str, ...] = ()
-    """A `str` variable's possible values, if they are few: then `check` can prove that conditions cover all cases."""
+    """A `str` variable's possible values, if they are few: then `check` can prove that conditions
+    cover all cases."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subnet:
-    """A net within the net, used through macro places; its names are prefixed with the macro place's."""
+    """A net within the net, used through macro places; its names are prefixed with the macro
+    place's."""
 
     name: str
     places: Mapping[str, Place]

@@ -1,7 +1,8 @@
 """The robotic task model: a whole task as an immutable record, its flat form and its ordinary net.
 
-A task is one interpreted Petri net (paper, sections 2 and 5) together with what its places and transitions mean. `Task.net`
-is its ordinary net (docs/semantics.md, section 8): events, conditions, priorities, weights and times dropped.
+A task is one interpreted Petri net (paper, sections 2 and 5) together with what its places and
+transitions mean. `Task.net` is its ordinary net (docs/semantics.md, section 8): events, conditions,
+priorities, weights and times dropped.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from coordinator.conditions import Expression
-from coordinator.net import Net
-from coordinator.task.elements import (
+from petrobot.coordinator.conditions import Expression
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task.elements import (
     End,
     Event,
     Input,
@@ -25,7 +26,7 @@ from coordinator.task.elements import (
     Value,
     Variable,
 )
-from coordinator.task.subnets import unfolded
+from petrobot.coordinator.task.subnets import unfolded
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ class Task:
     runs_place: str = ""
     """Control place whose tokens are the mission runs still to do."""
     parameters: Mapping[str, Value] = field(default_factory=dict)
-    """Names and defaults of what a user sets for a mission run; read like variables, never written."""
+    """Names and defaults of what a user sets for a mission run; read like variables, never
+    written."""
     variables: Mapping[str, Variable] = field(default_factory=dict)
     events: Mapping[str, Event] = field(default_factory=dict)
     subnets: Mapping[str, Subnet] = field(default_factory=dict)
@@ -57,13 +59,16 @@ class Task:
     """Service that is called at its end and gives the task's own results; empty: none."""
     text: str = ""
     pictures: str = ""
-    """Import path "module:function" of what draws a mission run's result for its report: SVG by title; empty: nothing."""
+    """Import path "module:function" of what draws a mission run's result for its report: SVG by
+    title; empty: nothing."""
     services: str = ""
-    """Location file that the task is usually run with, relative to the task's own file; empty: the one at hand."""
+    """Location file that the task is usually run with, relative to the task's own file; empty: the
+    one at hand."""
 
     @cached_property
     def flat(self) -> Task:
-        """The task with every macro place replaced by its subnet or by those drawn within it; itself if there is none."""
+        """The task with every macro place replaced by its subnet or by those drawn within it;
+        itself if there is none."""
         if not any(p.kind is Kind.MACRO for p in self.places.values()):
             return self
         places, transitions = unfolded(self.places, self.transitions, self.subnets)
@@ -71,30 +76,39 @@ class Task:
 
     @cached_property
     def net(self) -> Net:
-        """The ordinary net of the flat task: places, arcs, inhibitors, capacities and initial marking alone.
+        """The ordinary net of the flat task: places, arcs, inhibitors, capacities and initial
+        marking alone.
 
-        Priorities are left out on purpose: they settle conflicts among transitions whose events have come, so as
-        priorities of the ordinary net they would forbid firings that do happen.
+        Priorities are left out on purpose: they settle conflicts among transitions whose events
+        have come, so as priorities of the ordinary net they would forbid firings that do happen.
         """
         flat = self.flat
         return Net.build(
             {p.name: p.tokens for p in flat.places.values()},
             {t.name: (_weights(t.inputs), _produced(t)) for t in flat.transitions.values()},
-            inhibitors={t.name: {i.place: i.threshold for i in t.inhibitors} for t in flat.transitions.values()},
+            inhibitors={
+                t.name: {i.place: i.threshold for i in t.inhibitors}
+                for t in flat.transitions.values()
+            },
             capacity={p.name: p.capacity for p in flat.places.values() if p.capacity is not None},
         )
 
     @cached_property
     def error_elements(self) -> frozenset[str]:
-        """Names of places and transitions that only error branches reach (of `self`, macro places unexpanded)."""
+        """Names of places and transitions that only error branches reach (of `self`, macro places
+        unexpanded)."""
         transitions = {
-            t.name for t in self.transitions.values() if t.error_branch or any(i.end is End.ERROR for i in t.inputs)
+            t.name
+            for t in self.transitions.values()
+            if t.error_branch or any(i.end is End.ERROR for i in t.inputs)
         }
         places: set[str] = set()
         while True:
             new_places = set(self._only_fed_by(transitions)) - places
             new_transitions = {
-                t.name for t in self.transitions.values() if any(i.place in places | new_places for i in t.inputs)
+                t.name
+                for t in self.transitions.values()
+                if any(i.place in places | new_places for i in t.inputs)
             } - transitions
             if not new_places and not new_transitions:
                 return frozenset(places | transitions)
@@ -104,7 +118,11 @@ class Task:
     def _only_fed_by(self, transitions: set[str]) -> Iterator[str]:
         """Places without tokens of their own whose every producer is among the transitions."""
         for place in self.places.values():
-            feeders = [t.name for t in self.transitions.values() if any(o.place == place.name for o in t.outputs)]
+            feeders = [
+                t.name
+                for t in self.transitions.values()
+                if any(o.place == place.name for o in t.outputs)
+            ]
             if feeders and not place.tokens and transitions.issuperset(feeders):
                 yield place.name
 

@@ -1,7 +1,9 @@
-"""Macro places: a net with every macro place replaced by its subnet, names prefixed with the macro place's.
+"""Macro places: a net with every macro place replaced by its subnet, names prefixed with the macro
+place's.
 
-A macro place without a subnet only shows what is drawn within it (`macro`): that stays as it is, the place is dropped. In the
-flat task `macro` of every place and transition is the full name of the innermost macro place around it.
+A macro place without a subnet only shows what is drawn within it (`macro`): that stays as it is,
+the place is dropped. In the flat task `macro` of every place and transition is the full name of the
+innermost macro place around it.
 """
 
 from __future__ import annotations
@@ -9,15 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from coordinator.conditions import rename
-from coordinator.task.elements import End, Input, Kind, Output, Place, Subnet, Transition
+from petrobot.coordinator.conditions import rename
+from petrobot.coordinator.task.elements import End, Input, Kind, Output, Place, Subnet, Transition
 
 
 class CircleError(ValueError):
-    """A subnet that contains itself; `key` is that of the place, in the task file, by which it does."""
+    """A subnet that contains itself; `key` is that of the place, in the task file, by which it
+    does."""
 
     def __init__(self, inside: tuple[str, ...], place: Place) -> None:
-        super().__init__(f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}")
+        super().__init__(
+            f"subnet {place.subnet!r} contains itself by {' > '.join((*inside, place.subnet))}"
+        )
         self.key = f"subnets.{inside[-1]}.places.{place.name}.subnet"
 
 
@@ -33,11 +38,14 @@ class _Flat:
 
 
 def unfolded(
-    places: Mapping[str, Place], transitions: Mapping[str, Transition], subnets: Mapping[str, Subnet]
+    places: Mapping[str, Place],
+    transitions: Mapping[str, Transition],
+    subnets: Mapping[str, Subnet],
 ) -> tuple[dict[str, Place], dict[str, Transition]]:
     """Places and transitions of the flat net.
 
-    Raises CircleError on subnets that contain themselves; other faults are for `consistency.faults`.
+    Raises CircleError on subnets that contain themselves; other faults are for
+    `consistency.faults`.
     """
     flat = _Flat(subnets)
     _unfold(flat, "", places, transitions, ())
@@ -63,11 +71,14 @@ def _unfold(
         flat.entered[name] = subnet = flat.subnets[place.subnet]
         _unfold(flat, f"{name}.", subnet.places, subnet.transitions, (*inside, place.subnet))
     for transition in transitions.values():
-        flat.transitions[prefix + transition.name] = _prefixed(transition, prefix, places) if prefix else transition
+        flat.transitions[prefix + transition.name] = (
+            _prefixed(transition, prefix, places) if prefix else transition
+        )
 
 
 def _around(prefix: str, macro: str) -> str:
-    """The full name of the innermost macro place around something: the one it names, else the one whose subnet it is in."""
+    """The full name of the innermost macro place around something: the one it names, else the one
+    whose subnet it is in."""
     return prefix + macro if macro else prefix.removesuffix(".")
 
 
@@ -87,7 +98,8 @@ def _prefixed(transition: Transition, prefix: str, siblings: Mapping[str, Place]
 
 
 def _rewire(transition: Transition, entries: Mapping[str, Subnet]) -> Transition:
-    """The transition with its arcs to and from macro places bent to the subnets' entry and exit places."""
+    """The transition with its arcs to and from macro places bent to the subnets' entry and exit
+    places."""
     return replace(
         transition,
         inputs=tuple(_from(a, entries) for a in transition.inputs),
@@ -105,4 +117,8 @@ def _from(arc: Input, entries: Mapping[str, Subnet]) -> Input:
     if arc.place not in entries:
         return arc
     subnet = entries[arc.place]
-    return replace(arc, place=f"{arc.place}.{subnet.error if arc.end is End.ERROR else subnet.normal}", end=None)
+    return replace(
+        arc,
+        place=f"{arc.place}.{subnet.error if arc.end is End.ERROR else subnet.normal}",
+        end=None,
+    )

@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
-from coordinator.task.elements import End, Transition
-from coordinator.task.model import Task
+from petrobot.coordinator.task.elements import End, Transition
+from petrobot.coordinator.task.model import Task
 
 
 def is_timeless(t: Transition) -> bool:
     """Whether the transition waits neither for an event nor for a time nor for the end of a run."""
-    return not t.events and t.after is None and not any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs)
+    return (
+        not t.events
+        and t.after is None
+        and not any(a.end in (End.NORMAL, End.ERROR) for a in t.inputs)
+    )
 
 
 def endless(task: Task) -> set[str]:
-    """Transitions of a flat task that might fire for ever without time passing; none: every such sequence comes to an end.
+    """Transitions of a flat task that might fire for ever without time passing; none: every such
+    sequence comes to an end.
 
-    Of the transitions that wait for nothing, those are dropped again and again that drain a place which no other of
-    them fills: they can fire only finitely often. Whatever is left may go on for ever.
+    Of the transitions that wait for nothing, those are dropped again and again that drain a place
+    which no other of them fills: they can fire only finitely often. Whatever is left may go on for
+    ever.
     """
     net = task.net
     effect = {
-        t: {p: _weight(net.produce[i], p) - _weight(net.consume[i], p) for p in range(len(net.places))}
+        t: {
+            p: _weight(net.produce[i], p) - _weight(net.consume[i], p)
+            for p in range(len(net.places))
+        }
         for i, t in enumerate(net.transitions)
     }
     loose = {t.name for t in task.transitions.values() if is_timeless(t)}
     while True:
         filled = {p for t in loose for p, change in effect[t].items() if change > 0}
-        finite = {t for t in loose if any(change < 0 and p not in filled for p, change in effect[t].items())}
+        finite = {
+            t
+            for t in loose
+            if any(change < 0 and p not in filled for p, change in effect[t].items())
+        }
         if not finite:
             return loose
         loose -= finite

@@ -1,4 +1,5 @@
-"""The short notation of arcs: `ball`, `runs*2`, `locate_ball:normal`, `catch_ball:preempt=success`, `!blocked*3`."""
+"""The short notation of arcs: `ball`, `runs*2`, `locate_ball:normal`, `catch_ball:preempt=success`,
+`!blocked*3`."""
 
 from __future__ import annotations
 
@@ -6,8 +7,8 @@ import re
 from enum import StrEnum
 from typing import TypeVar
 
-from coordinator.conditions.wording import nearest
-from coordinator.task import Counts, End, Inhibitor, Input, Output
+from petrobot.coordinator.conditions.wording import nearest
+from petrobot.coordinator.task import Counts, End, Inhibitor, Input, Output
 
 W = TypeVar("W", bound=StrEnum)
 _ARC = re.compile(
@@ -23,11 +24,16 @@ def read_input(text: str) -> Input | Inhibitor:
     """An arc of `in`. Raises ArcError."""
     found = _ARC.match(text.strip())
     if not found:
-        raise ArcError(f"{text!r} is no arc: write PLACE, PLACE*2, PLACE:normal, PLACE:preempt=success or !PLACE")
+        raise ArcError(
+            f"{text!r} is no arc: write PLACE, PLACE*2, PLACE:normal, PLACE:preempt=success "
+            "or !PLACE"
+        )
     weight = int(found["weight"] or 1)
     if found["bar"]:
         if found["end"]:
-            raise ArcError(f"{text!r}: an inhibitor arc looks at tokens alone: write !{found['place']}")
+            raise ArcError(
+                f"{text!r}: an inhibitor arc looks at tokens alone: write !{found['place']}"
+            )
         return Inhibitor(found["place"], weight)
     end = _word(End, found["end"], text)
     counts = _word(Counts, found["counts"], text)
@@ -63,4 +69,6 @@ def _word(words: type[W], text: str | None, arc: str) -> W | None:
         return words(text)
     except ValueError:
         known = ", ".join(words)
-        raise ArcError(f"{arc!r}: {text!r} is none of {known}{nearest(text, list(words))}") from None
+        raise ArcError(
+            f"{arc!r}: {text!r} is none of {known}{nearest(text, list(words))}"
+        ) from None

@@ -7,9 +7,9 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from coordinator.conditions import ConditionError, Expression, parse
-from coordinator.conditions.wording import Fault
-from coordinator.task import (
+from petrobot.coordinator.conditions import ConditionError, Expression, parse
+from petrobot.coordinator.conditions.wording import Fault
+from petrobot.coordinator.task import (
     Early,
     Estimate,
     Event,
@@ -31,10 +31,10 @@ from coordinator.task import (
     Variable,
     VariableType,
 )
-from coordinator.task.consistency import faults as task_faults
-from coordinator.taskfile.arcs import ArcError, read_input, read_output
-from coordinator.taskfile.errors import TaskFileError, key_lines, line_of
-from coordinator.taskfile.table import Table
+from petrobot.coordinator.task.consistency import faults as task_faults
+from petrobot.coordinator.taskfile.arcs import ArcError, read_input, read_output
+from petrobot.coordinator.taskfile.errors import TaskFileError, key_lines, line_of
+from petrobot.coordinator.taskfile.table import Table
 
 SCHEMA = 1
 LARGEST = 4 << 20
@@ -46,28 +46,39 @@ def load(path: str | Path) -> Task:
     try:
         data = path.read_bytes()
     except OSError as error:
-        fault = Fault("file", f"cannot be read: {error.strerror}", "check the path and its permissions")
+        fault = Fault(
+            "file", f"cannot be read: {error.strerror}", "check the path and its permissions"
+        )
         raise TaskFileError(str(path), [fault], [0]) from error
     if len(data) > LARGEST:
-        raise TaskFileError(str(path), [Fault("file", f"{len(data)} bytes", f"a task has at most {LARGEST}")], [0])
+        raise TaskFileError(
+            str(path), [Fault("file", f"{len(data)} bytes", f"a task has at most {LARGEST}")], [0]
+        )
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
-        raise TaskFileError(str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]) from error
+        raise TaskFileError(
+            str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]
+        ) from error
     return loads(text, str(path))
 
 
 def loads(text: str, source: str = "task") -> Task:
-    """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every fault."""
+    """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every
+    fault."""
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         found = re.search(r"at line (\d+)", str(error))
         line = int(found[1]) if found else text.count("\n") + 1  # "at end of document"
-        raise TaskFileError(source, [Fault("TOML", str(error), "see toml.io for the syntax")], [line]) from error
+        raise TaskFileError(
+            source, [Fault("TOML", str(error), "see toml.io for the syntax")], [line]
+        ) from error
     except RecursionError as error:
-        raise TaskFileError(source, [Fault("TOML", "nested too deeply", "flatten it")], [0]) from error
+        raise TaskFileError(
+            source, [Fault("TOML", "nested too deeply", "flatten it")], [0]
+        ) from error
     faults: list[Fault] = []
     task = _task(Table(data, "", faults))
     faults = faults or list(task_faults(task))
@@ -95,7 +106,9 @@ def _task(root: Table) -> Task:
         pictures=head.text("pictures", ""),
         services=head.text("services", ""),
         parameters=head.plain("parameters"),
-        primitive_tasks={n: _primitive_task(n, t) for n, t in root.tables("primitive_tasks").items()},
+        primitive_tasks={
+            n: _primitive_task(n, t) for n, t in root.tables("primitive_tasks").items()
+        },
         variables={n: _variable(n, t) for n, t in root.tables("variables").items()},
         events={n: _event(n, t) for n, t in root.tables("events").items()},
         places={n: _place(n, t) for n, t in root.tables("places").items()},

@@ -1,4 +1,5 @@
-"""Reading one TOML table: every key is asked for by name and type, every fault is collected, leftovers are refused."""
+"""Reading one TOML table: every key is asked for by name and type, every fault is collected,
+leftovers are refused."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any, TypeVar
 
-from coordinator.conditions.wording import Fault, nearest
+from petrobot.coordinator.conditions.wording import Fault, nearest
 
 E = TypeVar("E", bound=StrEnum)
 _KINDS: Mapping[type, str] = {
@@ -21,7 +22,8 @@ _KINDS: Mapping[type, str] = {
 
 
 class Table:
-    """A table, its key in the file and the list that collects faults. Wrong or missing values read as their default."""
+    """A table, its key in the file and the list that collects faults. Wrong or missing values read
+    as their default."""
 
     def __init__(self, data: Mapping[str, Any], key: str, faults: list[Fault]) -> None:
         self.data = data
@@ -73,7 +75,11 @@ class Table:
         try:
             return words(text)
         except ValueError:
-            self.fault(name, f"{text!r} is none of {', '.join(words)}", nearest(text, list(words)).strip(" ()"))
+            self.fault(
+                name,
+                f"{text!r} is none of {', '.join(words)}",
+                nearest(text, list(words)).strip(" ()"),
+            )
             return first
 
     def texts(self, name: str, single: bool = False) -> tuple[str, ...]:
@@ -116,7 +122,9 @@ class Table:
         for name in self.data:
             if name not in self.asked:
                 near = nearest(name, self.asked).strip(" ()")
-                self.fault(name, "unknown key", near or f"known here: {', '.join(sorted(self.asked))}")
+                self.fault(
+                    name, "unknown key", near or f"known here: {', '.join(sorted(self.asked))}"
+                )
 
     def _value(self, name: str, kind: type, default: Any, fallback: Any) -> Any:
         self.asked.add(name)

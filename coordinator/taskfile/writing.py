@@ -1,4 +1,5 @@
-"""Task to TOML, canonically: the same task always gives the same text, and reading it gives the same task."""
+"""Task to TOML, canonically: the same task always gives the same text, and reading it gives the
+same task."""
 
 from __future__ import annotations
 
@@ -7,18 +8,23 @@ from dataclasses import fields
 from enum import StrEnum
 from typing import Any
 
-from coordinator.conditions import Expression
-from coordinator.task import Place, Reference, Subnet, Task, Transition
-from coordinator.taskfile.arcs import write_arc
-from coordinator.taskfile.reading import SCHEMA
+from petrobot.coordinator.conditions import Expression
+from petrobot.coordinator.task import Place, Reference, Subnet, Task, Transition
+from petrobot.coordinator.taskfile.arcs import write_arc
+from petrobot.coordinator.taskfile.reading import SCHEMA
 
 _SHORT = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
 def dumps(task: Task) -> str:
     """The task as TOML text."""
-    head = {k: getattr(task, k) for k in ("name", "text", "goal", "goal_transitions", "final", "final_error")}
-    head |= {k: getattr(task, k) for k in ("runs_place", "prepare", "score", "pictures", "services")}
+    head = {
+        k: getattr(task, k)
+        for k in ("name", "text", "goal", "goal_transitions", "final", "final_error")
+    }
+    head |= {
+        k: getattr(task, k) for k in ("runs_place", "prepare", "score", "pictures", "services")
+    }
     lines = [f"schema = {SCHEMA}", ""]
     lines += _section("task", head)
     if task.parameters:
@@ -38,7 +44,9 @@ def _subnet(subnet: Subnet) -> list[str]:
     return _section(key, ports) + _net(f"{key}.", subnet.places, subnet.transitions)
 
 
-def _net(prefix: str, places: Mapping[str, Place], transitions: Mapping[str, Transition]) -> list[str]:
+def _net(
+    prefix: str, places: Mapping[str, Place], transitions: Mapping[str, Transition]
+) -> list[str]:
     lines: list[str] = []
     for name, place in places.items():
         lines += _section(f"{prefix}places.{_name(name)}", _changed(place))
@@ -64,7 +72,9 @@ def _changed(record: Any) -> dict[str, Any]:
     return {
         f.name: int(value) if f.name in ("x", "y") and value == int(value) else value
         for f in fields(record)
-        if f.name != "name" and (value := getattr(record, f.name)) != f.default and value not in ({}, None)
+        if f.name != "name"
+        and (value := getattr(record, f.name)) != f.default
+        and value not in ({}, None)
     }
 
 
@@ -101,7 +111,11 @@ def _name(text: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    return '"' + "".join(_SHORT.get(c, c if c.isprintable() or c == " " else _escape(c)) for c in text) + '"'
+    return (
+        '"'
+        + "".join(_SHORT.get(c, c if c.isprintable() or c == " " else _escape(c)) for c in text)
+        + '"'
+    )
 
 
 def _escape(c: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from services.comm.under_way import NEVER, Patience
+from petrobot.services.comm.under_way import NEVER, Patience
 
 LOST: Final = "lost"
 UNREACHABLE: Final = "unreachable"
@@ -39,7 +39,8 @@ class Absence:
     def wait(self, now: float) -> None:
         """A link is being tried for the first time or again: calls wait for it."""
         self._wait_until(
-            now + self._patience.reconnect, f"{self._peer} did not come back in {self._patience.reconnect:g} s"
+            now + self._patience.reconnect,
+            f"{self._peer} did not come back in {self._patience.reconnect:g} s",
         )
 
     def fail(self, trouble: str) -> None:
@@ -59,8 +60,8 @@ class Absence:
     def new_call(self, now: float) -> Away | None:
         """What a new call is told at once; None: it waits.
 
-        One that follows another too soon waits a little: a task that tries again at once must not go round as fast as the
-        machine can.
+        One that follows another too soon waits a little: a task that tries again at once must not
+        go round as fast as the machine can.
         """
         if now < self.until < NEVER:
             return None
@@ -77,7 +78,9 @@ class Absence:
         if now < self.until:
             return None
         self.until = NEVER
-        return Away(REFUSED if self._refusal else LOST, self._refusal or self._with_trouble(self._why))
+        return Away(
+            REFUSED if self._refusal else LOST, self._refusal or self._with_trouble(self._why)
+        )
 
     def _with_trouble(self, text: str) -> str:
         return f"{text} ({self._trouble})" if self._trouble and self._trouble not in text else text

@@ -1,4 +1,5 @@
-"""Who may knock, and how fast one may speak: limits of a listening end as machines without clock."""
+"""Who may knock, and how fast one may speak: limits of a listening end as machines without
+clock."""
 
 from __future__ import annotations
 
@@ -31,9 +32,11 @@ class Bucket:
 
 
 class Knocks:
-    """Handshakes that failed, by address: a stranger who tries keys, or only connects, is not even listened to for a while.
+    """Handshakes that failed, by address: a stranger who tries keys, or only connects, is not even
+    listened to for a while.
 
-    A good caller fails none, so it is never kept waiting by its own address; `rate` a second and `burst` at once are allowed.
+    A good caller fails none, so it is never kept waiting by its own address; `rate` a second and
+    `burst` at once are allowed.
     """
 
     def __init__(self, rate: float, burst: float) -> None:

@@ -1,18 +1,24 @@
-"""The called end of the node protocol for all callers of a node, as a machine: what runs, how it ended, who was told.
+"""The called end of the node protocol for all callers of a node, as a machine: what runs, how it
+ended, who was told.
 
-Used alike in real time (`server.py` drives it) and in lock step. The node takes its `orders` and reports back with
-`finish`, `feedback`, `raise_event` and `answer`. What it promises:
+Used alike in real time (`server.py` drives it) and in lock step. The node takes its `orders` and
+reports back with `finish`, `feedback`, `raise_event` and `answer`. What it promises:
 
-- A call id is run at most once in the life of this boot: a known id is re-attached or answered from its stored result, one
-  whose result is gone is remembered as an id. Once the memory for ids was full (`FinishedIds.complete`), a call that may have
-  been sent before (`Call.again`) and is not known does not run: it may be among those forgotten.
-- Every run ends with one outcome, kept until its caller acknowledges it or `Keeping.results` is over.
-- A run goes on no longer than its deadline, and no longer without its caller than its offer's `orphan_time`.
+- A call id is run at most once in the life of this boot: a known id is re-attached or answered from
+  its stored result, one
+  whose result is gone is remembered as an id. Once the memory for ids was full
+  (`FinishedIds.complete`), a call that may have been sent before (`Call.again`) and is not known
+  does not run: it may be among those forgotten.
+- Every run ends with one outcome, kept until its caller acknowledges it or `Keeping.results` is
+  over.
+- A run goes on no longer than its deadline, and no longer without its caller than its offer's
+  `orphan_time`.
 - A device takes orders from one caller at a time: the holder of its lease.
 
-Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch, device_leased,
-device_needs_coordinator, cancelled (before it began), and busy from the node's runner. executed = unknown: rebooted (meant
-for another boot), forgotten (its result was kept no longer, or perhaps not even its id).
+Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch,
+device_leased, device_needs_coordinator, cancelled (before it began), and busy from the node's
+runner. executed = unknown: rebooted (meant for another boot), forgotten (its result was kept no
+longer, or perhaps not even its id).
 """
 
 from __future__ import annotations
@@ -22,9 +28,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from services.comm.events import EventBoard
-from services.comm.going import DEADLINE, NEVER, GoingRuns, Run
-from services.comm.messages import (
+from petrobot.services.comm.events import EventBoard
+from petrobot.services.comm.going import DEADLINE, NEVER, GoingRuns, Run
+from petrobot.services.comm.messages import (
     Accept,
     Answer,
     Bye,
@@ -45,25 +51,27 @@ from services.comm.messages import (
     Subscribe,
     Welcome,
 )
-from services.comm.orders import CancelRun, Commanded, Inline, Offer, Order, StartRun
-from services.comm.peers import COORDINATOR, Peers
-from services.comm.plain import NotPlainError, plain
-from services.comm.results import Keeping, ResultStore
-from services.comm.wire import NEWEST_VERSION, negotiate
+from petrobot.services.comm.orders import CancelRun, Commanded, Inline, Offer, Order, StartRun
+from petrobot.services.comm.peers import COORDINATOR, Peers
+from petrobot.services.comm.plain import NotPlainError, plain
+from petrobot.services.comm.results import Keeping, ResultStore
+from petrobot.services.comm.wire import NEWEST_VERSION, negotiate
 
 __all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Order", "StartRun"]
 
 ERROR: Final = "error"
 HOLD, RELEASE, HELD = "hold", "release", "held"
 ANSWERS: Final = 64
-"""Answers to commands that are kept. A command is repeated at once or never, and an answer is some hundred bytes."""
+"""Answers to commands that are kept. A command is repeated at once or never, and an answer is some
+hundred bytes."""
 
 
 class Callee:
-    """What a node offers, to all its callers. `offers` are by name; `boot` is drawn anew at each start of the process.
+    """What a node offers, to all its callers. `offers` are by name; `boot` is drawn anew at each
+    start of the process.
 
-    Callers are known by their name: one process a name. Raises nothing on what callers do; `finish` and its like raise
-    ValueError when the node itself names a run that does not go on.
+    Callers are known by their name: one process a name. Raises nothing on what callers do; `finish`
+    and its like raise ValueError when the node itself names a run that does not go on.
     """
 
     def __init__(
@@ -82,7 +90,8 @@ class Callee:
         self.directory = directory
         self.events = EventBoard()
         self.soonest = NEVER
-        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
+        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for
+        that."""
         self._keeping = keeping or Keeping()
         self._peers = Peers(name, directory, any_directory, self._keeping.lease)
         self._running = GoingRuns()
@@ -107,25 +116,35 @@ class Callee:
 
     # Callers come and go.
 
-    def link_up(self, now: float, peer: str, hello: Hello, *, local: bool = True) -> Welcome | Refuse:
-        """A caller has connected (`peer` is its name, `local` whether it lives on this host). Says what to answer it."""
+    def link_up(
+        self, now: float, peer: str, hello: Hello, *, local: bool = True
+    ) -> Welcome | Refuse:
+        """A caller has connected (`peer` is its name, `local` whether it lives on this host). Says
+        what to answer it."""
         refusal = self._peers.refusal(peer, hello)
         if refusal is not None:
             return refusal
         known = self._peers.get(peer)
         if known is None or (known.boot, known.epoch) != (hello.boot, hello.epoch):
             # Another process of that name counts its commands from the beginning again.
-            self._answers = OrderedDict((key, kept) for key, kept in self._answers.items() if key[0] != peer)
+            self._answers = OrderedDict(
+                (key, kept) for key, kept in self._answers.items() if key[0] != peer
+            )
         forgotten = self._peers.come(peer, hello, local)
         self.events.peer_down(forgotten, leaves=True)
         self._messages.extend((peer, event) for event in self.events.waiting(peer))
         version = negotiate(hello.oldest_version, hello.newest_version) or NEWEST_VERSION
-        offers = tuple(name for name, offer in self.offers.items() if local or offer.scope != "local")
-        runs = [id_ for id_, run in self._running.items() if run.peer == peer] + self._results.of(peer)
+        offers = tuple(
+            name for name, offer in self.offers.items() if local or offer.scope != "local"
+        )
+        runs = [id_ for id_, run in self._running.items() if run.peer == peer] + self._results.of(
+            peer
+        )
         return Welcome(version, self.name, self.boot, offers, tuple(runs), self.directory)
 
     def link_down(self, now: float, peer: str, *, leaves: bool = False) -> None:
-        """The link of a caller is down; with `leaves` it said good-bye and gives up its leases and subscriptions."""
+        """The link of a caller is down; with `leaves` it said good-bye and gives up its leases and
+        subscriptions."""
         if not self._peers.go(now, peer, leaves):
             return
         self.events.peer_down(peer, leaves)
@@ -158,7 +177,8 @@ class Callee:
             return
         if call.boot and call.boot != self.boot:
             text = f"this call was meant for another boot of {self.name}"
-            # Kept: a CANCEL that follows must not be answered as if the call had never left its caller.
+            # Kept: a CANCEL that follows must not be answered as if the call had never left its
+            # caller.
             self._end(now, peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN))
             return
         if call.again and not self._results.gone.complete:
@@ -176,14 +196,22 @@ class Callee:
             self._start(now, peer, call, offer)
 
     def answer_inline(self, now: float, peer: str, call: Call) -> Outcome | None:
-        """The outcome of a call to a service that is answered on the spot, None if it is another kind of call.
+        """The outcome of a call to a service that is answered on the spot, None if it is another
+        kind of call.
 
-        As `receive`, but the answer does not go through `messages`: the shell sends it, then has it kept by `keep`.
+        As `receive`, but the answer does not go through `messages`: the shell sends it, then has it
+        kept by `keep`.
         """
         offer = self.offers.get(call.service)
         id_ = call.id
         results = self._results
-        if offer is None or offer.inline is None or id_ in results.kept or id_ in results.gone or id_ in self._running:
+        if (
+            offer is None
+            or offer.inline is None
+            or id_ in results.kept
+            or id_ in results.gone
+            or id_ in self._running
+        ):
             return None
         if (call.boot and call.boot != self.boot) or (call.again and not results.gone.complete):
             return None
@@ -192,7 +220,8 @@ class Callee:
         return self._answered(now, offer.inline, call)
 
     def keep(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
-        """What `answer_inline` gave is on its way: keep it until it is acknowledged, as every result.
+        """What `answer_inline` gave is on its way: keep it until it is acknowledged, as every
+        result.
 
         `weight` is its length on the wire (bytes), None where it is not known.
         """
@@ -220,7 +249,9 @@ class Callee:
             self._messages.append((peer, outcome))
         else:
             text = "its result was kept no longer"
-            self._messages.append((peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN)))
+            self._messages.append(
+                (peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN))
+            )
 
     def _maybe_forgotten(self, id_: str) -> Outcome:
         text = f"{self.name} has forgotten ids of its oldest calls, and this one may be among them"
@@ -261,7 +292,9 @@ class Callee:
             self._end(now, peer, self._maybe_forgotten(cancel.id))
         else:
             # The call itself may still be on its way: remember that it must not begin.
-            self._end(now, peer, Outcome(cancel.id, ERROR, {}, "cancelled", cancel.reason, Executed.NO))
+            self._end(
+                now, peer, Outcome(cancel.id, ERROR, {}, "cancelled", cancel.reason, Executed.NO)
+            )
 
     def _take_subscribe(self, now: float, peer: str, subscribe: Subscribe) -> None:
         known = self._peers.get(peer)
@@ -283,7 +316,8 @@ class Callee:
         self._orders.append(Commanded(command, peer))
 
     def _known_command(self, peer: str, id_: str) -> None:
-        """A command that came before is not carried out again: its answer is said again, or comes when it is there."""
+        """A command that came before is not carried out again: its answer is said again, or comes
+        when it is there."""
         if (answer := self._answers.get((peer, id_))) is not None:
             self._messages.append((peer, answer))
         elif (owner := self._commands[id_][0]) != peer:
@@ -305,27 +339,40 @@ class Callee:
         cpu_seconds: float = 0.0,
         deferred: bool = False,
     ) -> Outcome:
-        """A run has ended; gives the outcome its caller is told. `seconds` is taken from the clock when left out.
+        """A run has ended; gives the outcome its caller is told. `seconds` is taken from the clock
+        when left out.
 
-        One that was stopped by its deadline ends ERROR `deadline` whatever it says; one stopped for another reason keeps
-        its own status if it had ended before. Raises ValueError if no such run goes on.
+        One that was stopped by its deadline ends ERROR `deadline` whatever it says; one stopped for
+        another reason keeps its own status if it had ended before. Raises ValueError if no such run
+        goes on.
         """
         run = self._running.pop(id, None)
         if run is None:
             raise ValueError(f"run {id}: no such run goes on")
         took = now - run.began if seconds is None else seconds
         if run.reason == "deadline":
-            text = text or f"it had not ended within its deadline (it ended {status} after {took:.3f} s)"
+            text = (
+                text
+                or f"it had not ended within its deadline (it ended {status} after {took:.3f} s)"
+            )
             outcome = Outcome(id, ERROR, {}, "deadline", text, executed, took, cpu_seconds)
         else:
             if run.stopping and cause == "cancelled":
                 cause, text = run.reason, text or run.call.service
-            outcome = Outcome(id, status, values or {}, cause, text, executed, took, cpu_seconds, deferred)
+            outcome = Outcome(
+                id, status, values or {}, cause, text, executed, took, cpu_seconds, deferred
+            )
         outcome = _sendable(outcome)
         self._end(now, run.peer, outcome)
         return outcome
 
-    def feedback(self, now: float, id: str, fraction: float, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
+    def feedback(
+        self,
+        now: float,
+        id: str,  # noqa: A002
+        fraction: float,
+        data: Mapping[str, Any] | None = None,
+    ) -> None:
         """Tell a run's caller how far it is (0 to 1); nothing is kept for one that is away."""
         run = self._running.get(id)
         if run is None:
@@ -342,9 +389,11 @@ class Callee:
         latched: bool = False,
         run: str = "",
     ) -> Event:
-        """Raise an event: of the outside world for whoever subscribed to it, or of a run that goes on, for its caller.
+        """Raise an event: of the outside world for whoever subscribed to it, or of a run that goes
+        on, for its caller.
 
-        A latched one is numbered by its source (default: this node) and kept until it is acknowledged.
+        A latched one is numbered by its source (default: this node) and kept until it is
+        acknowledged.
         """
         owner = ""
         if run:
@@ -358,15 +407,18 @@ class Callee:
         return event
 
     def answer(self, now: float, id: str, ok: bool, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
-        """Answer a command. Of a `hold`, `answers` in the data say by device (runs without one: this node's name) what became
-        of it: the deadlines of runs that are held stand still until a `release`. Raises ValueError if nobody waits for it.
+        """Answer a command. Of a `hold`, `answers` in the data say by device (runs without one:
+        this node's name) what became of it: the deadlines of runs that are held stand still until a
+        `release`. Raises ValueError if nobody waits for it.
         """
         peer, verb = self._commands.pop(id, ("", ""))
         if not peer:
             raise ValueError(f"command {id}: nobody waits for its answer")
         if verb == HOLD and data is not None:
             answers = data.get("answers", {})
-            self._running.hold_all(now, ["" if d == self.name else d for d, said in answers.items() if said == HELD])
+            self._running.hold_all(
+                now, ["" if d == self.name else d for d, said in answers.items() if said == HELD]
+            )
         answer = Answer(id, ok, plain(data or {}, "data"))
         self._answers[peer, id] = answer
         if len(self._answers) > ANSWERS:
@@ -392,7 +444,8 @@ class Callee:
     # What time does.
 
     def advance(self, now: float) -> None:
-        """Stop what is over its deadline or an orphan for too long; forget what was kept long enough."""
+        """Stop what is over its deadline or an orphan for too long; forget what was kept long
+        enough."""
         for due, kind, id_, run in self._running.over(now):
             if kind == DEADLINE or self._is_orphan(run, due):
                 self._stop(id_, run, kind, kind)
@@ -429,5 +482,7 @@ def _sendable(outcome: Outcome) -> Outcome:
         values = plain(outcome.values, "values") if outcome.values else outcome.values
     except NotPlainError as fault:
         text = f"what it returned cannot be sent: {fault}"
-        return replace(outcome, status=ERROR, values={}, cause="bad_result", text=text, deferred=False)
+        return replace(
+            outcome, status=ERROR, values={}, cause="bad_result", text=text, deferred=False
+        )
     return replace(outcome, status=str(outcome.status), values=values)

@@ -1,13 +1,18 @@
-"""The calling end of the node protocol for one peer, as a machine: calls out, how each one ended in.
+"""The calling end of the node protocol for one peer, as a machine: calls out, how each one ended
+in.
 
-Used alike in real time (`client.py` drives it) and in lock step (its messages travel in envelopes). What it promises:
+Used alike in real time (`client.py` drives it) and in lock step (its messages travel in envelopes).
+What it promises:
 
 - Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
-- No call is ever made again under another id. After a lost link the same call is sent again under the same id to the same
-  boot of the peer, marked `again`: the peer knows the id, or says that it may have forgotten it, and runs it at most once.
-  Another boot is never sent it.
-- What the caller decides by itself is ERROR with a cause (the table in docs/protocol.md): executed = no where the call never
-  left, unknown otherwise, also when its owner names the boot it was meant for: he may have sent it before he was restarted.
+- No call is ever made again under another id. After a lost link the same call is sent again under
+  the same id to the same
+  boot of the peer, marked `again`: the peer knows the id, or says that it may have forgotten it,
+  and runs it at most once. Another boot is never sent it.
+- What the caller decides by itself is ERROR with a cause (the table in docs/protocol.md): executed
+  = no where the call never
+  left, unknown otherwise, also when its owner names the boot it was meant for: he may have sent it
+  before he was restarted.
 """
 
 from __future__ import annotations
@@ -16,15 +21,35 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from services.comm import messages as m
-from services.comm.absence import LOST, REFUSED, UNREACHABLE, Absence
-from services.comm.events import EventIntake
-from services.comm.notice import Accepted, Answered, Ended, EventArrived, Late, Notice, PeerBack, PeerLost, Progress
-from services.comm.plain import plain
-from services.comm.settled import Settled
-from services.comm.under_way import NEVER, Patience, Pending, UnderWay, Waiter
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.absence import LOST, REFUSED, UNREACHABLE, Absence
+from petrobot.services.comm.events import EventIntake
+from petrobot.services.comm.notice import (
+    Accepted,
+    Answered,
+    Ended,
+    EventArrived,
+    Late,
+    Notice,
+    PeerBack,
+    PeerLost,
+    Progress,
+)
+from petrobot.services.comm.plain import plain
+from petrobot.services.comm.settled import Settled
+from petrobot.services.comm.under_way import NEVER, Patience, Pending, UnderWay, Waiter
 
-__all__ = ["Accepted", "Answered", "Caller", "Ended", "EventArrived", "Late", "Notice", "Patience", "PeerBack"]
+__all__ = [
+    "Accepted",
+    "Answered",
+    "Caller",
+    "Ended",
+    "EventArrived",
+    "Late",
+    "Notice",
+    "Patience",
+    "PeerBack",
+]
 __all__ += ["PeerLost", "Progress"]
 
 ERROR: Final = "error"
@@ -33,10 +58,13 @@ ERROR: Final = "error"
 class Caller:
     """Calls to one peer. `hello` says who calls; its epoch goes into each call that names none.
 
-    With `auto_ack` results and events are acknowledged at once; otherwise the owner says when they are safe.
+    With `auto_ack` results and events are acknowledged at once; otherwise the owner says when they
+    are safe.
     """
 
-    def __init__(self, peer: str, hello: m.Hello, *, auto_ack: bool = False, patience: Patience | None = None) -> None:
+    def __init__(
+        self, peer: str, hello: m.Hello, *, auto_ack: bool = False, patience: Patience | None = None
+    ) -> None:
         self.peer = peer
         self.hello = hello
         self.up = False
@@ -44,7 +72,8 @@ class Caller:
         """Boot of the peer, empty before the first link."""
         self.offers: tuple[str, ...] = ()
         self.soonest = NEVER
-        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for that."""
+        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for
+        that."""
         self._auto_ack = auto_ack
         self._patience = patience or Patience()
         self._absence = Absence(peer, self._patience)
@@ -73,12 +102,14 @@ class Caller:
         self.connecting(now)
 
     def connecting(self, now: float) -> None:
-        """A first connection is being tried: calls made now wait for it as long as for a reconnection."""
+        """A first connection is being tried: calls made now wait for it as long as for a
+        reconnection."""
         self._absence.wait(now)
         self.soonest = min(self.soonest, self._absence.until)
 
     def call(self, now: float, call: m.Call) -> None:
-        """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments that no message carries."""
+        """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments
+        that no message carries."""
         self.begin(
             now,
             call.id,
@@ -106,7 +137,8 @@ class Caller:
         waiter: Waiter | None = None,
         again: bool = False,
     ) -> int:
-        """`call` by the fields of a Call. `waiter` is told its end in place of a notice, and its result acknowledged then.
+        """`call` by the fields of a Call. `waiter` is told its end in place of a notice, and its
+        result acknowledged then.
 
         Gives how many messages wait to be taken out.
         """
@@ -115,7 +147,15 @@ class Caller:
         if arguments:
             arguments = plain(arguments, "arguments")
         call = m.Call(
-            id, service, arguments, deadline, epoch or self.hello.epoch, boot or self.boot, parent, seed, again
+            id,
+            service,
+            arguments,
+            deadline,
+            epoch or self.hello.epoch,
+            boot or self.boot,
+            parent,
+            seed,
+            again,
         )
         if self.up:
             due = now + self._patience.accept
@@ -136,8 +176,9 @@ class Caller:
             self._end(pending.call.id, *away, pending.if_unsent)
 
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
-        """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the peer does not say so
-        `within` seconds (None: `Patience.stop`). An id that is not under way is left alone.
+        """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the
+        peer does not say so `within` seconds (None: `Patience.stop`). An id that is not under way
+        is left alone.
         """
         pending = self._pending.get(id)
         if pending is None or pending.cancel is not None:
@@ -175,20 +216,22 @@ class Caller:
         self._messages.append(replace(command, data=plain(command.data, "data")))
 
     def subscribe(self, now: float, names: Iterable[str]) -> None:
-        """Have these events sent from now on, also after each reconnection; replaces an earlier subscription."""
+        """Have these events sent from now on, also after each reconnection; replaces an earlier
+        subscription."""
         self._names = tuple(names)
         if self.up:
             self._messages.append(m.Subscribe(self._names))
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
-        """The result of this call is safe; the peer may forget it. After a restart also of a call of the time before. One that
-        was given up here has no result yet."""
+        """The result of this call is safe; the peer may forget it. After a restart also of a call
+        of the time before. One that was given up here has no result yet."""
         settled = self._settled
         if id not in self._pending and not settled.is_safe(id) and not settled.was_given_up(id):
             self._ack(now, id)
 
     def disown(self, now: float, id: str) -> None:  # noqa: A002
-        """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes as `Late`."""
+        """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes
+        as `Late`."""
         if id not in self._pending and self.up:
             self._settled.give_up(id)
             self._messages.append(m.Cancel(id, "disowned"))
@@ -204,12 +247,15 @@ class Caller:
         return tuple(self._pending)
 
     def link_up(self, now: float, welcome: m.Welcome) -> None:
-        """The peer welcomed us: what was under way is sent again under its id, or ends if this is another boot."""
+        """The peer welcomed us: what was under way is sent again under its id, or ends if this is
+        another boot."""
         same = welcome.boot == self.boot
         self.up = True
         self._absence.over()
         self.boot, self.offers = welcome.boot, welcome.offers
-        self._notices.append(PeerBack(welcome.name, welcome.boot, same, welcome.offers, welcome.runs))
+        self._notices.append(
+            PeerBack(welcome.name, welcome.boot, same, welcome.offers, welcome.runs)
+        )
         if not same:
             self._forget_boot()
         if self._names is not None:
@@ -221,7 +267,8 @@ class Caller:
         self._settle_again(now, welcome.runs)
 
     def _forget_boot(self) -> None:
-        """The peer is another process now: what the old one was sent is lost, its event numbers begin anew."""
+        """The peer is another process now: what the old one was sent is lost, its event numbers
+        begin anew."""
         self._events.clear()
         for id_, pending in list(self._pending.items()):
             if pending.sent:
@@ -229,7 +276,8 @@ class Caller:
         self._settled.peer_is_new()
 
     def _settle_again(self, now: float, runs: Iterable[str]) -> None:
-        """Runs that the peer still keeps although they ended here: stop what was given up, acknowledge what was lost."""
+        """Runs that the peer still keeps although they ended here: stop what was given up,
+        acknowledge what was lost."""
         for id_ in runs:
             if self._settled.was_given_up(id_):
                 self._messages.append(m.Cancel(id_, "given up"))
@@ -237,7 +285,8 @@ class Caller:
                 self._ack(now, id_)
 
     def link_down(self, now: float, reason: str, *, final: bool = False) -> None:
-        """The link broke. Calls wait for it to come back, unless `final` (the peer was silent for long already)."""
+        """The link broke. Calls wait for it to come back, unless `final` (the peer was silent for
+        long already)."""
         self._absence.fail(reason)
         if not self.up:
             return
@@ -253,8 +302,9 @@ class Caller:
             self.connecting(now)
 
     def unreached(self, now: float, trouble: str, *, gone: bool = False) -> None:
-        """An attempt to connect has failed; `gone`: nothing listens at the peer's address. A process that we were connected to
-        has ended then, so its calls end at once; what was never connected may still be starting."""
+        """An attempt to connect has failed; `gone`: nothing listens at the peer's address. A
+        process that we were connected to has ended then, so its calls end at once; what was never
+        connected may still be starting."""
         self._absence.fail(trouble)
         if gone and self.boot and not self.up and self._absence.until < NEVER:
             self._end_all(*self._absence.give_up())
@@ -342,7 +392,11 @@ class Caller:
             self._end_all(*away)
         for id_ in self._pending.not_accepted(now):
             if self.up:
-                self._give_up(id_, "not_accepted", f"{self.peer} did not accept it in {self._patience.accept:g} s")
+                self._give_up(
+                    id_,
+                    "not_accepted",
+                    f"{self.peer} did not accept it in {self._patience.accept:g} s",
+                )
         for id_ in self._pending.not_answered(now):
             self._give_up(id_, "no_answer", f"{self.peer} gave no result in time")
         for id_ in [id_ for id_, due in self._commands.items() if due <= now]:
@@ -365,7 +419,8 @@ class Caller:
         return bool(self._notices)
 
     def messages(self, now: float | None = None) -> list[m.Message]:
-        """What to send, in order; each message is given once. Acknowledgements wait for others until `now` reaches theirs."""
+        """What to send, in order; each message is given once. Acknowledgements wait for others
+        until `now` reaches theirs."""
         if now is None or now >= self._settled.due:
             self._messages += self._settled.take_acks()
         messages, self._messages = self._messages, []

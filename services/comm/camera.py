@@ -1,8 +1,10 @@
-"""Image sources behind one interface, and the images' wire format over TCP (cv2 devices and files: `capture.py`).
+"""Image sources behind one interface, and the images' wire format over TCP (cv2 devices and files:
+`capture.py`).
 
-Wire format, network byte order. Image: b"PIMG", generation u32, sequence u64, age f64 (s since mid-exposure when sent),
-height u16, width u16, length u32, then the grey levels row by row. Control (receiver to camera): b"PCTL", generation u32, rate f64
-(images/s, 0: stop). The camera repeats the generation of the last control, so images of an earlier start are known and dropped.
+Wire format, network byte order. Image: b"PIMG", generation u32, sequence u64, age f64 (s since
+mid-exposure when sent), height u16, width u16, length u32, then the grey levels row by row. Control
+(receiver to camera): b"PCTL", generation u32, rate f64 (images/s, 0: stop). The camera repeats the
+generation of the last control, so images of an earlier start are known and dropped.
 """
 
 from __future__ import annotations
@@ -18,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.comm.capture import CaptureImages
-from services.comm.image import Image, ImageSource
-from services.comm.security import is_loopback
+from petrobot.services.comm.capture import CaptureImages
+from petrobot.services.comm.image import Image, ImageSource
+from petrobot.services.comm.security import is_loopback
 
 Clock = Callable[[], float]
 Pixels = NDArray[np.uint8]
@@ -57,7 +59,9 @@ class WireImage:
 def encode_image(image: WireImage) -> bytes:
     """Header and grey levels of one image, pixels (height, width) uint8."""
     height, width = image.pixels.shape
-    header = IMAGE_HEADER.pack(IMAGE_MAGIC, image.generation, image.sequence, image.age, height, width, height * width)
+    header = IMAGE_HEADER.pack(
+        IMAGE_MAGIC, image.generation, image.sequence, image.age, height, width, height * width
+    )
     return header + np.ascontiguousarray(image.pixels).tobytes()
 
 
@@ -72,13 +76,24 @@ class ImageDecoder:
         """Take bytes from the wire. Raises ImageFormatError when they are no images."""
         self._bytes += data
         while len(self._bytes) >= IMAGE_HEADER.size:
-            magic, generation, sequence, age, height, width, length = IMAGE_HEADER.unpack_from(self._bytes)
-            if magic != IMAGE_MAGIC or length != height * width or length > LARGEST_IMAGE or not age >= 0.0:
-                raise ImageFormatError(f"no image header: {bytes(self._bytes[: IMAGE_HEADER.size]).hex()}")
+            magic, generation, sequence, age, height, width, length = IMAGE_HEADER.unpack_from(
+                self._bytes
+            )
+            if (
+                magic != IMAGE_MAGIC
+                or length != height * width
+                or length > LARGEST_IMAGE
+                or not age >= 0.0
+            ):
+                raise ImageFormatError(
+                    f"no image header: {bytes(self._bytes[: IMAGE_HEADER.size]).hex()}"
+                )
             end = IMAGE_HEADER.size + length
             if len(self._bytes) < end:
                 return
-            pixels = np.frombuffer(bytes(self._bytes[IMAGE_HEADER.size : end]), np.uint8).reshape(height, width)
+            pixels = np.frombuffer(bytes(self._bytes[IMAGE_HEADER.size : end]), np.uint8).reshape(
+                height, width
+            )
             self._newest = WireImage(generation, sequence, age, pixels)
             del self._bytes[:end]
 
@@ -89,7 +104,8 @@ class ImageDecoder:
 
 
 class StreamImages:
-    """Images of a camera elsewhere, over TCP. Nothing blocks; a camera that is away is tried again every half second."""
+    """Images of a camera elsewhere, over TCP. Nothing blocks; a camera that is away is tried again
+    every half second."""
 
     def __init__(self, host: str, port: int, clock: Clock) -> None:
         self._address = host, port
@@ -208,13 +224,17 @@ class _Receiver:
 
 
 class ImageServer:
-    """The camera's end of the wire, for the simulated camera. Nothing blocks: a slow receiver misses images, no one waits."""
+    """The camera's end of the wire, for the simulated camera. Nothing blocks: a slow receiver
+    misses images, no one waits."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Bind; port 0 takes a free one. Raises OSError when the address is taken, ValueError for one that other hosts reach:
-        images have neither secrecy nor authentication."""
+        """Bind; port 0 takes a free one. Raises OSError when the address is taken, ValueError for
+        one that other hosts reach: images have neither secrecy nor authentication."""
         if not is_loopback(host):
-            raise ValueError(f'address "{host}:{port}" leaves this host, and images are not protected: use 127.0.0.1')
+            raise ValueError(
+                f'address "{host}:{port}" leaves this host, and images are not protected: '
+                "use 127.0.0.1"
+            )
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
         self._receivers: list[_Receiver] = []
@@ -236,7 +256,11 @@ class ImageServer:
             for _ in range(ADMITTED):
                 link, _ = self._listener.accept()
                 if len(self._receivers) >= RECEIVERS:
-                    self._leave(next((one for one in self._receivers if one.rate <= 0.0), self._receivers[0]))
+                    self._leave(
+                        next(
+                            (one for one in self._receivers if one.rate <= 0.0), self._receivers[0]
+                        )
+                    )
                 link.setblocking(False)
                 link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)
@@ -249,7 +273,8 @@ class ImageServer:
                 self._leave(receiver)
 
     def send(self, pixels: Pixels, age: float) -> None:
-        """Send an image, `age` s after mid-exposure, to all that want images and have taken the last one whole."""
+        """Send an image, `age` s after mid-exposure, to all that want images and have taken the
+        last one whole."""
         for receiver in list(self._receivers):
             if receiver.rate <= 0.0 or receiver.rest:
                 continue
@@ -307,7 +332,8 @@ class MemoryImages:
 
 
 def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
-    """The source that a device's config names: `source = "sim"` (with `address = "host:port"`), "capture:0" or "file:PATH".
+    """The source that a device's config names: `source = "sim"` (with `address = "host:port"`),
+    "capture:0" or "file:PATH".
 
     Raises ValueError naming key and remedy.
     """

@@ -1,4 +1,5 @@
-"""The hub of a CAN byte stream: the simulated bus itself, to which ports of this and other processes connect."""
+"""The hub of a CAN byte stream: the simulated bus itself, to which ports of this and other
+processes connect."""
 
 from __future__ import annotations
 
@@ -11,20 +12,22 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from services.comm.can_stream import ERROR, EXTENDED, REMOTE, Line, encode, parse_channel
-from services.comm.canbus import CanBus, Frame
+from petrobot.services.comm.can_stream import ERROR, EXTENDED, REMOTE, Line, encode, parse_channel
+from petrobot.services.comm.canbus import CanBus, Frame
 
 PORTS: Final = 64
-"""Ports that other processes may have at a time: a bus has few, and `select` cannot wait for more than a thousand."""
+"""Ports that other processes may have at a time: a bus has few, and `select` cannot wait for more
+than a thousand."""
 _UNSEEN: Final = EXTENDED | REMOTE | ERROR
 """Flags of frames that a `CanBus` does not carry."""
 
 
 class Hub:
-    """The bus itself: relays between any number of ports on a channel, and gives ports within this process.
+    """The bus itself: relays between any number of ports on a channel, and gives ports within this
+    process.
 
-    A machine of non-blocking sockets: `poll` does what is due, so it runs in a thread or in its owner's loop (watch `fileno`s
-    with `poll(timeout)`, which waits by itself).
+    A machine of non-blocking sockets: `poll` does what is due, so it runs in a thread or in its
+    owner's loop (watch `fileno`s with `poll(timeout)`, which waits by itself).
     """
 
     def __init__(self, channel: str = "tcp://127.0.0.1:0", allow_remote: bool = False) -> None:
@@ -63,7 +66,8 @@ class Hub:
         return port
 
     def poll(self, timeout: float = 0.0) -> None:
-        """Accept, read, relay and write what is due; wait up to `timeout` seconds for something to do."""
+        """Accept, read, relay and write what is due; wait up to `timeout` seconds for something to
+        do."""
         readable = [self._listener.fileno(), *self._lines]
         writable = [number for number, line in self._lines.items() if line.pending]
         ready, flushable, _ = select.select(readable, writable, [], timeout)
@@ -87,7 +91,9 @@ class Hub:
 
     def send_from(self, port: LocalPort, frame: Frame) -> None:
         """Pass a local port's frame on to all others."""
-        self._spread(encode(frame.id, frame.data), (frame.id, len(frame.data), frame.data), None, port)
+        self._spread(
+            encode(frame.id, frame.data), (frame.id, len(frame.data), frame.data), None, port
+        )
 
     def leave(self, port: LocalPort) -> None:
         """Forget a local port."""
@@ -112,7 +118,9 @@ class Hub:
         for word, dlc, data in line.read():
             self._spread(encode(word, data, dlc), (word, dlc, data), source, None)
 
-    def _spread(self, raw: bytes, frame: tuple[int, int, bytes], source: int | None, port: LocalPort | None) -> None:
+    def _spread(
+        self, raw: bytes, frame: tuple[int, int, bytes], source: int | None, port: LocalPort | None
+    ) -> None:
         for number in [number for number in self._lines if number != source]:
             self._attempt(number, lambda line: line.write(raw))
         word, _, data = frame

@@ -1,4 +1,5 @@
-"""Ports on a CAN bus as drivers and simulated drives use them, over the project's stream or any python-can interface."""
+"""Ports on a CAN bus as drivers and simulated drives use them, over the project's stream or any
+python-can interface."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from typing import Any
 
 import can
 
-from services.comm.can_stream import ERROR, EXTENDED, REMOTE, connect, encode
-from services.comm.canbus import CanBus, Frame
+from petrobot.services.comm.can_stream import ERROR, EXTENDED, REMOTE, connect, encode
+from petrobot.services.comm.canbus import CanBus, Frame
 
 
 class StreamPort(CanBus):
@@ -25,7 +26,11 @@ class StreamPort(CanBus):
         """Standard data frames that have come."""
         if self._line.pending:
             self._line.flush()
-        return [Frame(word, data) for word, _, data in self._line.read() if not word & (EXTENDED | REMOTE | ERROR)]
+        return [
+            Frame(word, data)
+            for word, _, data in self._line.read()
+            if not word & (EXTENDED | REMOTE | ERROR)
+        ]
 
     def close(self) -> None:
         """Leave the bus."""
@@ -41,7 +46,9 @@ class PythonCanBus(CanBus):
     def send(self, frame: Frame) -> None:
         """Put a frame on the bus."""
         try:
-            self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+            self._bus.send(
+                can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
+            )
         except (can.CanError, OSError) as reason:
             raise ConnectionError(f"the CAN bus does not take frames: {reason}") from reason
 
@@ -50,7 +57,9 @@ class PythonCanBus(CanBus):
         frames = []
         try:
             while (message := self._bus.recv(timeout=0.0)) is not None:
-                if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+                if not (
+                    message.is_extended_id or message.is_remote_frame or message.is_error_frame
+                ):
                     frames.append(Frame(message.arbitration_id, bytes(message.data)))
         except (can.CanError, OSError) as reason:
             raise ConnectionError(f"the CAN bus is gone: {reason}") from reason
@@ -64,15 +73,20 @@ class PythonCanBus(CanBus):
 def open_can(config: Mapping[str, Any]) -> CanBus:
     """The bus of a device: `interface` and `channel` as for python-can, other keys passed on to it.
 
-    `petrobot_stream` is opened directly; socketcan and all others through python-can. Raises ConnectionError or ValueError.
+    `petrobot_stream` is opened directly; socketcan and all others through python-can. Raises
+    ConnectionError or ValueError.
     """
     settings = dict(config)
     if not {"interface", "channel"} <= settings.keys():
-        raise ValueError('a CAN bus needs interface and channel, as interface = "socketcan", channel = "can0"')
+        raise ValueError(
+            'a CAN bus needs interface and channel, as interface = "socketcan", channel = "can0"'
+        )
     if settings["interface"] == "petrobot_stream":
         del settings["interface"]
         return StreamPort(**settings)
     try:
         return PythonCanBus(can.Bus(**settings))
     except (can.CanError, OSError) as reason:
-        raise ConnectionError(f"no CAN bus {settings['interface']} {settings['channel']}: {reason}") from reason
+        raise ConnectionError(
+            f"no CAN bus {settings['interface']} {settings['channel']}: {reason}"
+        ) from reason

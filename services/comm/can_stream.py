@@ -1,4 +1,5 @@
-"""CAN over a byte stream: its framing, and the python-can interface `petrobot_stream` that speaks it.
+"""CAN over a byte stream: its framing, and the python-can interface `petrobot_stream` that speaks
+it.
 
     bus = can.Bus(interface="petrobot_stream", channel="tcp://127.0.0.1:7303")      # or "unix:///run/cell/can"
 
@@ -7,8 +8,9 @@ Framing, both directions. First each end sends the six bytes `PBCAN\\x02`. Then 
     u8   DLC, 0 to 8
     DLC bytes of data (none in a remote frame)
     u32  CRC-32 of all that (IEEE 802.3, as zlib's), big-endian: a real bus has a CRC of its own
-A hub (`can_hub`) passes each frame on to all ports but the one it came from, in order of arrival. A port that sends other things,
-or does not read while more than 256 KiB wait for it, is dropped. Classic CAN only.
+A hub (`can_hub`) passes each frame on to all ports but the one it came from, in order of arrival. A
+port that sends other things, or does not read while more than 256 KiB wait for it, is dropped.
+Classic CAN only.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from urllib.parse import urlsplit
 import can
 from can import typechecking
 
-from services.comm.security import CHECK_BYTES, check
+from petrobot.services.comm.security import CHECK_BYTES, check
 
 GREETING: Final = b"PBCAN\x02"
 EXTENDED: Final = 1 << 31
@@ -45,14 +47,15 @@ class StreamFormatError(ConnectionError):
 
 
 def encode(word: int, data: bytes, dlc: int | None = None) -> bytes:
-    """One frame on the stream; `word` is the identifier with its flag bits, `dlc` differs from the data in remote frames."""
+    """One frame on the stream; `word` is the identifier with its flag bits, `dlc` differs from the
+    data in remote frames."""
     frame = _HEAD.pack(word, len(data) if dlc is None else dlc) + data
     return frame + check(frame)
 
 
 class Splitter:
-    """Cuts a byte stream into frames: (word, DLC, data). Raises StreamFormatError on a wrong greeting, DLC, identifier or
-    check."""
+    """Cuts a byte stream into frames: (word, DLC, data). Raises StreamFormatError on a wrong
+    greeting, DLC, identifier or check."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -81,7 +84,9 @@ class Splitter:
     def _greet(self) -> bool:
         start = bytes(self._buffer[: len(GREETING)])
         if start != GREETING[: len(start)]:
-            raise StreamFormatError(f"expected the greeting {GREETING!r}, got {start!r}: is this a CAN hub?")
+            raise StreamFormatError(
+                f"expected the greeting {GREETING!r}, got {start!r}: is this a CAN hub?"
+            )
         if len(start) < len(GREETING):
             return False
         del self._buffer[: len(GREETING)]
@@ -99,8 +104,8 @@ class Splitter:
 def parse_channel(channel: str, allow_remote: bool = False) -> tuple[socket.AddressFamily, Any]:
     """Socket family and address of `tcp://host:port` or `unix:///path`.
 
-    Raises ValueError for anything else, and for a host that is not this one unless `allow_remote` says so: the stream has
-    neither secrecy nor authentication.
+    Raises ValueError for anything else, and for a host that is not this one unless `allow_remote`
+    says so: the stream has neither secrecy nor authentication.
     """
     parts = urlsplit(channel)
     if parts.scheme == "unix" and parts.path and not parts.netloc:
@@ -109,9 +114,13 @@ def parse_channel(channel: str, allow_remote: bool = False) -> tuple[socket.Addr
         raise ValueError(f"channel {channel!r}: write tcp://127.0.0.1:7303 or unix:///path")
     if not allow_remote and not _is_loopback(parts.hostname):
         raise ValueError(
-            f"channel {channel!r} leaves this host, and the stream is not protected: say allow_remote=True to allow it"
+            f"channel {channel!r} leaves this host, and the stream is not protected: say "
+            "allow_remote=True to allow it"
         )
-    return (socket.AF_INET6 if ":" in parts.hostname else socket.AF_INET), (parts.hostname, parts.port)
+    return (socket.AF_INET6 if ":" in parts.hostname else socket.AF_INET), (
+        parts.hostname,
+        parts.port,
+    )
 
 
 def _is_loopback(host: str) -> bool:
@@ -139,7 +148,8 @@ class Line:
         return bool(self._waiting)
 
     def write(self, data: bytes) -> None:
-        """Send, or keep what the kernel does not take. Raises ConnectionError if the other end is gone or does not read."""
+        """Send, or keep what the kernel does not take. Raises ConnectionError if the other end is
+        gone or does not read."""
         with self._lock:
             self._waiting += data
             self._flush()
@@ -185,7 +195,8 @@ class Line:
 
 
 def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> Line:
-    """A line to the hub of a channel; raises ConnectionError if there is none, ValueError for a bad channel."""
+    """A line to the hub of a channel; raises ConnectionError if there is none, ValueError for a bad
+    channel."""
     family, address = parse_channel(channel, allow_remote)
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
@@ -211,7 +222,8 @@ class StreamBus(can.BusABC):
         receive_own_messages: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Connect. `bitrate` and other settings of a real bus are taken and have no effect. Raises CanInitializationError."""
+        """Connect. `bitrate` and other settings of a real bus are taken and have no effect. Raises
+        CanInitializationError."""
         if kwargs.pop("fd", False):
             raise can.CanInitializationError("petrobot_stream carries classic CAN only, not CAN FD")
         try:
@@ -226,7 +238,8 @@ class StreamBus(can.BusABC):
         super().__init__(channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a classic frame; waits up to `timeout` seconds for room (None: does not wait). Raises CanOperationError."""
+        """Send a classic frame; waits up to `timeout` seconds for room (None: does not wait).
+        Raises CanOperationError."""
         if msg.is_fd:
             raise can.CanOperationError("petrobot_stream carries classic CAN only, not CAN FD")
         word = msg.arbitration_id | (EXTENDED if msg.is_extended_id else 0)
@@ -238,7 +251,9 @@ class StreamBus(can.BusABC):
         except ConnectionError as reason:
             raise can.CanOperationError(str(reason)) from reason
         if self._own:
-            self._waiting.append(_message(word, msg.dlc, bytes(msg.data), self._channel, is_rx=False))
+            self._waiting.append(
+                _message(word, msg.dlc, bytes(msg.data), self._channel, is_rx=False)
+            )
 
     def fileno(self) -> int:
         """For select, and python-can's asyncio notifier."""

@@ -20,7 +20,8 @@ class CanBus(Protocol):
         """Put a frame on the bus. Raises ConnectionError when the bus is gone."""
 
     def receive(self) -> Sequence[Frame]:
-        """All frames that arrived since the last call, oldest first. Raises ConnectionError when the bus is gone."""
+        """All frames that arrived since the last call, oldest first. Raises ConnectionError when
+        the bus is gone."""
 
     def close(self) -> None:
         """Leave the bus."""

@@ -1,7 +1,9 @@
-"""CANopen on classic CAN (CiA 301): identifiers, frames in and out of bytes, and the client of expedited SDO transfers.
+"""CANopen on classic CAN (CiA 301): identifiers, frames in and out of bytes, and the client of
+expedited SDO transfers.
 
-Pure: times are passed in, frames come back. The subset is NMT, heartbeat, expedited SDO, SYNC, PDO mapping and EMCY, which
-is what drives and a digital-input node need. Byte order is little-endian everywhere (CiA 301, section 7.1.4).
+Pure: times are passed in, frames come back. The subset is NMT, heartbeat, expedited SDO, SYNC, PDO
+mapping and EMCY, which is what drives and a digital-input node need. Byte order is little-endian
+everywhere (CiA 301, section 7.1.4).
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from services.comm.canbus import Frame
+from petrobot.services.comm.canbus import Frame
 
 NMT_ID: Final = 0x000
 SYNC_ID: Final = 0x080
@@ -118,7 +120,11 @@ class SdoAbortError(Exception):
     """An SDO transfer was refused; `code` is a CiA 301 abort code."""
 
     def __init__(self, code: int, index: int = 0, sub: int = 0) -> None:
-        name = Abort(code).name.lower().replace("_", " ") if code in Abort._value2member_map_ else "unknown"
+        name = (
+            Abort(code).name.lower().replace("_", " ")
+            if code in Abort._value2member_map_
+            else "unknown"
+        )
         super().__init__(f"SDO abort {code:#010x} ({name}) at {index:#06x}:{sub}")
         self.code = code
         self.index = index
@@ -156,7 +162,9 @@ def parse_emergency(frame: Frame) -> Emergency:
     """What an EMCY frame says; raises ValueError if it is none."""
     node = frame.id - EMCY_BASE
     if node not in NODES or len(frame.data) != 8:
-        raise ValueError(f"frame {frame.id:#05x} with {len(frame.data)} bytes is no emergency message")
+        raise ValueError(
+            f"frame {frame.id:#05x} with {len(frame.data)} bytes is no emergency message"
+        )
     code, register = struct.unpack_from("<HB", frame.data)
     return Emergency(node, code, register, frame.data[3:])
 
@@ -166,7 +174,9 @@ def sdo_write_request(node: int, index: int, sub: int, data: bytes) -> Frame:
     if not 1 <= len(data) <= 4:
         raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
     command = 0x23 | (4 - len(data)) << 2
-    return Frame(SDO_REQUEST_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"))
+    return Frame(
+        SDO_REQUEST_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
+    )
 
 
 def sdo_read_request(node: int, index: int, sub: int) -> Frame:
@@ -184,7 +194,9 @@ def sdo_read_reply(node: int, index: int, sub: int, data: bytes) -> Frame:
     if not 1 <= len(data) <= 4:
         raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
     command = 0x43 | (4 - len(data)) << 2
-    return Frame(SDO_REPLY_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0"))
+    return Frame(
+        SDO_REPLY_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
+    )
 
 
 def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:
@@ -194,7 +206,8 @@ def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:
 
 @dataclass(frozen=True, slots=True)
 class SdoMessage:
-    """An SDO frame taken apart; `data` holds the bytes of an expedited transfer or the abort code."""
+    """An SDO frame taken apart; `data` holds the bytes of an expedited transfer or the abort
+    code."""
 
     command: int
     index: int
@@ -203,7 +216,8 @@ class SdoMessage:
 
 
 def parse_sdo(frame: Frame) -> SdoMessage:
-    """Take an SDO frame apart; raises ValueError if it has not 8 bytes, SdoAbortError(COMMAND) if it is no expedited transfer."""
+    """Take an SDO frame apart; raises ValueError if it has not 8 bytes, SdoAbortError(COMMAND) if
+    it is no expedited transfer."""
     if len(frame.data) != 8:
         raise ValueError(f"SDO frame {frame.id:#05x} with {len(frame.data)} bytes: must be 8")
     command, index, sub = struct.unpack_from("<BHB", frame.data)
@@ -252,10 +266,13 @@ PDO_OFF: Final = 1 << 31
 """Bit of a PDO's COB-ID (sub-index 1 of 1400h and 1800h) that switches it off."""
 
 
-def map_pdo(parameters: int, mapping: int, cob_id: int, transmission: int, objects: Sequence[Mapped]) -> list[Transfer]:
+def map_pdo(
+    parameters: int, mapping: int, cob_id: int, transmission: int, objects: Sequence[Mapped]
+) -> list[Transfer]:
     """The writes that map and switch on a PDO, in the order that CiA 301 section 7.5.2.36 asks for.
 
-    `parameters` and `mapping` are the indices of its two records (1400h and 1600h, or 1800h and 1A00h).
+    `parameters` and `mapping` are the indices of its two records (1400h and 1600h, or 1800h and
+    1A00h).
     """
     u8, u32 = Type.UNSIGNED8, Type.UNSIGNED32
     return [
@@ -269,9 +286,11 @@ def map_pdo(parameters: int, mapping: int, cob_id: int, transmission: int, objec
 
 
 class SdoClient:
-    """A client of one node's SDO server: does transfers one after another, gives up after `timeout` seconds each.
+    """A client of one node's SDO server: does transfers one after another, gives up after `timeout`
+    seconds each.
 
-    `results` holds what was read, by (index, sub-index); `failure` says why a transfer failed, which ends the row.
+    `results` holds what was read, by (index, sub-index); `failure` says why a transfer failed,
+    which ends the row.
     """
 
     def __init__(self, node: int, timeout: float = 0.5) -> None:
@@ -301,14 +320,23 @@ class SdoClient:
         if self._asked:
             if now >= self._due:
                 self._fail(
-                    f"node {self.node}: no answer from {transfer.index:#06x}:{transfer.sub} within {self.timeout} s"
+                    f"node {self.node}: no answer from {transfer.index:#06x}:{transfer.sub} "
+                    f"within {self.timeout} s"
                 )
-                return [sdo_abort(SDO_REQUEST_BASE + self.node, transfer.index, transfer.sub, Abort.TIMEOUT)]
+                return [
+                    sdo_abort(
+                        SDO_REQUEST_BASE + self.node, transfer.index, transfer.sub, Abort.TIMEOUT
+                    )
+                ]
             return []
         self._asked, self._due = True, now + self.timeout
         if transfer.value is None:
             return [sdo_read_request(self.node, transfer.index, transfer.sub)]
-        return [sdo_write_request(self.node, transfer.index, transfer.sub, transfer.type.pack(transfer.value))]
+        return [
+            sdo_write_request(
+                self.node, transfer.index, transfer.sub, transfer.type.pack(transfer.value)
+            )
+        ]
 
     def receive(self, frame: Frame) -> None:
         """Take a frame of the server; what was not asked for is ignored."""

@@ -1,7 +1,9 @@
-"""A CANopen master of CiA 402 drives, whatever machine they move: configures, starts, enables and supervises, cycle by cycle.
+"""A CANopen master of CiA 402 drives, whatever machine they move: configures, starts, enables and
+supervises, cycle by cycle.
 
-A machine: frames in, frames out, times passed in. What a drive is set to and what is sent to it in a cycle, its `DriveLink`
-knows; nodes that are no drives (inputs, sensors) are `Companion`s. CiA 301 (NMT, heartbeat, SDO, SYNC, EMCY) and CiA 402-2.
+A machine: frames in, frames out, times passed in. What a drive is set to and what is sent to it in
+a cycle, its `DriveLink` knows; nodes that are no drives (inputs, sensors) are `Companion`s. CiA 301
+(NMT, heartbeat, SDO, SYNC, EMCY) and CiA 402-2.
 """
 
 from __future__ import annotations
@@ -11,10 +13,20 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Generic, Protocol, TypeVar
 
-from services.comm import canopen
-from services.comm.canbus import Frame
-from services.comm.canopen import Mapped, NmtCommand, NmtState, SdoClient, Transfer, Type
-from services.comm.cia402 import DEVICE_TYPE, ENABLING, SENT, Command, Fault, Mode, Object, State, fault_text
+from petrobot.services.comm import canopen
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import Mapped, NmtCommand, NmtState, SdoClient, Transfer, Type
+from petrobot.services.comm.cia402 import (
+    DEVICE_TYPE,
+    ENABLING,
+    SENT,
+    Command,
+    Fault,
+    Mode,
+    Object,
+    State,
+    fault_text,
+)
 
 MASTER_NODE: Final = 0x7F
 """Node id under which the master sends its own heartbeat."""
@@ -44,8 +56,8 @@ class Phase(Enum):
 class Trouble:
     """Something that needs a reset.
 
-    `cause` is a short code (`drive_fault`, `power`, `bus`), `axis` the drive's number from 0 on or None, `code` an EMCY error
-    code or 0.
+    `cause` is a short code (`drive_fault`, `power`, `bus`), `axis` the drive's number from 0 on or
+    None, `code` an EMCY error code or 0.
     """
 
     cause: str
@@ -67,7 +79,8 @@ class Manner:
 
 
 class DriveLink(Protocol):
-    """What the master needs of one drive's link; see `Power`, `usual_transfers`, `pdo_transfers` and `unfit` to make one."""
+    """What the master needs of one drive's link; see `Power`, `usual_transfers`, `pdo_transfers`
+    and `unfit` to make one."""
 
     node: int
     sdo: SdoClient
@@ -84,10 +97,12 @@ class DriveLink(Protocol):
         """Its configuration for a bus cycle of so many seconds, and what is read from it."""
 
     def wrong(self) -> str:
-        """What makes the device at this node unfit, in words; empty if nothing. Asked when the transfers are done."""
+        """What makes the device at this node unfit, in words; empty if nothing. Asked when the
+        transfers are done."""
 
     def take(self, data: bytes) -> bool:
-        """Its TPDO; says whether its status is another one. Raises ValueError for bytes that are none."""
+        """Its TPDO; says whether its status is another one. Raises ValueError for bytes that are
+        none."""
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """Its RPDO of this cycle."""
@@ -98,7 +113,8 @@ Link = TypeVar("Link", bound=DriveLink)
 
 @dataclass(frozen=True)
 class Companion:
-    """A node on the bus that is no drive: its id, configuration, and what becomes of the data of its TPDO."""
+    """A node on the bus that is no drive: its id, configuration, and what becomes of the data of
+    its TPDO."""
 
     node: int
     transfers: Sequence[Transfer]
@@ -113,8 +129,8 @@ class Power:
     __slots__ = ("_reset_cycles", "_stop_cycles", "_wait", "stopping")
 
     def __init__(self, reset_cycles: int, stop_cycles: int) -> None:
-        """`reset_cycles`: cycles between two fault resets; `stop_cycles`: cycles that a drive is given to stop quickly and stand
-        before its power is taken away and its brake holds."""
+        """`reset_cycles`: cycles between two fault resets; `stop_cycles`: cycles that a drive is
+        given to stop quickly and stand before its power is taken away and its brake holds."""
         self._reset_cycles, self._stop_cycles = reset_cycles, stop_cycles
         self._wait = 0
         self.stopping = 0
@@ -136,7 +152,8 @@ class Power:
 
 
 def usual_transfers(cycle: float, mode: Mode, patience: float) -> list[Transfer]:
-    """Identity, heartbeats both ways (`patience` s), the bus cycle (s) and the mode of operation."""
+    """Identity, heartbeats both ways (`patience` s), the bus cycle (s) and the mode of
+    operation."""
     beat = MASTER_NODE << 16 | round(patience * 1e3)
     return [
         Transfer(Object.DEVICE_TYPE, 0, _U32),
@@ -151,7 +168,9 @@ def usual_transfers(cycle: float, mode: Mode, patience: float) -> list[Transfer]
 def pdo_transfers(node: int, received: Sequence[Mapped]) -> list[Transfer]:
     """One RPDO of these objects and the TPDO that every drive sends, both by SYNC."""
     return [
-        *canopen.map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received),
+        *canopen.map_pdo(
+            Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received
+        ),
         *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 1, SENT),
     ]
 
@@ -161,7 +180,9 @@ def companion_transfers(node: int, timer_ms: int, objects: Sequence[Mapped]) -> 
     return [
         Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
         Transfer(Object.TPDO1, 5, _U16, timer_ms),
-        *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects),
+        *canopen.map_pdo(
+            Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects
+        ),
     ]
 
 
@@ -187,7 +208,8 @@ class CanopenMaster(Generic[Link]):
         *,
         enable: bool = False,
     ) -> None:
-        """`cycle` in s; with `enable` the drives are enabled as soon as they are there for the first time."""
+        """`cycle` in s; with `enable` the drives are enabled as soon as they are there for the
+        first time."""
         self.cycle = cycle
         self.drives: Sequence[Link] = tuple(drives.values())
         self.names = tuple(drives)
@@ -222,8 +244,11 @@ class CanopenMaster(Generic[Link]):
         return self._now - self._heard[node] <= self._manner.patience
 
     def reset(self, now: float) -> None:
-        """Forget troubles, reset faults and enable again; configure again if the bus was the trouble."""
-        again = self.phase is not Phase.RUNNING or any(trouble.cause == "bus" for trouble in self.troubles)
+        """Forget troubles, reset faults and enable again; configure again if the bus was the
+        trouble."""
+        again = self.phase is not Phase.RUNNING or any(
+            trouble.cause == "bus" for trouble in self.troubles
+        )
         self.troubles.clear()
         self._resetting, self.wanted = True, True
         for drive in self.drives:
@@ -285,14 +310,17 @@ class CanopenMaster(Generic[Link]):
         if axis is None:
             return
         self.drives[axis].error_code = message.code
-        passed_over = self.phase is Phase.CONFIGURING or (self._manner.old_emergencies and self._resetting)
+        passed_over = self.phase is Phase.CONFIGURING or (
+            self._manner.old_emergencies and self._resetting
+        )
         if message.code and not passed_over:  # before, it may be old; a fault that stays will show
             self._fault(axis, message.code)
 
     # Frames out
 
     def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
-        """Frames of one cycle: configuration, or set points (one a drive) and SYNC; heartbeat when due."""
+        """Frames of one cycle: configuration, or set points (one a drive) and SYNC; heartbeat when
+        due."""
         self._now = now
         frames: list[Frame] = []
         if now >= self._beat_due:
@@ -302,7 +330,10 @@ class CanopenMaster(Generic[Link]):
             return frames + self._configure(now)
         self._supervise(now)
         wanted, resetting = self.wanted, self._resetting
-        frames += [drive.frame(target, wanted, resetting) for drive, target in zip(self.drives, targets, strict=True)]
+        frames += [
+            drive.frame(target, wanted, resetting)
+            for drive, target in zip(self.drives, targets, strict=True)
+        ]
         frames.append(canopen.SYNC)
         return frames
 
@@ -328,7 +359,11 @@ class CanopenMaster(Generic[Link]):
 
     def _start(self, now: float) -> list[Frame]:
         """All transfers are over: start the nodes, or say what failed and try again later."""
-        wrong = [client.failure for client in self._clients() if client.failure and self._needed(client.node)]
+        wrong = [
+            client.failure
+            for client in self._clients()
+            if client.failure and self._needed(client.node)
+        ]
         wrong = wrong or [text for text in (drive.wrong() for drive in self.drives) if text]
         if wrong:
             self._report(Trouble("bus", None, 0, "; ".join(wrong)))
@@ -336,7 +371,9 @@ class CanopenMaster(Generic[Link]):
             return []
         if self._enable_first:
             self._enable_first, self.wanted = False, True
-            self._resetting = True  # the drives may have gone into a fault when their last master went away
+            self._resetting = (
+                True  # the drives may have gone into a fault when their last master went away
+            )
             self.troubles.clear()
         self.phase = Phase.STARTING
         for drive in self.drives:
@@ -357,12 +394,19 @@ class CanopenMaster(Generic[Link]):
             drive.silent += 1
             if drive.silent == lost:
                 self._report(Trouble("bus", axis, 0, f"{self.names[axis]}: the drive is silent"))
-            if drive.state is State.FAULT and not self._resetting and drive.spoken and drive.silent <= 1:
+            if (
+                drive.state is State.FAULT
+                and not self._resetting
+                and drive.spoken
+                and drive.silent <= 1
+            ):
                 self._fault(axis, drive.error_code)
         patience = self._manner.patience
         for node, heard in self._heard.items():
             if now - heard > patience and self._needed(node):
-                self._report(Trouble("bus", self._axis.get(node), 0, f"node {node} sends no heartbeat"))
+                self._report(
+                    Trouble("bus", self._axis.get(node), 0, f"node {node} sends no heartbeat")
+                )
         if self.phase is Phase.STARTING and all(drive.spoken for drive in self.drives):
             self.phase = Phase.RUNNING
         if self._resetting and self.enabled:

@@ -1,4 +1,5 @@
-"""Images from any cv2.VideoCapture device or video file. OpenCV is imported at the first start, so nodes without one need none."""
+"""Images from any cv2.VideoCapture device or video file. OpenCV is imported at the first start, so
+nodes without one need none."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.comm.image import Image
+from petrobot.services.comm.image import Image
 
 Clock = Callable[[], float]
 Pixels = NDArray[np.uint8]
@@ -18,12 +19,14 @@ Pixels = NDArray[np.uint8]
 class CaptureImages:
     """Any cv2.VideoCapture device (a number) or video file (a path), opened at the first start.
 
-    A thread grabs a device's images as they come, so the newest is never older than one exposure. A file is paced by the clock:
-    image k belongs to the time start + k / rate, and after the last one there is none.
+    A thread grabs a device's images as they come, so the newest is never older than one exposure. A
+    file is paced by the clock: image k belongs to the time start + k / rate, and after the last one
+    there is none.
     """
 
     def __init__(self, target: int | str, clock: Clock, latency: float = 0.0) -> None:
-        """`latency`: s from mid-exposure until a device's image is here (from its datasheet, or measured)."""
+        """`latency`: s from mid-exposure until a device's image is here (from its datasheet, or
+        measured)."""
         self._target = target
         self._clock = clock
         self._latency = latency
@@ -37,7 +40,8 @@ class CaptureImages:
         self._on = threading.Event()
 
     def start(self, rate: float) -> None:
-        """Send images at about this rate. Raises ConnectionError naming the source when it cannot be opened."""
+        """Send images at about this rate. Raises ConnectionError naming the source when it cannot
+        be opened."""
         import cv2  # only who uses a capture needs OpenCV's video backends
 
         self.stop()
@@ -46,7 +50,8 @@ class CaptureImages:
         if not self._capture.isOpened():
             self._capture = None
             raise ConnectionError(
-                f"camera source {self._target!r} cannot be opened: is it plugged in, does the file exist?"
+                f"camera source {self._target!r} cannot be opened: is it plugged in, does "
+                "the file exist?"
             )
         self._begin, self._rate, self._sequence, self._newest = self._clock(), rate, 0, None
         if isinstance(self._target, str):
@@ -85,7 +90,9 @@ class CaptureImages:
             taken, pixels = self._capture.read()
             if not taken:
                 return
-            self._newest = Image(_grey(pixels), self._begin + self._sequence / self._rate, self._sequence)
+            self._newest = Image(
+                _grey(pixels), self._begin + self._sequence / self._rate, self._sequence
+            )
             self._sequence += 1
 
     def _grab(self) -> None:

@@ -1,8 +1,10 @@
-"""Lock step in one process: several parties, tick by tick, every envelope in the one order that any placement gives.
+"""Lock step in one process: several parties, tick by tick, every envelope in the one order that any
+placement gives.
 
-At tick k each party takes the envelopes due at k, ordered by (tick sent, source, sequence), then advances to k * TICK; what
-it sends is due after the delay of its link, one tick at least. So parties never see each other within a tick, and neither
-their order nor the process they live in shows. Bodies are passed on as they would arrive from another process.
+At tick k each party takes the envelopes due at k, ordered by (tick sent, source, sequence), then
+advances to k * TICK; what it sends is due after the delay of its link, one tick at least. So
+parties never see each other within a tick, and neither their order nor the process they live in
+shows. Bodies are passed on as they would arrive from another process.
 """
 
 from __future__ import annotations
@@ -14,11 +16,11 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from services.comm.canbus import Frame
-from services.comm.codec import decode, encode
-from services.comm.messages import Message
-from services.comm.party import TICK, Envelope, Party, Posted
-from services.comm.plain import SCALARS, NotPlainError, copy_array, plain
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.codec import decode, encode
+from petrobot.services.comm.messages import Message
+from petrobot.services.comm.party import TICK, Envelope, Party, Posted
+from petrobot.services.comm.plain import SCALARS, NotPlainError, copy_array, plain
 
 _MESSAGES = frozenset(get_args(Message))
 _FLAT = frozenset((float, int, str, bytes, bool))
@@ -36,7 +38,8 @@ class CellError(Exception):
 
 
 class Delays:
-    """Delays of the links in ticks, by `"source/target"` (endpoint names) or by channel; the former goes first.
+    """Delays of the links in ticks, by `"source/target"` (endpoint names) or by channel; the former
+    goes first.
 
     Whatever is not named takes one tick. Raises CellError for a delay below one.
     """
@@ -46,7 +49,9 @@ class Delays:
         self._ways: dict[tuple[str, str, str], int] = {}
         for name, ticks in self._table.items():
             if type(ticks) is not int or ticks < 1:
-                raise CellError(f"link {name}: a delay of {ticks!r}; give a whole number of ticks, at least 1")
+                raise CellError(
+                    f"link {name}: a delay of {ticks!r}; give a whole number of ticks, at least 1"
+                )
 
     def ticks(self, envelope: Envelope) -> int:
         """Ticks that this envelope is on its way."""
@@ -62,8 +67,8 @@ class Delays:
 
 
 def as_received(channel: str, body: Any) -> Any:
-    """The body as it arrives in another process: messages checked and in plain data, arrays as tuples, images read-only
-    (those that their sender has locked are passed on as they are).
+    """The body as it arrives in another process: messages checked and in plain data, arrays as
+    tuples, images read-only (those that their sender has locked are passed on as they are).
 
     Raises NotPlainError or ProtocolError for what no envelope carries.
     """
@@ -89,7 +94,8 @@ def as_received(channel: str, body: Any) -> Any:
 
 
 def _frozen(array: NDArray[Any]) -> bool:
-    """Whether an array is already what would arrive: nobody can write to it, as its maker has locked memory of its own."""
+    """Whether an array is already what would arrive: nobody can write to it, as its maker has
+    locked memory of its own."""
     flags = array.flags
     locked = not flags.writeable and flags.owndata and flags.c_contiguous
     return locked and array.dtype in _DTYPES and array.ndim <= _MOST_DIMENSIONS
@@ -98,7 +104,9 @@ def _frozen(array: NDArray[Any]) -> bool:
 class Half:
     """The parties that live in this process, their inboxes, and the numbers of what they send."""
 
-    def __init__(self, parties: Iterable[Party], delays: Delays, everybody: Iterable[str] = ()) -> None:
+    def __init__(
+        self, parties: Iterable[Party], delays: Delays, everybody: Iterable[str] = ()
+    ) -> None:
         self._parties: dict[str, Party] = {}
         for party in sorted(parties, key=lambda one: one.name):
             if party.name in self._parties:
@@ -117,7 +125,8 @@ class Half:
         self._parties[party.name] = party
 
     def step(self, tick: int) -> list[Posted]:
-        """Run one tick. Gives the envelopes for parties that do not live here, in the order they were sent."""
+        """Run one tick. Gives the envelopes for parties that do not live here, in the order they
+        were sent."""
         now = tick * TICK
         outside: list[Posted] = []
         for name, party in self._parties.items():
@@ -147,17 +156,23 @@ class Half:
             inbox[due] = [one]
 
     def own(self, source: str, party: str) -> None:
-        """Note which party an endpoint lives in. Raises CellError if two parties send under one name."""
+        """Note which party an endpoint lives in. Raises CellError if two parties send under one
+        name."""
         owner = self._owners.setdefault(source, party)
         if owner != party:
-            raise CellError(f"{owner} and {party} both send as {source}; an endpoint lives in one party")
+            raise CellError(
+                f"{owner} and {party} both send as {source}; an endpoint lives in one party"
+            )
 
     def _post(self, tick: int, sender: str, envelope: Envelope) -> Posted:
         party, source, target, channel, sent = envelope
         if self._owners.get(source) != sender:
             self.own(source, sender)
         if party not in self._names:
-            raise CellError(f"{source} sends to the party {party}, which is not in the cell: {sorted(self._names)}")
+            raise CellError(
+                f"{source} sends to the party {party}, which is not in the cell: "
+                f"{sorted(self._names)}"
+            )
         try:
             body = as_received(channel, sent)
         except Exception as fault:
@@ -189,7 +204,8 @@ class Cell:
         self.tick += 1
 
     def replace(self, party: Party) -> None:
-        """Another party takes a name over, as a process that was started again does; what is on its way still arrives."""
+        """Another party takes a name over, as a process that was started again does; what is on its
+        way still arrives."""
         self._half.replace(party)
 
     def run(self, until: Callable[[], bool], max_ticks: int) -> bool:

@@ -1,7 +1,8 @@
-"""CiA 402 servo drives: state machine, words, objects, units and error codes, as master and drives must agree on them.
+"""CiA 402 servo drives: state machine, words, objects, units and error codes, as master and drives
+must agree on them.
 
-Pure tables and functions (CiA 402-2 and 402-3). Positions are in micro-radians at the joint (the drives' position factor),
-speeds in micro-radians per second, so an INTEGER32 holds 2,147 rad.
+Pure tables and functions (CiA 402-2 and 402-3). Positions are in micro-radians at the joint (the
+drives' position factor), speeds in micro-radians per second, so an INTEGER32 holds 2,147 rad.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Final
 
-from services.comm.canopen import Mapped, Type
+from petrobot.services.comm.canopen import Mapped, Type
 
 UNITS: Final = 1e6
 """Position units in a radian and speed units in a radian per second."""
@@ -26,7 +27,8 @@ def from_units(units: int) -> float:
 
 
 class State(Enum):
-    """The power drive system's states; the value is (mask, pattern) of the statusword's low byte (CiA 402-2, table 31)."""
+    """The power drive system's states; the value is (mask, pattern) of the statusword's low byte
+    (CiA 402-2, table 31)."""
 
     def __init__(self, mask: int, word: int) -> None:
         self.word = word
@@ -43,7 +45,8 @@ class State(Enum):
 
 
 class StatusBit(IntEnum):
-    """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode, 12 also as in velocity mode."""
+    """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode,
+    12 also as in velocity mode."""
 
     VOLTAGE_ENABLED = 1 << 4
     WARNING = 1 << 7
@@ -55,7 +58,8 @@ class StatusBit(IntEnum):
 
 
 class Command(Enum):
-    """Commands; the value is (mask, pattern) of the controlword (CiA 402-2, table 29). FAULT_RESET acts on its rising edge."""
+    """Commands; the value is (mask, pattern) of the controlword (CiA 402-2, table 29). FAULT_RESET
+    acts on its rising edge."""
 
     SHUTDOWN = (0x87, 0x06)
     SWITCH_ON = (0x8F, 0x07)
@@ -120,7 +124,9 @@ FAULT_TEXT: Final = {
 
 def fault_text(code: int) -> str:
     """An error code in words."""
-    return FAULT_TEXT[Fault(code)] if code in Fault._value2member_map_ else f"error code {code:#06x}"
+    return (
+        FAULT_TEXT[Fault(code)] if code in Fault._value2member_map_ else f"error code {code:#06x}"
+    )
 
 
 class Object(IntEnum):
@@ -162,7 +168,8 @@ RECEIVED: Final = (
     Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
     Mapped(Object.TARGET_POSITION, 0, Type.INTEGER32),
 )
-"""Objects of the RPDO that the master sends each drive in each cycle, in cyclic synchronous position mode."""
+"""Objects of the RPDO that the master sends each drive in each cycle, in cyclic synchronous
+position mode."""
 
 VELOCITY_RECEIVED: Final = (
     Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
@@ -207,7 +214,8 @@ def state_of(statusword: int) -> State:
 
 
 def command_of(controlword: int) -> Command | None:
-    """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive to see)."""
+    """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive
+    to see)."""
     return _COMMANDS[controlword & 0xFF]
 
 
@@ -227,10 +235,13 @@ TRANSITIONS: Final = {
     (State.OPERATION_ENABLED, Command.QUICK_STOP): State.QUICK_STOP_ACTIVE,  # 11
     (State.QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 12
     (State.FAULT, Command.FAULT_RESET): State.SWITCH_ON_DISABLED,  # 15
-    (State.QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION): State.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
+    (
+        State.QUICK_STOP_ACTIVE,
+        Command.ENABLE_OPERATION,
+    ): State.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
 }
-"""The transitions that commands cause, with their numbers in CiA 402-2 figure 9. Any other command changes nothing.
-0, 1 (power on), 13 (fault) and 14 (fault reaction over) happen of themselves."""
+"""The transitions that commands cause, with their numbers in CiA 402-2 figure 9. Any other command
+changes nothing. 0, 1 (power on), 13 (fault) and 14 (fault reaction over) happen of themselves."""
 
 ENABLING: Final = {
     State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
@@ -240,7 +251,8 @@ ENABLING: Final = {
     State.QUICK_STOP_ACTIVE: Command.DISABLE_VOLTAGE,
     State.FAULT: Command.FAULT_RESET,
 }
-"""Which command leads from a state towards OPERATION_ENABLED. FAULT_RESET needs a word without its bit before."""
+"""Which command leads from a state towards OPERATION_ENABLED. FAULT_RESET needs a word without its
+bit before."""
 
 
 def after(state: State, command: Command) -> State:

@@ -18,17 +18,21 @@ import ssl
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-from services.comm.caller import Caller, Notice
-from services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of, futures_of
-from services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
-from services.comm.security import UNPROVEN, Keys
-from services.comm.under_way import NEVER
-from services.comm.wire import ProtocolError, Side, State
+from petrobot.services.comm.caller import Caller, Notice
+from petrobot.services.comm.link import READ_BUFFER, Limits, Link, Timing, clock_of, futures_of
+from petrobot.services.comm.messages import Bye, Call, Executed, Message, Outcome, Refuse, Welcome
+from petrobot.services.comm.security import UNPROVEN, Keys
+from petrobot.services.comm.under_way import NEVER
+from petrobot.services.comm.wire import ProtocolError, Side, State
 
 OnNotices = Callable[[float, list[Notice]], None]
-NOT_TRUSTED = "perhaps our certificate is not trusted there, or has ended: it takes TLS 1.3 and certificates of its own cell alone"
+NOT_TRUSTED = (
+    "perhaps our certificate is not trusted there, or has ended: it takes TLS 1.3 "
+    "and certificates of its own cell alone"
+)
 _FOR_GOOD = frozenset(("version", "key_needed", "wrong_node"))
-"""Faults of the opening that trying again does not mend. With a key they are found in a proven WELCOME alone."""
+"""Faults of the opening that trying again does not mend. With a key they are found in a proven
+WELCOME alone."""
 _EXPIRED = 10
 """X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
 _NUMBERS = itertools.count(1)
@@ -43,7 +47,9 @@ class _ClientLink(Link):
     """One connection to the peer."""
 
     def __init__(self, client: Client) -> None:
-        super().__init__(Side.CLIENT, client.caller.peer, client.key, client.timing, client.limits, client.buffer)
+        super().__init__(
+            Side.CLIENT, client.caller.peer, client.key, client.timing, client.limits, client.buffer
+        )
         self._client = client
         self.finished = asyncio.Event()
         self.refusal: Refuse | None = None
@@ -87,8 +93,8 @@ class _ClientLink(Link):
 
 
 class Client:
-    """Keeps a caller connected to its peer. `on_notices(now, notices)` gets what the caller has to tell, in the loop,
-    but for the ends of calls made by `call`.
+    """Keeps a caller connected to its peer. `on_notices(now, notices)` gets what the caller has to
+    tell, in the loop, but for the ends of calls made by `call`.
     """
 
     def __init__(
@@ -103,8 +109,9 @@ class Client:
         timing: Timing | None = None,
         limits: Limits | None = None,
     ) -> None:
-        """`key`: the shared key, or all that are accepted. `tls`: mutual TLS; the other end must show the certificate of the
-        caller's peer. With any of them, and without, the other end must go by the name of the caller's peer."""
+        """`key`: the shared key, or all that are accepted. `tls`: mutual TLS; the other end must
+        show the certificate of the caller's peer. With any of them, and without, the other end must
+        go by the name of the caller's peer."""
         self.host = host
         self.port = port
         self.caller = caller
@@ -116,7 +123,8 @@ class Client:
         self.trouble = ""
         """Why the last attempt to connect came to nothing; empty if it did not."""
         self.answered = False
-        """Whether somebody answered the last attempt, be it by a refusal: then nobody needs to be launched there."""
+        """Whether somebody answered the last attempt, be it by a refusal: then nobody needs to be
+        launched there."""
         self.timing = timing or Timing()
         self.limits = limits or Limits()
         self.buffer = bytearray(READ_BUFFER)
@@ -144,9 +152,14 @@ class Client:
 
     @property
     def certificate_ends(self) -> float | None:
-        """When the certificate ends that the peer showed (s since 1970); None while not connected, and without TLS."""
+        """When the certificate ends that the peer showed (s since 1970); None while not connected,
+        and without TLS."""
         certificate = None if self._link is None else self._link.certificate()
-        return None if certificate is None else float(ssl.cert_time_to_seconds(certificate["notAfter"]))
+        return (
+            None
+            if certificate is None
+            else float(ssl.cert_time_to_seconds(certificate["notAfter"]))
+        )
 
     async def close(self, text: str = "the caller stops") -> None:
         """Say good-bye; calls under way end as lost."""
@@ -174,7 +187,8 @@ class Client:
         parent: str = "",
         seed: int = 0,
     ) -> Outcome:
-        """Call a service: its outcome, which is acknowledged when it comes. Cancelling the task cancels the call."""
+        """Call a service: its outcome, which is acknowledged when it comes. Cancelling the task
+        cancels the call."""
         id_ = f"{self._prefix}{next(_NUMBERS)}"
         now = self.now()
         future: asyncio.Future[Outcome] = self._future()
@@ -263,11 +277,17 @@ class Client:
         try:
             async with asyncio.timeout(self.timing.silence):
                 _, link = await self._loop.create_connection(
-                    lambda: _ClientLink(self), self.host, self.port, ssl=self.tls, server_hostname=name
+                    lambda: _ClientLink(self),
+                    self.host,
+                    self.port,
+                    ssl=self.tls,
+                    server_hostname=name,
                 )
         except (OSError, TimeoutError) as fault:
             self.trouble, self.answered = self._said(fault), isinstance(fault, ssl.SSLError)
-            self.caller.unreached(self.now(), self.trouble, gone=isinstance(fault, ConnectionRefusedError))
+            self.caller.unreached(
+                self.now(), self.trouble, gone=isinstance(fault, ConnectionRefusedError)
+            )
             self.flush()
             return None
         self.trouble, self.answered = "", True
@@ -275,7 +295,8 @@ class Client:
         return link
 
     def took_outcomes(self, now: float, outcomes: list[Outcome]) -> None:
-        """Calls have ended. Their owners go on in this turn of the loop: what they call now shares a write."""
+        """Calls have ended. Their owners go on in this turn of the loop: what they call now shares
+        a write."""
         caller = self.caller
         caller.take_outcomes(now, outcomes)
         if caller.has_news:
@@ -292,7 +313,8 @@ class Client:
     def gone(self, now: float, link: _ClientLink) -> None:
         """A link is over."""
         if self.tls is not None and not link.welcome and link.refusal is None:
-            link.reason += f"; {NOT_TRUSTED}"  # in TLS 1.3 a client is let in before its certificate is looked at
+            # in TLS 1.3 a client is let in before its certificate is looked at
+            link.reason += f"; {NOT_TRUSTED}"
         self.trouble = link.reason
         if self._link is link:
             self._link = None
@@ -312,6 +334,14 @@ class Client:
                 return f"{text}; make it anew with `petrobot keys --tls` and copy it to {peer}"
             return f"its certificate is not that of {self.caller.peer}: {fault.verify_message}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
-        if isinstance(fault, OSError) and fault.errno and not isinstance(fault, ssl.SSLError | socket.gaierror):
+        if (
+            isinstance(fault, OSError)
+            and fault.errno
+            and not isinstance(fault, ssl.SSLError | socket.gaierror)
+        ):
             said = os.strerror(fault.errno).lower()  # asyncio's own words are the address once more
-        return f"{said}; {NOT_TRUSTED}" if self.tls is not None and isinstance(fault, ConnectionError) else said
+        return (
+            f"{said}; {NOT_TRUSTED}"
+            if self.tls is not None and isinstance(fault, ConnectionError)
+            else said
+        )

@@ -1,4 +1,5 @@
-"""Messages as bytes and back: a msgpack array `[kind, field, ...]` for each, every field checked on its way in."""
+"""Messages as bytes and back: a msgpack array `[kind, field, ...]` for each, every field checked on
+its way in."""
 
 from __future__ import annotations
 
@@ -11,12 +12,19 @@ from typing import Any, NamedTuple, get_args
 import msgpack
 import numpy as np
 
-from services.comm import messages as m
-from services.comm.canbus import Frame
-from services.comm.frequent import COUNT_END, EXECUTED, NAME_LENGTH, READERS, WRITERS
-from services.comm.messages import Executed, Message, Tick
-from services.comm.party import Envelope, Posted
-from services.comm.plain import LARGEST, MAX_CONTAINERS, NotPlainError, inspect, pack_array, unpack_array
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.frequent import COUNT_END, EXECUTED, NAME_LENGTH, READERS, WRITERS
+from petrobot.services.comm.messages import Executed, Message, Tick
+from petrobot.services.comm.party import Envelope, Posted
+from petrobot.services.comm.plain import (
+    LARGEST,
+    MAX_CONTAINERS,
+    NotPlainError,
+    inspect,
+    pack_array,
+    unpack_array,
+)
 
 __all__ = [
     "LIMITS",
@@ -57,12 +65,13 @@ LIMITS: Mapping[int, int] = {
     m.SetPoint.KIND: 4 * KIB,
     m.Withdraw.KIND: 16,
 }
-"""Largest body of each kind (bytes), the MAC not counted. A value of the global memory (1 MiB) fits into CALL and RESULT; images
-and other large data have connections of their own."""
+"""Largest body of each kind (bytes), the MAC not counted. A value of the global memory (1 MiB) fits
+into CALL and RESULT; images and other large data have connections of their own."""
 
 MAX_VALUES = 1 << 17
-"""Most values in one message, all that its arrays and maps hold: 1 MiB of floats. Together with the limit of bytes this is what
-keeps other callers waiting while one message is read: some 30 ms at the worst."""
+"""Most values in one message, all that its arrays and maps hold: 1 MiB of floats. Together with the
+limit of bytes this is what keeps other callers waiting while one message is read: some 30 ms at the
+worst."""
 ENTRY = 6
 """Values that an entry of a map counts as: its key is checked, hashed and put in its place."""
 MAX_CONTAINERS_OF_TICK = 100_000
@@ -70,7 +79,8 @@ MAX_CONTAINERS_OF_TICK = 100_000
 UNCOUNTED = MAX_CONTAINERS
 """Bodies up to so many bytes are read without counting what is in them: they cannot hold more."""
 _SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
-"""Kinds whose last field, a bool, is left out when it is false: a peer that does not know it yet is not bothered with it."""
+"""Kinds whose last field, a bool, is left out when it is false: a peer that does not know it yet is
+not bothered with it."""
 _COUNTED = frozenset((m.Call.KIND, m.Outcome.KIND, m.Event.KIND, m.Answer.KIND))
 _NUMBERS = frozenset((float, int))
 _TICK = Tick.KIND
@@ -79,7 +89,8 @@ _ARRAY, _MESSAGE = 1, 2
 
 
 class ProtocolError(Exception):
-    """The other side broke the protocol. `code` is for programs, `text` for people; `before` came well before the fault."""
+    """The other side broke the protocol. `code` is for programs, `text` for people; `before` came
+    well before the fault."""
 
     def __init__(self, code: str, text: str, before: Iterable[Message] = ()) -> None:
         super().__init__(f"{code}: {text}")
@@ -150,11 +161,19 @@ def _posted_all(value: tuple[Any, ...]) -> tuple[Posted, ...]:
 
 
 def _posted(item: Any) -> Posted:
-    if type(item) is not tuple or tuple(map(type, item[:6])) != (int, int, str, str, str, str) or len(item) != 7:
+    if (
+        type(item) is not tuple
+        or tuple(map(type, item[:6])) != (int, int, str, str, str, str)
+        or len(item) != 7
+    ):
         raise _FieldError("not an envelope")
     due, sequence, party, source, target, channel, body = item
     inspect(body, _LEAVES)
-    return Posted(_count(due), _count(sequence), Envelope(party, source, target, channel, _body_in(channel, body)))
+    return Posted(
+        _count(due),
+        _count(sequence),
+        Envelope(party, source, target, channel, _body_in(channel, body)),
+    )
 
 
 def _body_in(channel: str, body: Any) -> Any:
@@ -176,7 +195,8 @@ class _Field(NamedTuple):
 
     @property
     def out(self) -> tuple[type, ...]:
-        """Types that it may have on its way out: packed they are those on its way in, or taken for them."""
+        """Types that it may have on its way out: packed they are those on its way in, or taken for
+        them."""
         return (*self.types, *_ALSO.get(self.types[0], ()))
 
 
@@ -201,7 +221,17 @@ _SHORTER = {"cause": "put long words into the text"}
 class _Spec:
     """One kind of message: how its fields are read and written."""
 
-    __slots__ = ("checks", "cls", "fields", "long_checks", "names", "out", "read", "required", "types")
+    __slots__ = (
+        "checks",
+        "cls",
+        "fields",
+        "long_checks",
+        "names",
+        "out",
+        "read",
+        "required",
+        "types",
+    )
 
     def __init__(self, cls: type[Message]) -> None:
         described = dataclasses.fields(cls)
@@ -209,7 +239,8 @@ class _Spec:
         self.names = [field.name for field in described]
         self.fields = [_FIELDS[str(field.type)] for field in described]
         self.required = sum(
-            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING for field in described
+            field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            for field in described
         )
         self.types = tuple(field.types[0] for field in self.fields)
         self.checks = self._checks(short=True)
@@ -222,11 +253,13 @@ class _Spec:
         """Place in the array, name, field, and whether more than its type is checked."""
 
     def _checks(self, short: bool) -> tuple[tuple[int, Callable[[Any], Any]], ...]:
-        """Checks by position; a body shorter than the longest name needs none of its names measured."""
+        """Checks by position; a body shorter than the longest name needs none of its names
+        measured."""
         return tuple(
             (index, field.check)
             for index, (name, field) in enumerate(zip(self.names, self.fields, strict=True))
-            if field.check is not None and not (field.check is _name and (short or name in _FREE_TEXT))
+            if field.check is not None
+            and not (field.check is _name and (short or name in _FREE_TEXT))
         )
 
 
@@ -245,16 +278,18 @@ unpack = msgpack.unpackb
 def encode(message: Message) -> bytes:
     """Body of a frame, without length and MAC: what `decode` takes, and nothing else.
 
-    Raises ProtocolError for a message that the other side would have to refuse, since a refusal costs the connection: too
-    large, a name too long, a number out of its range, data that is not plain. Data in calls and results must have been
-    through `plain`.
+    Raises ProtocolError for a message that the other side would have to refuse, since a refusal
+    costs the connection: too large, a name too long, a number out of its range, data that is not
+    plain. Data in calls and results must have been through `plain`.
     """
     kind = message.KIND
     writer = WRITERS.get(kind)
     row: Sequence[Any] | None = writer(message) if writer is not None else None
     try:
         if row is None and kind == _TICK:
-            return _small_enough(message, msgpack.packb([kind, *_tick_out(message)], default=_extension))
+            return _small_enough(
+                message, msgpack.packb([kind, *_tick_out(message)], default=_extension)
+            )
         if row is None:
             row = _row(message)
         body: bytes = _pack(row)
@@ -283,15 +318,20 @@ def _small_enough(message: Message, body: bytes) -> bytes:
 
 
 def _row(message: Message) -> list[Any]:
-    """The array that is a message's body, each field checked as the other side will check it. Raises ProtocolError."""
+    """The array that is a message's body, each field checked as the other side will check it.
+    Raises ProtocolError."""
     kind = message.KIND
     spec = _SPECS[kind]
     row = [kind, *spec.read(message)]
     for index, name, field, checks in spec.out:
         value = row[index]
         try:
-            if not isinstance(value, field.out) or (type(value) is bool and bool not in field.types):
-                raise _FieldError(f"expected a {field.types[0].__name__}, found a {type(value).__name__}")
+            if not isinstance(value, field.out) or (
+                type(value) is bool and bool not in field.types
+            ):
+                raise _FieldError(
+                    f"expected a {field.types[0].__name__}, found a {type(value).__name__}"
+                )
             if checks and field.check is not None:
                 field.check(value)
         except (_FieldError, NotPlainError, OverflowError) as fault:
@@ -306,11 +346,14 @@ def _refuse_too_many(body: bytes, message: Message) -> None:
     try:
         _unpack_counted(body, message.KIND)
     except Exception as fault:
-        raise ProtocolError("too_large", f"a {type(message).__name__}: {_not_readable(fault)}") from None
+        raise ProtocolError(
+            "too_large", f"a {type(message).__name__}: {_not_readable(fault)}"
+        ) from None
 
 
 def encode_all(messages: Iterable[Message]) -> list[bytes]:
-    """`encode` of each, the kinds that make up nearly all traffic without a call of it. Raises as `encode`."""
+    """`encode` of each, the kinds that make up nearly all traffic without a call of it. Raises as
+    `encode`."""
     bodies: list[bytes] = []
     for message in messages:
         kind = message.KIND
@@ -330,7 +373,17 @@ def encode_all(messages: Iterable[Message]) -> list[bytes]:
 def _tick_out(tick: Any) -> tuple[int, list[Any]]:
     rows = []
     for due, sequence, envelope in tick.envelopes:
-        rows.append((due, sequence, envelope.party, envelope.source, envelope.target, envelope.channel, envelope.body))
+        rows.append(
+            (
+                due,
+                sequence,
+                envelope.party,
+                envelope.source,
+                envelope.target,
+                envelope.channel,
+                envelope.body,
+            )
+        )
     return tick.number, rows
 
 
@@ -356,9 +409,12 @@ def no_extension(code: int, data: bytes) -> Any:
 
 
 def kind_of(head: bytes | bytearray | memoryview) -> int:
-    """Kind of the message whose body begins so (2 bytes needed). Raises ProtocolError if there is no such kind."""
+    """Kind of the message whose body begins so (2 bytes needed). Raises ProtocolError if there is
+    no such kind."""
     if len(head) < 2 or not 0x91 <= head[0] <= 0x9F or head[1] not in _SPECS:
-        raise ProtocolError("unknown_kind", "a body begins with an array of 1 to 15 fields and a known kind")
+        raise ProtocolError(
+            "unknown_kind", "a body begins with an array of 1 to 15 fields and a known kind"
+        )
     return head[1]
 
 
@@ -367,7 +423,9 @@ def decode(body: bytes | memoryview) -> Message:
     kind = kind_of(body)
     limit = LIMITS[kind]
     if len(body) > limit:
-        raise ProtocolError("too_large", f"kind {kind}: {len(body)} bytes are above the limit of {limit}")
+        raise ProtocolError(
+            "too_large", f"kind {kind}: {len(body)} bytes are above the limit of {limit}"
+        )
     return decode_kind(body, kind)
 
 
@@ -450,17 +508,25 @@ def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
             counter.values = ENTRY * len(body)
         return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **hooks)
     counter = _Counter(MAX_CONTAINERS)
-    # Arrays within arrays are counted when they end; none of those that have not ended may be longer than all may be together.
+    # Arrays within arrays are counted when they end; none of those that have not ended may be
+    # longer than all may be together.
     longest = {"max_array_len": MAX_VALUES, "max_map_len": MAX_VALUES // ENTRY}
-    return msgpack.unpackb(body, ext_hook=no_extension, list_hook=counter, object_hook=counter, **longest)
+    return msgpack.unpackb(
+        body, ext_hook=no_extension, list_hook=counter, object_hook=counter, **longest
+    )
 
 
 def _other_types(spec: _Spec, fields: list[Any]) -> None:
-    """Settle fields that differ from the usual types: trailing ones left out, int for float, nil where it may stand."""
+    """Settle fields that differ from the usual types: trailing ones left out, int for float, nil
+    where it may stand."""
     if not spec.required <= len(fields) <= len(spec.fields):
         raise _FieldError(f"{len(fields)} fields instead of {len(spec.fields)}")
-    for position, (value, name, field) in enumerate(zip(fields, spec.names, spec.fields, strict=False)):
+    for position, (value, name, field) in enumerate(
+        zip(fields, spec.names, spec.fields, strict=False)
+    ):
         if type(value) is int and field.types[0] is float:
             fields[position] = float(value)
         elif type(value) not in field.types:
-            raise _FieldError(f"{name} is a {type(value).__name__}, not a {field.types[0].__name__}")
+            raise _FieldError(
+                f"{name} is a {type(value).__name__}, not a {field.types[0].__name__}"
+            )

@@ -1,9 +1,11 @@
-"""The numba extra for small kernels of numbers: compiled where numba is installed, run as they stand where it is not.
+"""The numba extra for small kernels of numbers: compiled where numba is installed, run as they
+stand where it is not.
 
-A kernel takes and gives floats and tuples of floats, and gives the same bits either way: no fast mathematics, so sums keep
-their order, and functions whose last place differs from library to library (hypot, powers) do not occur in kernels. Compiled
-code is kept on disk beside the source or in the user's cache; where neither can be written kernels are not compiled, since
-that would have to be done anew in every process. `PETROBOT_COMPILED=0` in the environment leaves numba out.
+A kernel takes and gives floats and tuples of floats, and gives the same bits either way: no fast
+mathematics, so sums keep their order, and functions whose last place differs from library to
+library (hypot, powers) do not occur in kernels. Compiled code is kept on disk beside the source or
+in the user's cache; where neither can be written kernels are not compiled, since that would have to
+be done anew in every process. `PETROBOT_COMPILED=0` in the environment leaves numba out.
 """
 
 from __future__ import annotations
@@ -42,8 +44,9 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def packed(function: Callable[..., Any], numbers: Iterable[float]) -> Sequence[float]:
-    """Numbers that a kernel reads by place and that seldom change, as its callers best hand them over: an array to a compiled
-    one, which takes it as it is (many floats of a tuple are each taken apart), else a tuple of floats."""
+    """Numbers that a kernel reads by place and that seldom change, as its callers best hand them
+    over: an array to a compiled one, which takes it as it is (many floats of a tuple are each taken
+    apart), else a tuple of floats."""
     if hasattr(function, "py_func"):
         array: Any = np.array(list(numbers), dtype=np.float64)
         return array  # type: ignore[no-any-return]

@@ -1,28 +1,35 @@
-"""Where everything is: the location file services.toml as immutable data, read by every host and by the coordinator."""
+"""Where everything is: the location file services.toml as immutable data, read by every host and by
+the coordinator."""
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from services.comm import directory_file
-from services.comm.party import TICK
+from petrobot.services.comm import directory_file
+from petrobot.services.comm.party import TICK
 
+_log = logging.getLogger(__name__)
 COORDINATOR = directory_file.COORDINATOR
 COORDINATOR_PORT = directory_file.COORDINATOR_PORT
 SHIPPED = Path(__file__).parents[2]
-"""Where petrobot's own files are, so that a copied services.toml still finds the shipped numbers."""
+"""Where petrobot's own files are, so that a copied services.toml still finds the shipped
+numbers."""
 MEMORY = "memory"
 MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
 """What the node that has the global memory offers."""
 
 
 class DirectoryError(Exception):
-    """services.toml is refused, or it does not know a name; `faults` holds one line for each fault, with its remedy."""
+    """services.toml is refused, or it does not know a name; `faults` holds one line for each fault,
+    with its remedy."""
 
     def __init__(self, faults: tuple[str, ...]) -> None:
         super().__init__("\n".join(faults))
@@ -37,17 +44,21 @@ class NodeEntry:
     host: str
     port: int
     sim: str = ""
-    """Import path of what makes the simulated laboratory's party, `function(directory, name)`; empty for a real node."""
+    """Import path of what makes the simulated laboratory's party, `function(directory, name)`;
+    empty for a real node."""
     worker_memory_mb: int = 4096
-    """Limit of the address space of each worker process (MiB). Address space, not memory in use: numpy, opencv and scipy
-    together reserve about 0.6 GiB on a small host; some libraries reserve more for each core."""
+    """Limit of the address space of each worker process (MiB). Address space, not memory in use:
+    numpy, opencv and scipy together reserve about 0.6 GiB on a small host; some libraries reserve
+    more for each core."""
     workers: int = 32
-    """Most worker processes for actions without a device: as many runs of such actions at a time."""
+    """Most worker processes for actions without a device: as many runs of such actions at a
+    time."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceEntry:
-    """A device: its node, its driver ("module:Class"; empty on a simulated node) and the driver's own keys."""
+    """A device: its node, its driver ("module:Class"; empty on a simulated node) and the driver's
+    own keys."""
 
     name: str
     node: str
@@ -81,7 +92,8 @@ class ActionEntry:
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """A general-purpose service. `run` is empty for the global memory and for what a simulated node answers itself."""
+    """A general-purpose service. `run` is empty for the global memory and for what a simulated node
+    answers itself."""
 
     name: str
     node: str
@@ -114,7 +126,8 @@ class Directory:
 
     source: Path
     hash: str
-    """SHA-256 of the file's data (comments and spacing left out), in the handshake of every connection."""
+    """SHA-256 of the file's data (comments and spacing left out), in the handshake of every
+    connection."""
     nodes: Mapping[str, NodeEntry]
     devices: Mapping[str, DeviceEntry]
     actions: Mapping[str, ActionEntry]
@@ -130,7 +143,8 @@ class Directory:
     """Files of numbers that the cell's programs share, by name; relative to this file."""
 
     def where(self, name: str) -> str:
-        """The node of an action, service, device, stream's receiver or timer. Raises DirectoryError."""
+        """The node of an action, service, device, stream's receiver or timer. Raises
+        DirectoryError."""
         if name in self.streams:
             return self.devices[self.streams[name].to].node
         key = MEMORY if name in MEMORY_CALLS else name
@@ -138,10 +152,13 @@ class Directory:
             if key in table:
                 return str(table[key].node)
         known = [*self.actions, *self.services, *self.devices, *self.timers, *self.streams]
-        raise DirectoryError((f"{self.source}: nothing is named {name!r}{directory_file.nearest(key, known)}",))
+        raise DirectoryError(
+            (f"{self.source}: nothing is named {name!r}{directory_file.nearest(key, known)}",)
+        )
 
     def party(self, endpoint: str) -> str:
-        """Lock step: the party that an endpoint lives in; a name that stands in no table is a party itself."""
+        """Lock step: the party that an endpoint lives in; a name that stands in no table is a party
+        itself."""
         try:
             return endpoint if endpoint in self.nodes else self.where(endpoint)
         except DirectoryError:
@@ -169,7 +186,8 @@ class Directory:
         return {name: self.address(name) for name in (*self.nodes, COORDINATOR)}
 
     def same_host(self, node: str, party: str) -> bool:
-        """Whether a party lives on a node's host; one that is no node (a coordinator in lock step) does."""
+        """Whether a party lives on a node's host; one that is no node (a coordinator in lock step)
+        does."""
         return party not in self.nodes or self.nodes[party].host == self.nodes[node].host
 
     def laboratory(self) -> str:
@@ -182,33 +200,42 @@ class Directory:
         return key in self.services and self.services[key].local
 
     def file(self, path: str) -> Path:
-        """A path written in services.toml, taken relative to it; what is not there but comes with petrobot is taken from there."""
+        """A path written in services.toml, taken relative to it; what is not there but comes with
+        petrobot is taken from there."""
         beside = self.source.parent / path
         shipped = SHIPPED / path
         return shipped if not beside.exists() and shipped.exists() else beside
 
     def delays(self) -> dict[str, int]:
-        """Lock-step delays of the links in whole ticks, rounded up, as `services.comm.cell.Delays` takes them."""
-        return {name: max(1, math.ceil(seconds / TICK - 1e-6)) for name, seconds in self.links.items()}
+        """Lock-step delays of the links in whole ticks, rounded up, as `services.comm.cell.Delays`
+        takes them."""
+        return {
+            name: max(1, math.ceil(seconds / TICK - 1e-6)) for name, seconds in self.links.items()
+        }
 
 
 def load(path: str | Path) -> Directory:
-    """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be read."""
+    """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be
+    read."""
     source = Path(path)
     return parse(read_text(source), source)
 
 
 def read_text(source: Path) -> str:
-    """The text of a location file. Raises DirectoryError with the line that is no UTF-8, OSError when it cannot be read."""
+    """The text of a location file. Raises DirectoryError with the line that is no UTF-8, OSError
+    when it cannot be read."""
     try:
         return source.read_text(encoding="utf-8")
     except UnicodeDecodeError as fault:
         line = source.read_bytes()[: fault.start].count(b"\n") + 1
-        raise DirectoryError((f"{source}:{line}: not UTF-8 text ({fault.reason}); save the file as UTF-8",)) from fault
+        raise DirectoryError(
+            (f"{source}:{line}: not UTF-8 text ({fault.reason}); save the file as UTF-8",)
+        ) from fault
 
 
 def parse(text: str, source: Path) -> Directory:
-    """Read the text of a services.toml; `source` is its path, for messages and for relative paths."""
+    """Read the text of a services.toml; `source` is its path, for messages and for relative
+    paths."""
     text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
     tables, digest, faults = directory_file.read(text, str(source), MEMORY)
     if faults:
@@ -221,11 +248,17 @@ def parse(text: str, source: Path) -> Directory:
         devices=devices,
         actions={n: _action(n, t, devices) for n, t in tables["actions"].items()},
         services={n: _service(n, t) for n, t in tables["services"].items()},
-        streams={n: StreamEntry(n, t["to"], float(t["period"])) for n, t in tables["streams"].items()},
-        timers={n: TimerEntry(n, t["node"], float(t["period"])) for n, t in tables["timers"].items()},
+        streams={
+            n: StreamEntry(n, t["to"], float(t["period"])) for n, t in tables["streams"].items()
+        },
+        timers={
+            n: TimerEntry(n, t["node"], float(t["period"])) for n, t in tables["timers"].items()
+        },
         links={n: float(d) for n, d in tables["links"].items()},
         keys=dict(tables["keys"]),
-        coordinator=NodeEntry(COORDINATOR, **{"host": "127.0.0.1", "port": COORDINATOR_PORT, **tables[COORDINATOR]}),
+        coordinator=NodeEntry(
+            COORDINATOR, **{"host": "127.0.0.1", "port": COORDINATOR_PORT, **tables[COORDINATOR]}
+        ),
         parameters=dict(tables["parameters"]),
     )
 
@@ -254,7 +287,9 @@ def _action(name: str, table: Mapping[str, Any], devices: Mapping[str, DeviceEnt
 
 
 def _service(name: str, table: Mapping[str, Any]) -> ServiceEntry:
-    return ServiceEntry(name, table["node"], table.get("run", ""), table.get("scope", "network") == "local")
+    return ServiceEntry(
+        name, table["node"], table.get("run", ""), table.get("scope", "network") == "local"
+    )
 
 
 def _seconds(value: float | None) -> float | None:
@@ -262,10 +297,21 @@ def _seconds(value: float | None) -> float | None:
 
 
 def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
-    """Faults of the import paths that a node of this host must load: one line each, empty when all are there."""
-    places = [(f"devices.{d.name}.driver", d.driver) for d in directory.devices.values() if d.node == node and d.driver]
-    places += [(f"actions.{a.name}.run", a.run) for a in directory.actions.values() if a.node == node]
-    places += [(f"services.{s.name}.run", s.run) for s in directory.services.values() if s.node == node and s.run]
+    """Faults of the import paths that a node of this host must load: one line each, empty when all
+    are there."""
+    places = [
+        (f"devices.{d.name}.driver", d.driver)
+        for d in directory.devices.values()
+        if d.node == node and d.driver
+    ]
+    places += [
+        (f"actions.{a.name}.run", a.run) for a in directory.actions.values() if a.node == node
+    ]
+    places += [
+        (f"services.{s.name}.run", s.run)
+        for s in directory.services.values()
+        if s.node == node and s.run
+    ]
     found = [(key, _import_fault(path)) for key, path in places]
     return tuple(f"{directory.source}: {key}: {fault}" for key, fault in found if fault)
 
@@ -278,21 +324,46 @@ def _import_fault(path: str) -> str:
     return ""
 
 
-def resolve(path: str) -> Any:
-    """The object at an import path "module:name". Raises ImportError that says what is missing and what to do."""
-    module_name, _, attribute = path.partition(":")
+@cache
+def module_name(name: str) -> str:
+    """Return the name by which a module of a location file or task file is imported.
+
+    It is the name itself. Only what was shipped as `services`, `sim` or `coordinator` before
+    petrobot was one package is found under its present name, unless the user has such a package.
+    """
+    top = name.partition(".")[0]
+    if top not in ("coordinator", "services", "sim"):
+        return name
     try:
-        module = importlib.import_module(module_name)
+        spec = importlib.util.find_spec(top)
+    except ValueError:  # a stand-in in sys.modules without a spec: the user's
+        return name
+    own = spec.origin if spec is not None else None
+    if spec is not None and (own is None or not Path(own).samefile(SHIPPED / top / "__init__.py")):
+        return name
+    _log.warning("%s is an old name; write petrobot.%s", name, name)
+    return f"petrobot.{name}"
+
+
+def resolve(path: str) -> Any:
+    """The object at an import path "module:name". Raises ImportError that says what is missing and
+    what to do."""
+    written, _, attribute = path.partition(":")
+    try:
+        module = importlib.import_module(module_name(written))
     except ImportError as fault:
         raise ImportError(
-            f"cannot import {module_name!r} ({fault}); install its package on this host or put its folder on PYTHONPATH"
+            f"cannot import {written!r} ({fault}); install its package on this host or put "
+            "its folder on PYTHONPATH"
         ) from fault
     except Exception as fault:
         raise ImportError(
-            f"importing {module_name!r} raises {type(fault).__name__}: {fault}; mend the module"
+            f"importing {written!r} raises {type(fault).__name__}: {fault}; mend the module"
         ) from fault
     found = getattr(module, attribute, None)
     if not callable(found):
         names = [n for n in vars(module) if not n.startswith("_")]
-        raise ImportError(f"{module_name!r} has no callable {attribute!r}{directory_file.nearest(attribute, names)}")
+        raise ImportError(
+            f"{written!r} has no callable {attribute!r}{directory_file.nearest(attribute, names)}"
+        )
     return found

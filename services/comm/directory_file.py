@@ -33,7 +33,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and value == value and abs(value) < 1e9
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and value == value
+        and abs(value) < 1e9
+    )
 
 
 def _text(value: Any) -> bool:
@@ -59,17 +64,23 @@ def _is_address(text: str) -> bool:
     return True
 
 
-_HOST_NAME = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?")
-"""Letters, digits and hyphens in labels (RFC 1123); underscores, which many local networks have, too."""
+_HOST_NAME = re.compile(
+    r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?"
+)
+"""Letters, digits and hyphens in labels (RFC 1123); underscores, which many local networks have,
+too."""
 _IMPORT_PATH = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _NAME = re.compile(r"[A-Za-z_][\w-]*")
 LONGEST_NAME = 200
-"""Characters of a name: with what is put before or behind it (`memory:`, `stream:`) it still is one in any message."""
+"""Characters of a name: with what is put before or behind it (`memory:`, `stream:`) it still is one
+in any message."""
 
 
 def _path_key(what: str, *, required: bool = False) -> Key:
     return Key(
-        f'an import path "module:{what}"', lambda v: isinstance(v, str) and bool(_IMPORT_PATH.fullmatch(v)), required
+        f'an import path "module:{what}"',
+        lambda v: isinstance(v, str) and bool(_IMPORT_PATH.fullmatch(v)),
+        required,
     )
 
 
@@ -85,14 +96,18 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
     "nodes": {
         "host": Key('a host name or address such as "127.0.0.1", without a port', _host, True),
         "port": Key(
-            "a port from 1 to 65535", lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536, True
+            "a port from 1 to 65535",
+            lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536,
+            True,
         ),
         "sim": _path_key("function"),
         "worker_memory_mb": Key(
-            "a whole number of MiB above 0", lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0
+            "a whole number of MiB above 0",
+            lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
         ),
         "workers": Key(
-            "a whole number of processes above 0", lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0
+            "a whole number of processes above 0",
+            lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
         ),
     },
     "devices": {"node": _name_key("a node", required=True), "driver": _path_key("Class")},
@@ -119,7 +134,9 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
 OPEN = ("devices",)
 """Tables whose entries have keys of their own beside the known ones."""
 FLAT: Mapping[str, Key] = {
-    "links": Key("a delay in seconds, 0.004 (one tick) or more", lambda v: _number(v) and v >= 0.004),
+    "links": Key(
+        "a delay in seconds, 0.004 (one tick) or more", lambda v: _number(v) and v >= 0.004
+    ),
     "keys": Key("the path of a file or folder, relative to this one", _text),
     "parameters": Key("the path of a file, relative to this one", _text),
 }
@@ -156,13 +173,16 @@ class Faults:
                     return number
                 if header == ".".join(table):
                     first = number
-            elif header == ".".join(table) and re.match(rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line):
+            elif header == ".".join(table) and re.match(
+                rf"[\"']?{re.escape(path[-1])}[\"']?\s*=", line
+            ):
                 return number
         return first
 
 
 def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
-    """Tables of the file, the hash of its data, and all faults (then the tables are not to be used)."""
+    """Tables of the file, the hash of its data, and all faults (then the tables are not to be
+    used)."""
     faults = Faults(text, source)
     try:
         data = tomllib.loads(text)
@@ -183,18 +203,23 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
                 faults.add(f"{table}.{name}", f"is {value!r}; write {key.wants}")
     for name in tables["links"]:
         if "/" not in name and name not in CHANNELS:
-            faults.add(f"links.{name}", f'unknown link; write a channel or "source/target"{nearest(name, CHANNELS)}')
+            faults.add(
+                f"links.{name}",
+                f'unknown link; write a channel or "source/target"{nearest(name, CHANNELS)}',
+            )
     for name in tables["keys"]:
         if name not in KEYS:
             faults.add(
-                f"keys.{name}", f'unknown; write file = "cell.key" or certificates = "keys"{nearest(name, KEYS)}'
+                f"keys.{name}",
+                f'unknown; write file = "cell.key" or certificates = "keys"{nearest(name, KEYS)}',
             )
     if {"file", "certificates"} <= tables["keys"].keys():
         faults.add("keys", "a shared key and certificates; name one of them")
     elif tables["keys"].keys() == {"also"}:
         faults.add(
             "keys.also",
-            'is accepted beside another key, and there is none; write file = "cell.key" or certificates = "keys", too',
+            'is accepted beside another key, and there is none; write file = "cell.key" or '
+            'certificates = "keys", too',
         )
     if not faults.lines:
         _check_places(tables, faults, memory)
@@ -203,8 +228,8 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
 
 
 def _digest(data: Mapping[str, Any]) -> str:
-    """Hash of the file's data but for `keys`: while keys are replaced, hosts name different ones, and a key that does not fit
-    is refused as such."""
+    """Hash of the file's data but for `keys`: while keys are replaced, hosts name different ones,
+    and a key that does not fit is refused as such."""
     told = {name: table for name, table in data.items() if name != "keys"}
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
 
@@ -228,7 +253,9 @@ def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
     schema = data.get("schema")
     if schema != SCHEMA:
         known = "is missing" if schema is None else f"is {schema!r}"
-        faults.add("schema", f"{known}; write schema = {SCHEMA}, the layout that this version reads")
+        faults.add(
+            "schema", f"{known}; write schema = {SCHEMA}, the layout that this version reads"
+        )
     if not data.get("nodes"):
         faults.add("nodes", "there is no node; write at least one [nodes.NAME] with host and port")
 
@@ -265,7 +292,9 @@ def _entries(
         yield name, entry
 
 
-def _check_key(here: str, key: str, value: Any, shape: Mapping[str, Key], open_: bool, faults: Faults) -> None:
+def _check_key(
+    here: str, key: str, value: Any, shape: Mapping[str, Key], open_: bool, faults: Faults
+) -> None:
     if key in shape:
         if not shape[key].fits(value):
             faults.add(here, f"is {value!r}; write {shape[key].wants}")
@@ -286,10 +315,16 @@ def _check_places(tables: Tables, faults: Faults, memory: str) -> None:
     for name, entry in tables["services"].items():
         node = nodes.get(entry["node"], {})
         if "run" not in entry and name != memory and node and not node.get("sim"):
-            faults.add(f"services.{name}.run", f'is missing; write an import path (only "{memory}" is built in)')
+            faults.add(
+                f"services.{name}.run",
+                f'is missing; write an import path (only "{memory}" is built in)',
+            )
     for name, entry in tables["streams"].items():
         if entry["to"] not in devices:
-            faults.add(f"streams.{name}.to", f"no device is named {entry['to']!r}{nearest(entry['to'], devices)}")
+            faults.add(
+                f"streams.{name}.to",
+                f"no device is named {entry['to']!r}{nearest(entry['to'], devices)}",
+            )
     for name, entry in tables["actions"].items():
         _check_action(f"actions.{name}", entry, tables, faults)
 
@@ -299,7 +334,9 @@ def _check_node(key: str, node: str, nodes: Mapping[str, Any], faults: Faults) -
         faults.add(key, f"no node is named {node!r}{nearest(node, nodes)}")
 
 
-def _check_addresses(nodes: Mapping[str, Any], coordinator: Mapping[str, Any], faults: Faults) -> None:
+def _check_addresses(
+    nodes: Mapping[str, Any], coordinator: Mapping[str, Any], faults: Faults
+) -> None:
     taken: dict[tuple[str, int], str] = {}
     for name, entry in nodes.items():
         if name == COORDINATOR:
@@ -307,11 +344,17 @@ def _check_addresses(nodes: Mapping[str, Any], coordinator: Mapping[str, Any], f
         address = (entry["host"], entry["port"])
         if address in taken:
             where = f"{address[0]}:{address[1]}"
-            faults.add(f"nodes.{name}.port", f"{where} is already node {taken[address]!r}'s; give each its own port")
+            faults.add(
+                f"nodes.{name}.port",
+                f"{where} is already node {taken[address]!r}'s; give each its own port",
+            )
         taken.setdefault(address, name)
     own = (coordinator.get("host", "127.0.0.1"), coordinator.get("port", COORDINATOR_PORT))
     if own in taken:
-        faults.add(f"{COORDINATOR}.port", f"{own[0]}:{own[1]} is already node {taken[own]!r}'s; give each its own port")
+        faults.add(
+            f"{COORDINATOR}.port",
+            f"{own[0]}:{own[1]} is already node {taken[own]!r}'s; give each its own port",
+        )
 
 
 def _check_action(here: str, entry: Mapping[str, Any], tables: Tables, faults: Faults) -> None:
@@ -320,13 +363,18 @@ def _check_action(here: str, entry: Mapping[str, Any], tables: Tables, faults: F
     if node is not None:
         _check_node(f"{here}.node", node, nodes, faults)
     if device is None and node is None:
-        faults.add(here, 'is on no node; write device = "..." (it runs where its device is) or node = "..."')
+        faults.add(
+            here,
+            'is on no node; write device = "..." (it runs where its device is) or node = "..."',
+        )
     elif device is not None and device not in devices:
         faults.add(f"{here}.device", f"no device is named {device!r}{nearest(device, devices)}")
     elif device is not None and node is not None and devices[device]["node"] != node:
         home = devices[device]["node"]
         faults.add(
-            f"{here}.node", f"is on two nodes: its device {device!r} is on {home!r}, node says {node!r}; remove node"
+            f"{here}.node",
+            f"is on two nodes: its device {device!r} is on {home!r}, node says {node!r}; "
+            "remove node",
         )
 
 
@@ -336,5 +384,8 @@ def _check_names(tables: Tables, faults: Faults) -> None:
     for table in SHAPES:
         for name in tables[table]:
             if name in owner:
-                faults.add(f"{table}.{name}", f"the name is taken by {owner[name]}.{name}; rename one of them")
+                faults.add(
+                    f"{table}.{name}",
+                    f"the name is taken by {owner[name]}.{name}; rename one of them",
+                )
             owner.setdefault(name, table)

@@ -1,7 +1,9 @@
-"""What a location file promises of this host, looked at before anything is launched: code that is there, keys, files of numbers.
+"""What a location file promises of this host, looked at before anything is launched: code that is
+there, keys, files of numbers.
 
-Nothing is imported: a module is found, and its names are read from its source. So the look is quick, and does not run what it
-finds. A node's own start imports everything and says what else is wrong.
+Nothing is imported: a module is found, and its names are read from its source. So the look is
+quick, and does not run what it finds. A node's own start imports everything and says what else is
+wrong.
 """
 
 from __future__ import annotations
@@ -13,17 +15,21 @@ from collections.abc import Container, Iterator
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
-from services.comm.directory import Directory
-from services.comm.directory_file import Faults, nearest
+from petrobot.services.comm.directory import Directory, module_name
+from petrobot.services.comm.directory_file import Faults, nearest
 
 LOOPBACK_NAMES = ("localhost", "ip6-localhost")
 
 
-def misplaced(directory: Directory, *, everywhere: bool = False, actions: bool = True) -> tuple[str, ...]:
-    """One line for each fault, as "FILE:LINE: KEY: what is wrong; remedy"; empty when there is none.
+def misplaced(
+    directory: Directory, *, everywhere: bool = False, actions: bool = True
+) -> tuple[str, ...]:
+    """One line for each fault, as "FILE:LINE: KEY: what is wrong; remedy"; empty when there is
+    none.
 
-    Import paths are looked at for nodes on loopback addresses alone, as what other hosts have is not known here; `everywhere`: for
-    all nodes, as a lock-step cell launches them all here. `actions` False: theirs are not, as scripted ones replace them.
+    Import paths are looked at for nodes on loopback addresses alone, as what other hosts have is
+    not known here; `everywhere`: for all nodes, as a lock-step cell launches them all here.
+    `actions` False: theirs are not, as scripted ones replace them.
     """
     faults = Faults(_text(directory.source), str(directory.source))
     open_nodes = [n.name for n in directory.nodes.values() if not is_loopback(n.host)]
@@ -32,13 +38,18 @@ def misplaced(directory: Directory, *, everywhere: bool = False, actions: bool =
             host = directory.nodes[name].host
             faults.add(
                 f"nodes.{name}.host",
-                f"{host} can be reached by other hosts, and there is no key; make one with `petrobot keys`, copy it to each "
+                f"{host} can be reached by other hosts, and there is no key; make one with "
+                "`petrobot keys`, copy it to each "
                 'host and write [keys] file = "cell.key", or write host = "127.0.0.1"',
             )
     for table, files in (("keys", directory.keys), ("parameters", directory.parameters)):
         for name, path in files.items():
             if not directory.file(path).exists():
-                made = "make it with `petrobot keys`" if table == "keys" else "write the path of a file"
+                made = (
+                    "make it with `petrobot keys`"
+                    if table == "keys"
+                    else "write the path of a file"
+                )
                 faults.add(f"{table}.{name}", f"{directory.file(path)} is not there; {made}")
     here = {n.name for n in directory.nodes.values() if everywhere or is_loopback(n.host)}
     for key, path in _imports(directory, here, actions):
@@ -63,11 +74,16 @@ def is_loopback(host: str) -> bool:
 def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):  # a directory that was made of a text: its lines are not known
+    except (
+        OSError,
+        UnicodeDecodeError,
+    ):  # a directory that was made of a text: its lines are not known
         return ""
 
 
-def _imports(directory: Directory, here: Container[str], actions: bool) -> Iterator[tuple[str, str]]:
+def _imports(
+    directory: Directory, here: Container[str], actions: bool
+) -> Iterator[tuple[str, str]]:
     for node in directory.nodes.values():
         if node.name in here and node.sim:
             yield f"nodes.{node.name}.sim", node.sim
@@ -89,16 +105,21 @@ def _check_arguments(directory: Directory, here: Container[str], faults: Faults)
             if name not in (known or ()):
                 function = action.run.partition(":")[2]
                 faults.add(
-                    f"actions.{action.name}.args", f"{function} has no argument {name!r}{nearest(name, known or ())}"
+                    f"actions.{action.name}.args",
+                    f"{function} has no argument {name!r}{nearest(name, known or ())}",
                 )
 
 
 def _parameters(path: str) -> set[str] | None:
-    """What a function may be given by name beside its context; None if that cannot be told, or if it takes anything."""
+    """What a function may be given by name beside its context; None if that cannot be told, or if
+    it takes anything."""
     module, _, attribute = path.partition(":")
     tree = _source(_spec(module))
     for statement in tree.body if tree is not None else ():
-        if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef) and statement.name == attribute:
+        if (
+            isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef)
+            and statement.name == attribute
+        ):
             if statement.args.kwarg is not None or statement.decorator_list:
                 return None
             return {a.arg for a in [*statement.args.args[1:], *statement.args.kwonlyargs]}
@@ -107,8 +128,10 @@ def _parameters(path: str) -> set[str] | None:
 
 def _spec(module: str) -> ModuleSpec | None:
     try:
-        return importlib.util.find_spec(module)
-    except Exception:  # a parent package that cannot be imported, whatever it raises: told by `_unknown`
+        return importlib.util.find_spec(module_name(module))
+    except (
+        Exception
+    ):  # a parent package that cannot be imported, whatever it raises: told by `_unknown`
         return None
 
 
@@ -122,14 +145,21 @@ def _source(spec: ModuleSpec | None) -> ast.Module | None:
 
 
 def _unknown(path: str) -> str:
-    """What is wrong with an import path, with the remedy; empty if nothing is, as far as its source tells."""
+    """What is wrong with an import path, with the remedy; empty if nothing is, as far as its source
+    tells."""
     module, _, attribute = path.partition(":")
     try:
-        spec = importlib.util.find_spec(module)
+        spec = importlib.util.find_spec(module_name(module))
     except Exception as fault:  # a parent package that cannot be imported, whatever it raises
-        return f"cannot find {module!r} ({type(fault).__name__}: {fault}); install its package here or put its folder on PYTHONPATH"
+        return (
+            f"cannot find {module!r} ({type(fault).__name__}: {fault}); install its "
+            "package here or put its folder on PYTHONPATH"
+        )
     if spec is None:
-        return f"no module {module!r} on this host; install its package here or put its folder on PYTHONPATH"
+        return (
+            f"no module {module!r} on this host; install its package here or put its "
+            "folder on PYTHONPATH"
+        )
     names = _names(spec)
     if names is None or attribute in names:
         return ""
@@ -147,9 +177,13 @@ def _names(spec: ModuleSpec) -> set[str] | None:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
                 found.add(statement.name)
             case ast.Import() | ast.ImportFrom():
-                found |= {(alias.asname or alias.name).partition(".")[0] for alias in statement.names}
+                found |= {
+                    (alias.asname or alias.name).partition(".")[0] for alias in statement.names
+                }
             case ast.Assign() | ast.AnnAssign():
-                targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+                targets = (
+                    statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+                )
                 found |= {target.id for target in targets if isinstance(target, ast.Name)}
             case ast.Expr():
                 pass

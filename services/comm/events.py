@@ -1,4 +1,5 @@
-"""Events on their way: at the node latched ones are numbered and kept until they are safe, at the caller taken once."""
+"""Events on their way: at the node latched ones are numbered and kept until they are safe, at the
+caller taken once."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from services.comm.messages import Event, EventAck
+from petrobot.services.comm.messages import Event, EventAck
 
 KEPT = 1_000
 """Latched events of one source that are kept; then the oldest gives way."""
@@ -16,7 +17,8 @@ KEPT = 1_000
 class _Kept:
     event: Event
     owner: str
-    """Caller whose run raised it; empty for an event of the outside world, which goes to whoever asked for it."""
+    """Caller whose run raised it; empty for an event of the outside world, which goes to whoever
+    asked for it."""
     safe: set[str] = field(default_factory=set)
 
 
@@ -41,21 +43,28 @@ class EventBoard:
         """Latched events that gave way to newer ones before anybody had them."""
 
     def subscribe(self, peer: str, names: Iterable[str], durable: bool) -> list[Event]:
-        """From now on `peer` gets these events. Gives the kept ones that it has not said to be safe, oldest first."""
+        """From now on `peer` gets these events. Gives the kept ones that it has not said to be
+        safe, oldest first."""
         self._listeners[peer] = _Listener(frozenset(names), durable)
         return self.waiting(peer)
 
     def waiting(self, peer: str) -> list[Event]:
-        """Kept events that this peer should have and has not said to be safe, by source, oldest first."""
-        return [kept.event for kept in self._all() if peer not in kept.safe and self._wants(peer, kept)]
+        """Kept events that this peer should have and has not said to be safe, by source, oldest
+        first."""
+        return [
+            kept.event for kept in self._all() if peer not in kept.safe and self._wants(peer, kept)
+        ]
 
     def raise_event(self, event: Event, latched: bool, owner: str) -> tuple[Event, list[str]]:
-        """The event as it goes out (numbered if latched) and to whom now. `owner` alone gets an event of his run."""
+        """The event as it goes out (numbered if latched) and to whom now. `owner` alone gets an
+        event of his run."""
         if latched:
             event = self._number(event, owner)
         if owner:
             return event, [owner]
-        return event, [peer for peer, one in self._listeners.items() if one.up and event.name in one.names]
+        return event, [
+            peer for peer, one in self._listeners.items() if one.up and event.name in one.names
+        ]
 
     def _number(self, event: Event, owner: str) -> Event:
         number = self._numbers.get(event.source, 0) + 1
@@ -71,7 +80,8 @@ class EventBoard:
         return event
 
     def acknowledge(self, peer: str, source: str, number: int) -> None:
-        """The events of this source up to this number are safe with `peer`; what nobody else waits for is forgotten."""
+        """The events of this source up to this number are safe with `peer`; what nobody else waits
+        for is forgotten."""
         kept = self._kept.get(source)
         if kept is None:
             return
@@ -81,7 +91,8 @@ class EventBoard:
         self._kept[source] = deque(one for one in kept if self._awaited(one))
 
     def peer_down(self, peer: str, leaves: bool) -> None:
-        """The link of a peer is down; one that leaves in good order, or is not durable, is forgotten."""
+        """The link of a peer is down; one that leaves in good order, or is not durable, is
+        forgotten."""
         listener = self._listeners.get(peer)
         if listener is None:
             return
@@ -127,7 +138,8 @@ class EventIntake:
         self._unsafe: dict[str, set[int]] = {}
 
     def take(self, event: Event, safe: bool) -> tuple[bool, EventAck | None]:
-        """Whether this event is new, and what to acknowledge. `safe`: its owner needs no time to make it so."""
+        """Whether this event is new, and what to acknowledge. `safe`: its owner needs no time to
+        make it so."""
         if not event.number:
             return True, None
         seen = self._seen.setdefault(event.source, OrderedDict())
@@ -142,7 +154,8 @@ class EventIntake:
         return new, None if event.number in unsafe else EventAck(event.source, event.number)
 
     def acknowledge(self, event: Event) -> EventAck | None:
-        """This event of its source and those before it are safe now; gives what to tell the peer, if anything."""
+        """This event of its source and those before it are safe now; gives what to tell the peer,
+        if anything."""
         unsafe = self._unsafe.get(event.source, set())
         if event.number not in unsafe:
             return None

@@ -1,7 +1,8 @@
-"""When certificates end, and who is told: read from the files themselves, said once, a month before it hurts.
+"""When certificates end, and who is told: read from the files themselves, said once, a month before
+it hurts.
 
-Only the standard library: a host that runs a node needs no package for X.509. Of a certificate (RFC 5280, section 4.1) no more
-is read than its `notAfter`.
+Only the standard library: a host that runs a node needs no package for X.509. Of a certificate (RFC
+5280, section 4.1) no more is read than its `notAfter`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ _BEFORE_VALIDITY = 3
 
 
 def ends_of(pem: str) -> datetime:
-    """When the first certificate of a PEM text ends. Raises ValueError if there is none that can be read."""
+    """When the first certificate of a PEM text ends. Raises ValueError if there is none that can be
+    read."""
     first = pem[pem.find("-----BEGIN CERTIFICATE-----") :].partition("-----END CERTIFICATE-----")
     try:
         der = ssl.PEM_cert_to_DER_cert("".join(first[:2]))
@@ -70,7 +72,8 @@ def _time(der: bytes, at: int) -> datetime:
 
 
 def ending(file: Path, now: datetime, remedy: str) -> str:
-    """What to say of a certificate's file that ends soon or has ended; empty if neither, or if it cannot be read."""
+    """What to say of a certificate's file that ends soon or has ended; empty if neither, or if it
+    cannot be read."""
     try:
         ends = ends_of(file.read_text(encoding="ascii"))
     except (OSError, ValueError):
@@ -91,14 +94,16 @@ _said: set[tuple[Path, bool]] = set()
 
 
 def watch(file: Path, now: datetime, remedy: str) -> None:
-    """This process uses a certificate: say on standard error once that it ends soon, and once that it has ended."""
+    """This process uses a certificate: say on standard error once that it ends soon, and once that
+    it has ended."""
     file = file.absolute()
     _remedies[file] = remedy
     _tell(file, now)
 
 
 def look_again(now: datetime) -> None:
-    """What `watch` does, of all certificates that it was given: for a process that lives long, once a `DAY`."""
+    """What `watch` does, of all certificates that it was given: for a process that lives long, once
+    a `DAY`."""
     for file in list(_remedies):
         _tell(file, now)
 

@@ -1,8 +1,9 @@
-"""The kinds that make up nearly all traffic, written and read without the codec's table: the same bytes, a third of the time.
+"""The kinds that make up nearly all traffic, written and read without the codec's table: the same
+bytes, a third of the time.
 
-A reader gives None for fields that are not of the usual types, ranges and number: the table then says what is wrong with
-them, or takes what it may (trailing fields left out, an integer for a float). So nothing is accepted here that the table
-refuses; tests/comm/test_codec.py holds that.
+A reader gives None for fields that are not of the usual types, ranges and number: the table then
+says what is wrong with them, or takes what it may (trailing fields left out, an integer for a
+float). So nothing is accepted here that the table refuses; tests/comm/test_codec.py holds that.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from collections.abc import Callable, Mapping
 from math import inf
 from typing import Any, Final
 
-from services.comm.messages import Call, Executed, Message, Outcome
-from services.comm.plain import inspect
+from petrobot.services.comm.messages import Call, Executed, Message, Outcome
+from petrobot.services.comm.plain import inspect
 
 NAME_LENGTH: Final = 255
 """Longest name, id or code (characters)."""
@@ -61,7 +62,8 @@ def _outcome(fields: list[Any], short: bool) -> Message | None:
 
 
 READERS: Mapping[int, Reader] = {Call.KIND: _call, Outcome.KIND: _outcome}
-"""By kind: reads the array of a body; `short` says that it is shorter than the longest name. Raises NotPlainError."""
+"""By kind: reads the array of a body; `short` says that it is shorter than the longest name. Raises
+NotPlainError."""
 
 
 def _call_row(call: Any) -> tuple[Any, ...] | None:
@@ -79,12 +81,21 @@ def _call_row(call: Any) -> tuple[Any, ...] | None:
         and 0 <= seed < COUNT_END
     ):
         row = (4, id_, service, call.arguments, deadline, epoch, boot, parent, seed)
-        return (*row, True) if call.again else row  # seldom: after a broken link or a restart of the caller
+        return (
+            (*row, True) if call.again else row
+        )  # seldom: after a broken link or a restart of the caller
     return None
 
 
 def _outcome_row(end: Any) -> tuple[Any, ...] | None:
-    id_, status, cause, text, seconds, cpu = end.id, end.status, end.cause, end.text, end.seconds, end.cpu_seconds
+    id_, status, cause, text, seconds, cpu = (
+        end.id,
+        end.status,
+        end.cause,
+        end.text,
+        end.seconds,
+        end.cpu_seconds,
+    )
     if (
         type(id_) is type(cause) is type(text) is str
         and isinstance(status, str)
@@ -101,5 +112,9 @@ def _outcome_row(end: Any) -> tuple[Any, ...] | None:
     return None
 
 
-WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {Call.KIND: _call_row, Outcome.KIND: _outcome_row}
-"""By kind: the message as the array that is its body; None for one that the table has to look at."""
+WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {
+    Call.KIND: _call_row,
+    Outcome.KIND: _outcome_row,
+}
+"""By kind: the message as the array that is its body; None for one that the table has to look
+at."""

@@ -1,4 +1,5 @@
-"""Runs that go on at the called end: when each must have ended, with clocks that stand still while the run is held."""
+"""Runs that go on at the called end: when each must have ended, with clocks that stand still while
+the run is held."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm.messages import Call
+from petrobot.services.comm.messages import Call
 
 NEVER: Final = float("inf")
 DEADLINE: Final = "deadline"
@@ -16,7 +17,8 @@ ORPHAN: Final = "orphan"
 
 @dataclass(slots=True)
 class Run:
-    """A run that goes on; times in seconds on the node's clock. `stopping` once it was ordered to stop, `reason` says why."""
+    """A run that goes on; times in seconds on the node's clock. `stopping` once it was ordered to
+    stop, `reason` says why."""
 
     call: Call
     peer: str
@@ -63,7 +65,8 @@ class GoingRuns(dict[str, Run]):
                 self.limit(id_, run.limit + pause)
 
     def over(self, now: float) -> Iterator[tuple[float, str, str, Run]]:
-        """What is due: time, DEADLINE or ORPHAN, id and run. A deadline that stands still or has moved is not."""
+        """What is due: time, DEADLINE or ORPHAN, id and run. A deadline that stands still or has
+        moved is not."""
         while self._timers and self._timers[0][0] <= now:
             due, kind, id_ = heapq.heappop(self._timers)
             run = self.get(id_)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """One exposure: `pixels` (height, width) uint8 grey levels, mid-exposure `time` on the receiver's clock (s).
+    """One exposure: `pixels` (height, width) uint8 grey levels, mid-exposure `time` on the
+    receiver's clock (s).
 
     `sequence` counts from 0.
     """

@@ -1,7 +1,8 @@
-"""JSON for whoever reads it: browsers, scripts, other programs. Every text that leaves petrobot as JSON is written here.
+"""JSON for whoever reads it: browsers, scripts, other programs. Every text that leaves petrobot as
+JSON is written here.
 
-RFC 8259 has no infinity and no NaN. Python writes them anyway, and then no browser can read anything of that text. So a
-number that is not finite leaves as null: "no value".
+RFC 8259 has no infinity and no NaN. Python writes them anyway, and then no browser can read
+anything of that text. So a number that is not finite leaves as null: "no value".
 """
 
 from __future__ import annotations
@@ -13,15 +14,19 @@ from numbers import Real
 from typing import Any
 
 DEEPEST = 64
-"""Levels of nesting that are written; what lies deeper becomes an ellipsis, so that a value that holds itself has an end."""
+"""Levels of nesting that are written; what lies deeper becomes an ellipsis, so that a value that
+holds itself has an end."""
 WIDEST_BITS = 1023
-"""Whole numbers of more bits are infinite for a reader that keeps numbers as doubles, as browsers do."""
+"""Whole numbers of more bits are infinite for a reader that keeps numbers as doubles, as browsers
+do."""
 
 
 def json_text(value: Any, **layout: Any) -> str:
-    """A value as JSON text, with the options of `json.dumps` for its layout. Never raises because of a value.
+    """A value as JSON text, with the options of `json.dumps` for its layout. Never raises because
+    of a value.
 
-    Numbers that are not finite become null; what JSON does not know (a set, an object) becomes text.
+    Numbers that are not finite become null; what JSON does not know (a set, an object) becomes
+    text.
     """
     try:
         return json.dumps(value, allow_nan=False, default=_foreign, **layout)
@@ -30,7 +35,8 @@ def json_text(value: Any, **layout: Any) -> str:
 
 
 def finite(value: Any, depth: int = DEEPEST) -> Any:
-    """A copy of the value that holds nothing but what JSON knows, with null for every number that is not finite."""
+    """A copy of the value that holds nothing but what JSON knows, with null for every number that
+    is not finite."""
     if value is None or isinstance(value, str | bool):
         return value
     if isinstance(value, int):
@@ -43,7 +49,13 @@ def finite(value: Any, depth: int = DEEPEST) -> Any:
 
 
 def _key(key: Any) -> str:
-    return key if isinstance(key, str) else json.dumps(key) if key is None or isinstance(key, bool) else str(key)
+    return (
+        key
+        if isinstance(key, str)
+        else json.dumps(key)
+        if key is None or isinstance(key, bool)
+        else str(key)
+    )
 
 
 def _foreign(value: Any) -> Any:

@@ -1,11 +1,14 @@
-"""The emergency stop's latch on disk: a node that is started again must not let devices move that somebody has stopped.
+"""The emergency stop's latch on disk: a node that is started again must not let devices move that
+somebody has stopped.
 
-One small file a node, on the node's own host, with the names of the devices that obey nobody (`*`: all of them). The node
-keeps it, and looks for it before each run on a device, and a few times a second; `petrobot estop` writes it for a node of its own
-host that does not answer. A file that cannot be read or understood counts as `*`: whoever is unsure leaves the devices stopped.
+One small file a node, on the node's own host, with the names of the devices that obey nobody (`*`:
+all of them). The node keeps it, and looks for it before each run on a device, and a few times a
+second; `petrobot estop` writes it for a node of its own host that does not answer. A file that
+cannot be read or understood counts as `*`: whoever is unsure leaves the devices stopped.
 
-The file stands in `$PETROBOT_STATE`, else in `.petrobot` beside services.toml, else, where that cannot be written, in a folder
-of the user's own (`$XDG_STATE_HOME` or `~/.local/state`). What lies in any of them counts; clearing clears them all.
+The file stands in `$PETROBOT_STATE`, else in `.petrobot` beside services.toml, else, where that
+cannot be written, in a folder of the user's own (`$XDG_STATE_HOME` or `~/.local/state`). What lies
+in any of them counts; clearing clears them all.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.services.comm.whole_file import make_folder, write_whole
 
 ALL: Final = "*"
 STATE: Final = "PETROBOT_STATE"
@@ -34,11 +37,13 @@ class Latch:
         self.paths = tuple(folder / f"{node}.stopped" for folder in folders)
 
     def stopped(self) -> frozenset[str]:
-        """Names of devices that obey nobody; `ALL` among them: all. Costs a look at each file's name while there is none."""
+        """Names of devices that obey nobody; `ALL` among them: all. Costs a look at each file's
+        name while there is none."""
         return frozenset().union(*(_read(path) for path in self.paths))
 
     def stop(self, devices: Iterable[str]) -> Path:
-        """Keep that these devices are stopped, too; gives where, once it is safe on disk. Raises LatchError."""
+        """Keep that these devices are stopped, too; gives where, once it is safe on disk. Raises
+        LatchError."""
         names = sorted(self.stopped() | set(devices))
         faults = []
         for path in self.paths:
@@ -51,7 +56,8 @@ class Latch:
         raise LatchError("; ".join(faults))
 
     def clear(self, devices: Iterable[str], all_devices: Iterable[str]) -> None:
-        """These devices obey again; `all_devices` is what `ALL` stands for. Raises LatchError, and then nothing is cleared."""
+        """These devices obey again; `all_devices` is what `ALL` stands for. Raises LatchError, and
+        then nothing is cleared."""
         stopped = self.stopped()
         left = (set(all_devices) if ALL in stopped else set(stopped)) - set(devices)
         if left:
@@ -63,7 +69,9 @@ class Latch:
                 else:
                     path.unlink(missing_ok=True)
             except OSError as fault:
-                raise LatchError(f"{path}: {fault.strerror}; remove it by hand once the cell is safe") from fault
+                raise LatchError(
+                    f"{path}: {fault.strerror}; remove it by hand once the cell is safe"
+                ) from fault
 
     @property
     def kept(self) -> bool:

@@ -1,4 +1,5 @@
-"""One asyncio connection: bytes to a `Connection` and back, heartbeat, limits. Server and client build on it."""
+"""One asyncio connection: bytes to a `Connection` and back, heartbeat, limits. Server and client
+build on it."""
 
 from __future__ import annotations
 
@@ -13,15 +14,17 @@ from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any
 
-from services.comm.messages import Bye, Event, Feedback, Message, Ping, Pong, Refuse
-from services.comm.security import NONCE_BYTES, Keys
-from services.comm.wire import Connection, ProtocolError, Side, State
+from petrobot.services.comm.messages import Bye, Event, Feedback, Message, Ping, Pong, Refuse
+from petrobot.services.comm.security import NONCE_BYTES, Keys
+from petrobot.services.comm.wire import Connection, ProtocolError, Side, State
 
 READ_BUFFER = 1 << 16
-"""Bytes read at once. What is in them is taken apart before another link is read: so many empty maps take some 25 ms."""
+"""Bytes read at once. What is in them is taken apart before another link is read: so many empty
+maps take some 25 ms."""
 HEARD = 4096
-"""Bytes of a frame that is not complete that count as a sign of life. Fewer do not: a frame that drips in, or whose length was
-changed on its way, must not hold up all that follows it for longer than silence would."""
+"""Bytes of a frame that is not complete that count as a sign of life. Fewer do not: a frame that
+drips in, or whose length was changed on its way, must not hold up all that follows it for longer
+than silence would."""
 _HEARTBEATS = frozenset((Ping, Pong))
 _OWN = frozenset((Ping, Pong, Bye, Refuse))
 """Kinds that a link deals with itself."""
@@ -55,13 +58,16 @@ class Limits:
     handshakes_at_once: int = 100
     """and at once; above it the address is cut off before it says a word."""
     spare_loopback: bool = True
-    """Whether addresses of this host may fail as often as they like: one process must not lock out all others here."""
+    """Whether addresses of this host may fail as often as they like: one process must not lock out
+    all others here."""
     messages: float = 200_000.0
-    """Messages that a caller may send a second, on average: above it no more is read from it for a while,"""
+    """Messages that a caller may send a second, on average: above it no more is read from it for a
+    while,"""
     messages_at_once: int = 20_000
     """and at once."""
     buffer_high: int = 1 << 20
-    """Bytes waiting to be sent above which a link is slow: progress and pulses are dropped, no more is read from it,"""
+    """Bytes waiting to be sent above which a link is slow: progress and pulses are dropped, no more
+    is read from it,"""
     buffer_hard: int = 64 << 20
     """and above which it is cut."""
 
@@ -89,7 +95,8 @@ class Heart:
         """What to do at `now`; call it when `due`."""
         late = now - self._due
         if late > self._timing.silence / 2:
-            # This process itself stood still: what the other side said meanwhile may still lie in the socket.
+            # This process itself stood still: what the other side said meanwhile may still lie in
+            # the socket.
             self.heard = max(self.heard, now - self._timing.silence + self._timing.heartbeat)
         silent = now - self.heard
         if silent >= self._timing.silence:
@@ -105,12 +112,19 @@ class Heart:
 class Link(asyncio.BufferedProtocol):
     """Base of both ends. Subclasses take messages in `took`, the end of the link in `over`.
 
-    `buffer` is what bytes are read into, shared by all links of an owner: they are taken out before anything else is read.
-    Reading into one buffer spares a fresh one of 256 KiB for each read, which costs more than all else here.
+    `buffer` is what bytes are read into, shared by all links of an owner: they are taken out before
+    anything else is read. Reading into one buffer spares a fresh one of 256 KiB for each read,
+    which costs more than all else here.
     """
 
     def __init__(
-        self, side: Side, server: str, key: Keys | None, timing: Timing, limits: Limits, buffer: bytearray
+        self,
+        side: Side,
+        server: str,
+        key: Keys | None,
+        timing: Timing,
+        limits: Limits,
+        buffer: bytearray,
     ) -> None:
         nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
         self.connection = Connection(side, server, key=key, nonce=nonce)
@@ -124,7 +138,8 @@ class Link(asyncio.BufferedProtocol):
         self.silent = False
         """Whether it is over because the other side was silent."""
         self.frames: list[bytes] = []
-        """Made by the connection and not yet written: they have their places in the order, so they go before all else."""
+        """Made by the connection and not yet written: they have their places in the order, so they
+        go before all else."""
         self._view = memoryview(buffer)
         self._transport: asyncio.Transport | None = None
         self._heart = Heart(0.0, timing)
@@ -167,7 +182,9 @@ class Link(asyncio.BufferedProtocol):
         self.made()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return self._view  # not the bytearray: under TLS asyncio slices it, and would read into a copy
+        return (
+            self._view
+        )  # not the bytearray: under TLS asyncio slices it, and would read into a copy
 
     def buffer_updated(self, nbytes: int) -> None:
         data = bytes(self._view[:nbytes])
@@ -184,7 +201,11 @@ class Link(asyncio.BufferedProtocol):
         if len(messages) == 1 and type(messages[0]) not in _OWN and not self._opening:
             self.took(now, messages)
             return
-        if self._opening and self._transport is not None and (out := self.connection.data_to_send()):
+        if (
+            self._opening
+            and self._transport is not None
+            and (out := self.connection.data_to_send())
+        ):
             self._transport.write(out)
         self._sort(now, messages)
 
@@ -218,7 +239,9 @@ class Link(asyncio.BufferedProtocol):
 
     def connection_lost(self, fault: Exception | None) -> None:
         if not self.reason:
-            self.reason = f"the connection broke: {fault}" if fault is not None else "the other side hung up"
+            self.reason = (
+                f"the connection broke: {fault}" if fault is not None else "the other side hung up"
+            )
         if self._timer is not None:
             self._timer.cancel()
         self._transport = None
@@ -236,7 +259,8 @@ class Link(asyncio.BufferedProtocol):
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
 
     def send(self, messages: Sequence[Message]) -> None:
-        """Send messages in one write. One that no frame can carry is answered for by `unsendable`."""
+        """Send messages in one write. One that no frame can carry is answered for by
+        `unsendable`."""
         if self.frames:
             self.write()
         transport = self._transport
@@ -274,13 +298,17 @@ class Link(asyncio.BufferedProtocol):
         return b"".join([self._bytes(message) for message in messages])
 
     def _bytes(self, message: Message) -> bytes:
-        if self.slow and (type(message) is Feedback or (type(message) is Event and not message.number)):
+        if self.slow and (
+            type(message) is Feedback or (type(message) is Event and not message.number)
+        ):
             return b""
         try:
             return self.connection.send(message)
         except ProtocolError as fault:
             if self.connection.state is not State.OPEN:
-                return b""  # its last word came with what is being answered: nobody listens any more
+                return (
+                    b""  # its last word came with what is being answered: nobody listens any more
+                )
             instead = self.unsendable(message, fault)
             return b"" if instead is None else self.connection.send(instead)
 
@@ -304,19 +332,23 @@ class Link(asyncio.BufferedProtocol):
             self._transport.abort()
 
     def certificate(self) -> dict[str, Any] | None:
-        """The other end's certificate, as `ssl.SSLSocket.getpeercert` gives it; None without TLS."""
+        """The other end's certificate, as `ssl.SSLSocket.getpeercert` gives it; None without
+        TLS."""
         return None if self._transport is None else self._transport.get_extra_info("peercert")
 
     def ends(self) -> tuple[str, str]:
         """Addresses of the other and of this end; empty where there are none."""
         if self._transport is None:
             return "", ""
-        return _host(self._transport.get_extra_info("peername")), _host(self._transport.get_extra_info("sockname"))
+        return _host(self._transport.get_extra_info("peername")), _host(
+            self._transport.get_extra_info("sockname")
+        )
 
     def _refuse(self, now: float, fault: ProtocolError) -> None:
         opening = self.connection.version == 0
         self._sort(now, list(fault.before))
-        # The connection is closed for its part already; a sealed one could only be answered with a seal.
+        # The connection is closed for its part already; a sealed one could only be answered with a
+        # seal.
         self.reason = self.reason or str(fault)
         if self._transport is not None and not self._transport.is_closing():
             refusal = self.connection.refusal(Refuse(fault.code, fault.text[:500]))
@@ -349,7 +381,8 @@ def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
 
 
 def futures_of(loop: asyncio.AbstractEventLoop) -> Callable[[], asyncio.Future[Any]]:
-    """What makes the futures of a loop: for asyncio's own the class that its `create_future` calls."""
+    """What makes the futures of a loop: for asyncio's own the class that its `create_future`
+    calls."""
     usual = getattr(type(loop), "create_future", None) is asyncio.BaseEventLoop.create_future
     return functools.partial(asyncio.Future, loop=loop) if usual else loop.create_future
 

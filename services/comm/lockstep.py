@@ -1,16 +1,18 @@
 """Lock step across processes: a full mesh of TCP connections, one Tick message a peer and tick.
 
-A member runs the parties that live in its process. Its Tick of number k carries all that it sent a peer at k and says that
-nothing of k follows; a member runs tick k + 1 as soon as it has the Tick k of every peer. So sends overlap with the others'
-work, and nobody waits for an answer. A peer that is silent for `patience` seconds of wall time is lost.
+A member runs the parties that live in its process. Its Tick of number k carries all that it sent a
+peer at k and says that nothing of k follows; a member runs tick k + 1 as soon as it has the Tick k
+of every peer. So sends overlap with the others' work, and nobody waits for an answer. A peer that
+is silent for `patience` seconds of wall time is lost.
 
-The cell ends when one member says Bye instead of its Tick k: everybody has then run the ticks up to k, no more, as in one
-process.
+The cell ends when one member says Bye instead of its Tick k: everybody has then run the ticks up to
+k, no more, as in one process.
 
-A member in `returning` may be lost and come back as another process (a coordinator that is resumed): the others wait for it
-where they stand. They may differ by a tick, since it can have been killed between two of its Ticks. Each tells the new process
-the last Tick that it has sent; that one gives the missing marks, empty, and goes on behind the newest. What was on its way to the
-dead process is lost, as with any broken connection: the node protocol says it again.
+A member in `returning` may be lost and come back as another process (a coordinator that is
+resumed): the others wait for it where they stand. They may differ by a tick, since it can have been
+killed between two of its Ticks. Each tells the new process the last Tick that it has sent; that one
+gives the missing marks, empty, and goes on behind the newest. What was on its way to the dead
+process is lost, as with any broken connection: the node protocol says it again.
 """
 
 from __future__ import annotations
@@ -23,14 +25,20 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
-from services.comm.cell import Cell, CellError, Delays, Half
-from services.comm.directory import COORDINATOR
-from services.comm.listening import cannot_listen
-from services.comm.messages import Bye, Hello, Message, Refuse, Tick, Welcome
-from services.comm.party import Party, Posted
-from services.comm.security import NONCE_BYTES, UNPROVEN, Keys, require_key
-from services.comm.tick_link import PartyLostError, TickLink, family, handshake, tune
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, Connection, ProtocolError, Side
+from petrobot.services.comm.cell import Cell, CellError, Delays, Half
+from petrobot.services.comm.directory import COORDINATOR
+from petrobot.services.comm.listening import cannot_listen
+from petrobot.services.comm.messages import Bye, Hello, Message, Refuse, Tick, Welcome
+from petrobot.services.comm.party import Party, Posted
+from petrobot.services.comm.security import NONCE_BYTES, UNPROVEN, Keys, require_key
+from petrobot.services.comm.tick_link import PartyLostError, TickLink, family, handshake, tune
+from petrobot.services.comm.wire import (
+    NEWEST_VERSION,
+    OLDEST_VERSION,
+    Connection,
+    ProtocolError,
+    Side,
+)
 
 __all__ = ["Cell", "CellError", "Delays", "Member", "PartyLostError", "TickLink"]
 
@@ -42,12 +50,14 @@ _LINGER: Final = 1.0
 
 
 class Member:
-    """One process of a lock-step cell. `addresses` (host, port) name all members, this one too; `name` is among them.
+    """One process of a lock-step cell. `addresses` (host, port) name all members, this one too;
+    `name` is among them.
 
-    `hosts` says which member each party of the cell lives in; without it each member is one party of its own name.
-    `directory` (hash of services.toml) must be the same in all. `patience` is how long a mark may be
-    missing, `joining` how long members may take to come together (s of wall time; importing takes some on a busy host).
-    Members in `returning` may be away for `absence` (s of wall time); one that comes back itself `rejoins`.
+    `hosts` says which member each party of the cell lives in; without it each member is one party
+    of its own name. `directory` (hash of services.toml) must be the same in all. `patience` is how
+    long a mark may be missing, `joining` how long members may take to come together (s of wall
+    time; importing takes some on a busy host). Members in `returning` may be away for `absence` (s
+    of wall time); one that comes back itself `rejoins`.
     """
 
     def __init__(
@@ -89,7 +99,8 @@ class Member:
     def open(self) -> None:
         """Listen, reach the members sorted before this one, wait for those sorted after it.
 
-        Raises PartyLostError for one that does not come within `joining`, CellError for one that does not fit.
+        Raises PartyLostError for one that does not come within `joining`, CellError for one that
+        does not fit.
         """
         before = sorted(peer for peer in self._addresses if peer < self.name)
         after = {peer for peer in self._addresses if peer > self.name}
@@ -118,7 +129,9 @@ class Member:
         host, port = self._addresses[self.name]
         require_key(self.name, host, self._key)
         try:
-            return socket.create_server((host, port), family=family(host), backlog=len(self._addresses))
+            return socket.create_server(
+                (host, port), family=family(host), backlog=len(self._addresses)
+            )
         except OSError as fault:
             key = COORDINATOR if self.name == COORDINATOR else f"nodes.{self.name}"
             raise CellError(cannot_listen(key, host, port, fault)) from None
@@ -128,7 +141,8 @@ class Member:
         return Connection(side, server, key=self._key, nonce=nonce)
 
     def _find_place(self, deadline: float) -> None:
-        """Join a cell that goes on: hear where everybody is, give the missing marks, go on behind the newest."""
+        """Join a cell that goes on: hear where everybody is, give the missing marks, go on behind
+        the newest."""
         while missing := [link for link in self._links.values() if link.newest is None]:
             self._wait(missing, deadline)
         last = {link.peer: link.newest for link in self._links.values() if link.newest is not None}
@@ -138,7 +152,8 @@ class Member:
                 link.send(Tick(number))
 
     def _readmit(self, peer: str) -> None:
-        """A member that may return is gone: wait for it, and tell it the last tick that was sent from here."""
+        """A member that may return is gone: wait for it, and tell it the last tick that was sent
+        from here."""
         lost = self._links.pop(peer)
         lost.sock.close()
         deadline = time.monotonic() + self._absence
@@ -162,15 +177,21 @@ class Member:
         host, port = self._addresses[peer]
         while True:
             try:
-                sock = socket.create_connection((host, port), timeout=max(deadline - time.monotonic(), _RETRY))
+                sock = socket.create_connection(
+                    (host, port), timeout=max(deadline - time.monotonic(), _RETRY)
+                )
                 break
             except OSError as fault:
                 if time.monotonic() + _RETRY >= deadline:
-                    raise PartyLostError(peer, f"nobody answers on {host}:{port}: {fault}") from None
+                    raise PartyLostError(
+                        peer, f"nobody answers on {host}:{port}: {fault}"
+                    ) from None
                 time.sleep(_RETRY)
         tune(sock)
         connection = self._connection(Side.CLIENT, peer)
-        hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "party", self.name, self._boot, 0, self._directory)
+        hello = Hello(
+            OLDEST_VERSION, NEWEST_VERSION, "party", self.name, self._boot, 0, self._directory
+        )
         try:
             early = handshake(sock, connection, hello, deadline)
         except (OSError, ProtocolError) as fault:
@@ -186,14 +207,20 @@ class Member:
         raise CellError(f"{peer}: {text}")
 
     def _admit(
-        self, listener: socket.socket, after: set[str], deadline: float, before: TickLink | None = None
+        self,
+        listener: socket.socket,
+        after: set[str],
+        deadline: float,
+        before: TickLink | None = None,
     ) -> TickLink | None:
         """The next member that connects; None if it was a stranger."""
         listener.settimeout(max(deadline - time.monotonic(), 0.001))
         try:
             sock, _ = listener.accept()
         except TimeoutError:
-            raise PartyLostError(min(after), f"it did not join the cell in {self._joining:g} s") from None
+            raise PartyLostError(
+                min(after), f"it did not join the cell in {self._joining:g} s"
+            ) from None
         tune(sock)
         connection = self._connection(Side.SERVER, self.name)
         try:
@@ -214,18 +241,26 @@ class Member:
 
     def _refusal(self, hello: Message, after: set[str]) -> Refuse | None:
         if not isinstance(hello, Hello) or hello.role != "party" or hello.name not in after:
-            return Refuse("not_a_party", f"{self.name} waits for the lock-step parties {', '.join(sorted(after))}")
+            return Refuse(
+                "not_a_party",
+                f"{self.name} waits for the lock-step parties {', '.join(sorted(after))}",
+            )
         if hello.directory != self._directory:
-            return Refuse("directory", f"{hello.name} and {self.name} have different services.toml: copy one to both")
+            return Refuse(
+                "directory",
+                f"{hello.name} and {self.name} have different services.toml: copy one to both",
+            )
         return None
 
     # Going on together.
 
     def run(self, until: Callable[[], bool] | None = None, max_ticks: int | None = None) -> str:
-        """Run ticks until `until()` holds after one, `max_ticks` are over, or another member ends the cell.
+        """Run ticks until `until()` holds after one, `max_ticks` are over, or another member ends
+        the cell.
 
-        Gives why it ended: "until", "max_ticks", or "NAME: text" of the member that ended it. Raises PartyLostError for a
-        member that is gone or silent, and whatever a party of this process raises; the others are told either way.
+        Gives why it ended: "until", "max_ticks", or "NAME: text" of the member that ended it.
+        Raises PartyLostError for a member that is gone or silent, and whatever a party of this
+        process raises; the others are told either way.
         """
         try:
             why = self._run(until, max_ticks)
@@ -261,7 +296,8 @@ class Member:
                     raise  # else it is missed, and waited for, when its own Tick is due
 
     def _gather(self, number: int) -> str | None:
-        """Wait for every peer's Tick of this number and deliver it; gives why the cell has ended, if it has."""
+        """Wait for every peer's Tick of this number and deliver it; gives why the cell has ended,
+        if it has."""
         deadline = time.monotonic() + (self._absence if self._returning else self._patience)
         links = self._links.values()
         while True:
@@ -289,7 +325,9 @@ class Member:
         ready = poll.poll(max(deadline - time.monotonic(), 0.0) * 1000.0)
         if not ready:
             patience = self._absence if self._returning else self._patience
-            raise PartyLostError(missing[0].peer, f"no end of tick {self.tick - 1} for {patience:g} s: lost")
+            raise PartyLostError(
+                missing[0].peer, f"no end of tick {self.tick - 1} for {patience:g} s: lost"
+            )
         for number, what in ready:
             link = by_number[number]
             try:
@@ -306,14 +344,18 @@ class Member:
         for posted in tick.envelopes:
             envelope = posted.envelope
             if posted.due <= tick.number or self._hosts.get(envelope.party) != self.name:
-                raise PartyLostError(peer, f"an envelope of {envelope.source} to {envelope.party} does not belong here")
+                raise PartyLostError(
+                    peer,
+                    f"an envelope of {envelope.source} to {envelope.party} does not belong here",
+                )
             self._half.own(envelope.source, peer)
             self._half.deliver(tick.number, posted)
 
     # Going apart.
 
     def _leave(self, text: str) -> None:
-        """Say Bye to all, and wait until they have read it: closing at once could take it from them."""
+        """Say Bye to all, and wait until they have read it: closing at once could take it from
+        them."""
         for link in self._links.values():
             with contextlib.suppress(PartyLostError, ProtocolError):
                 link.send(Bye(text))

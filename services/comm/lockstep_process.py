@@ -1,4 +1,5 @@
-"""A process of its own for one party of a lock-step cell: what `python -m services` and `python -m sim` share."""
+"""A process of its own for one party of a lock-step cell: what `python -m petrobot.services` and
+`python -m petrobot.sim` share."""
 
 from __future__ import annotations
 
@@ -7,18 +8,19 @@ import signal
 import sys
 from typing import Protocol
 
-from services.comm.credentials import shared_keys
-from services.comm.directory import COORDINATOR, Directory
-from services.comm.lockstep import Delays, Member
-from services.comm.party import Party
-from services.comm.security import KeyNeededError, Keys, is_loopback
+from petrobot.services.comm.credentials import shared_keys
+from petrobot.services.comm.directory import COORDINATOR, Directory
+from petrobot.services.comm.lockstep import Delays, Member
+from petrobot.services.comm.party import Party
+from petrobot.services.comm.security import KeyNeededError, Keys, is_loopback
 
 
 def cell_key(directory: Directory) -> Keys | None:
     """What seals the ticks of a lock-step cell: the shared key, if there is one.
 
-    Ticks cross no TLS (docs/decisions/lock-step-doors.md): with certificates all members must be on loopback. Raises
-    KeyNeededError where they are not, KeyFileError for a key file that cannot be used.
+    Ticks cross no TLS (docs/decisions/lock-step-doors.md): with certificates all members must be on
+    loopback. Raises KeyNeededError where they are not, KeyFileError for a key file that cannot be
+    used.
     """
     if "file" in directory.keys:
         return shared_keys(directory)
@@ -26,8 +28,10 @@ def cell_key(directory: Directory) -> Keys | None:
         for name, (host, _) in directory.members().items():
             if not is_loopback(host):
                 raise KeyNeededError(
-                    f"{directory.source}: lock step crosses no TLS, and {name} is at {host}: for lock step over several hosts "
-                    'write file = "cell.key" in place of certificates under [keys] (`petrobot keys` makes it), or use one host'
+                    f"{directory.source}: lock step crosses no TLS, and {name} is at {host}: "
+                    "for lock step over several hosts "
+                    'write file = "cell.key" in place of certificates under [keys] '
+                    "(`petrobot keys` makes it), or use one host"
                 )
     return None
 
@@ -40,10 +44,12 @@ class Closable(Party, Protocol):
 
 
 def run_member(directory: Directory, name: str, party: Closable, awaited: float) -> None:
-    """Be the member `name` of a lock-step cell of one process a node, until one of them ends it or SIGTERM comes.
+    """Be the member `name` of a lock-step cell of one process a node, until one of them ends it or
+    SIGTERM comes.
 
-    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not waited for.
-    Raises CellError when another member is lost, KeyFileError for a key file that cannot be used.
+    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not
+    waited for. Raises CellError when another member is lost, KeyFileError for a key file that
+    cannot be used.
     """
     key = cell_key(directory)
     member = Member(

@@ -1,10 +1,10 @@
 """The messages of the node protocol: what two processes say to each other, as plain typed records.
 
-Each class has a `KIND`, its number on the wire; `wire.py` turns messages into bytes and back. Only durations cross the
-wire, never a clock reading. The exchange is described in docs/protocol.md.
+Each class has a `KIND`, its number on the wire; `wire.py` turns messages into bytes and back. Only
+durations cross the wire, never a clock reading. The exchange is described in docs/protocol.md.
 
-Nobody changes a message once it is made. Call and Outcome are not frozen all the same: that would make each of them eight
-times as long to make (0.9 us instead of 0.1), and every call makes four.
+Nobody changes a message once it is made. Call and Outcome are not frozen all the same: that would
+make each of them eight times as long to make (0.9 us instead of 0.1), and every call makes four.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class Refuse:
 
 @dataclass(slots=True)
 class Call:
-    """Run an action or ask a service. `id` is unique for ever; a known id is answered from what is known, never run twice."""
+    """Run an action or ask a service. `id` is unique for ever; a known id is answered from what is
+    known, never run twice."""
 
     KIND: ClassVar[int] = 4
     id: str
@@ -81,13 +82,15 @@ class Call:
     """Seconds that the run may take; enforced by the node."""
     epoch: int = 0
     boot: str = ""
-    """Boot that the caller believes to talk to; empty: any. Another boot answers `executed = unknown`."""
+    """Boot that the caller believes to talk to; empty: any. Another boot answers `executed =
+    unknown`."""
     parent: str = ""
     """Id of the call on whose behalf this one is made; cancelled with it."""
     seed: int = 0
     """Seed of the mission run: an action's random draws are keyed by it."""
     again: bool = False
-    """It may have been sent before: a node that cannot rule out that it ran and was forgotten does not run it.
+    """It may have been sent before: a node that cannot rule out that it ran and was forgotten does
+    not run it.
 
     Left out on the wire when false."""
 
@@ -125,7 +128,8 @@ class Outcome:
     """How long the run took on the node's clock."""
     cpu_seconds: float = 0.0
     deferred: bool = False
-    """The status is provisional: a later verdict may correct it for the estimates. Left out on the wire when false."""
+    """The status is provisional: a later verdict may correct it for the estimates. Left out on the
+    wire when false."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +153,8 @@ class Cancel:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of the outside world, of a run that goes on (`run` is its call id), or a changed variable."""
+    """An event of the outside world, of a run that goes on (`run` is its call id), or a changed
+    variable."""
 
     KIND: ClassVar[int] = 10
     name: str
@@ -179,7 +184,8 @@ class Subscribe:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A node-level order that is no action: `hold`, `release`, `stop` (stop routine of all devices), `status`."""
+    """A node-level order that is no action: `hold`, `release`, `stop` (stop routine of all
+    devices), `status`."""
 
     KIND: ClassVar[int] = 13
     id: str
@@ -217,7 +223,8 @@ class Pong:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Lock step: all that the sender sends at this tick to the receiver, and its end-of-tick mark in one."""
+    """Lock step: all that the sender sends at this tick to the receiver, and its end-of-tick mark
+    in one."""
 
     KIND: ClassVar[int] = 17
     number: int
@@ -250,13 +257,15 @@ class Proof:
 
 @dataclass(frozen=True, slots=True)
 class StreamOpen:
-    """First message on a stream's own connection: set points of this stream follow, one each `period` seconds."""
+    """First message on a stream's own connection: set points of this stream follow, one each
+    `period` seconds."""
 
     KIND: ClassVar[int] = 21
     stream: str
     period: float
     ticket: str = ""
-    """What the receiving node gave out for this stream; a receiver that asks for none ignores it."""
+    """What the receiving node gave out for this stream; a receiver that asks for none ignores
+    it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +279,8 @@ class SetPoint:
     held: float = 0.0
     """Seconds that the sender has stood by these values already: 0 when they are new."""
     elapsed: float = 0.0
-    """Seconds since the stream was opened, on the sender's clock: tells the receiver what was late on its way."""
+    """Seconds since the stream was opened, on the sender's clock: tells the receiver what was late
+    on its way."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from services.comm.messages import Answer, Event, Outcome
+from petrobot.services.comm.messages import Answer, Event, Outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,8 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class Late:
-    """The peer's own result of a call that had ended here before (lost, given up): to be recorded; it moves nothing."""
+    """The peer's own result of a call that had ended here before (lost, given up): to be recorded;
+    it moves nothing."""
 
     outcome: Outcome
 
@@ -62,7 +63,8 @@ class PeerLost:
 
 @dataclass(frozen=True, slots=True)
 class PeerBack:
-    """The link is up. `runs` are ids that the peer still runs or whose results it keeps for this caller's name."""
+    """The link is up. `runs` are ids that the peer still runs or whose results it keeps for this
+    caller's name."""
 
     name: str
     boot: str

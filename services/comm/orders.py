@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from services.comm.messages import Call, Command, Outcome
+from petrobot.services.comm.messages import Call, Command, Outcome
 
 Inline = Callable[[float, Call], Outcome]
-"""A service answered on the spot, in the node's loop: (now, call) to outcome. It must neither wait nor compute for long."""
+"""A service answered on the spot, in the node's loop: (now, call) to outcome. It must neither wait
+nor compute for long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +38,8 @@ class StartRun:
 
 @dataclass(frozen=True, slots=True)
 class CancelRun:
-    """Order: stop this run (stop routine first); `finish` still reports its end. Given once a run."""
+    """Order: stop this run (stop routine first); `finish` still reports its end. Given once a
+    run."""
 
     id: str
     reason: str

@@ -1,10 +1,13 @@
-"""A child ends with its parent: the kernel sees to it (prctl(2), PR_SET_PDEATHSIG), so that nothing here has to run for it.
+"""A child ends with its parent: the kernel sees to it (prctl(2), PR_SET_PDEATHSIG), so that nothing
+here has to run for it.
 
-What has no device is killed at once. What owns a device gets the time of its stop routine, which begins when the pipe to the parent
-ends; but a driver or an action that hangs never looks at a pipe, and one that hangs in C holds the interpreter, so that no handler
-and no thread of Python runs either. For such a process the kernel's signal is handled by the C library's own `alarm(2)`: a handler
-is called with the number of its signal, `alarm` with seconds. SIGQUIT is 3, so 3 s after the parent's end SIGALRM ends the
-process, whatever it is doing. SIGUSR1 is 10, the time of a node that ends its own children first.
+What has no device is killed at once. What owns a device gets the time of its stop routine, which
+begins when the pipe to the parent ends; but a driver or an action that hangs never looks at a pipe,
+and one that hangs in C holds the interpreter, so that no handler and no thread of Python runs
+either. For such a process the kernel's signal is handled by the C library's own `alarm(2)`: a
+handler is called with the number of its signal, `alarm` with seconds. SIGQUIT is 3, so 3 s after
+the parent's end SIGALRM ends the process, whatever it is doing. SIGUSR1 is 10, the time of a node
+that ends its own children first.
 """
 
 from __future__ import annotations
@@ -17,7 +20,8 @@ from pathlib import Path
 
 PR_SET_PDEATHSIG, PR_GET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 2, 36
 STOP_ROUTINE = signal.SIGQUIT
-"""Its number is how many seconds a process with a device may go on without its node: the stop limit of 2 s, and a margin."""
+"""Its number is how many seconds a process with a device may go on without its node: the stop limit
+of 2 s, and a margin."""
 GOOD_ORDER = signal.SIGUSR1
 """Its number is how many seconds a node may take to end in good order once its launcher is gone."""
 
@@ -28,13 +32,15 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def die_with(parent: int) -> None:
-    """Be killed at the very moment the parent ends, also while stopped, or in the middle of an action that hangs."""
+    """Be killed at the very moment the parent ends, also while stopped, or in the middle of an
+    action that hangs."""
     _ask(signal.SIGKILL)
     _still_there(parent)
 
 
 def outlive(parent: int, by: signal.Signals) -> None:
-    """Be ended so many seconds after the parent as `by` (STOP_ROUTINE or GOOD_ORDER) has for its number, and not later."""
+    """Be ended so many seconds after the parent as `by` (STOP_ROUTINE or GOOD_ORDER) has for its
+    number, and not later."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     _LIBC.signal.restype = ctypes.c_void_p
     _LIBC.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
@@ -56,11 +62,14 @@ def adopt_orphans() -> None:
 
 
 async def until_ended(process: int) -> None:
-    """Wait until a child of this process has ended. It need not have been waited for (it is left for that).
+    """Wait until a child of this process has ended. It need not have been waited for (it is left
+    for that).
 
-    The end of a pipe to a process is no sign of its end: a process that it has left running may hold the other end.
+    The end of a pipe to a process is no sign of its end: a process that it has left running may
+    hold the other end.
     """
-    import asyncio  # here, not above: a worker's keeper needs nothing of it, and there is one beside each worker
+    # here, not above: a worker's keeper needs nothing of it, and there is one beside each worker
+    import asyncio
 
     loop = asyncio.get_running_loop()
     try:
@@ -89,7 +98,8 @@ def _runs(process: int) -> bool:
 
 
 def wanted_with_parent() -> bool:
-    """Whether whoever launched this process wants it to end with itself (PR_SET_PDEATHSIG outlives exec)."""
+    """Whether whoever launched this process wants it to end with itself (PR_SET_PDEATHSIG outlives
+    exec)."""
     number = ctypes.c_int()
     _LIBC.prctl(PR_GET_PDEATHSIG, ctypes.byref(number))
     return number.value != 0

@@ -1,9 +1,11 @@
-"""A party of a lock-step cell: the coordinator, a node or the laboratory, as a machine without clock or sockets of its own.
+"""A party of a lock-step cell: the coordinator, a node or the laboratory, as a machine without
+clock or sockets of its own.
 
-Lock step goes in ticks of `TICK` seconds. At tick k each party first gets the envelopes due at k, ordered by
-(time, source, sequence), then `advance`s to the time k * TICK, and what it sent is collected. An envelope sent at tick k
-is due at k + its link's delay, at least one tick, also when both ends are in one process: so one and four processes give
-one and the same run, and so does moving an endpoint to another party.
+Lock step goes in ticks of `TICK` seconds. At tick k each party first gets the envelopes due at k,
+ordered by (time, source, sequence), then `advance`s to the time k * TICK, and what it sent is
+collected. An envelope sent at tick k is due at k + its link's delay, at least one tick, also when
+both ends are in one process: so one and four processes give one and the same run, and so does
+moving an endpoint to another party.
 """
 
 from __future__ import annotations
@@ -16,10 +18,12 @@ TICK = 0.004
 
 
 class Envelope(NamedTuple):
-    """A message on its way. `source` and `target` are endpoint names (an action, a device, a service or a party), not processes.
+    """A message on its way. `source` and `target` are endpoint names (an action, a device, a
+    service or a party), not processes.
 
-    `channel` says what `body` is: "call" a message of the node protocol, "can" a `Frame`, "image" an `Image` body,
-    "stream" a set point, "control" anything of the cell's own (start of images, ...). `party` is the receiving party.
+    `channel` says what `body` is: "call" a message of the node protocol, "can" a `Frame`, "image"
+    an `Image` body, "stream" a set point, "control" anything of the cell's own (start of images,
+    ...). `party` is the receiving party.
     """
 
     party: str

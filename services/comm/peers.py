@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm.messages import Call, Hello, Refuse
-from services.comm.orders import Offer
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
+from petrobot.services.comm.messages import Call, Hello, Refuse
+from petrobot.services.comm.orders import Offer
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
 
 COORDINATOR: Final = "coordinator"
 NODE: Final = "node"
@@ -29,7 +29,8 @@ class Peer:
 
 
 class Peers:
-    """The callers of one node, by name; one process a name. `lease` is how long (s) one that is away keeps its devices."""
+    """The callers of one node, by name; one process a name. `lease` is how long (s) one that is
+    away keeps its devices."""
 
     def __init__(self, node: str, directory: str, any_directory: bool, lease: float) -> None:
         self._node = node
@@ -53,21 +54,38 @@ class Peers:
         if negotiate(hello.oldest_version, hello.newest_version) is None:
             spoken = f"{OLDEST_VERSION} to {NEWEST_VERSION}"
             asked = f"{hello.oldest_version} to {hello.newest_version}"
-            return Refuse("version", f"{self._node} speaks versions {spoken}, you {asked}: update the older side")
+            return Refuse(
+                "version",
+                f"{self._node} speaks versions {spoken}, you {asked}: update the older side",
+            )
         known = self._peers.get(name)
         if known is not None and hello.epoch < known.epoch:
-            text = f"{name} has been here with epoch {known.epoch}, you come with {hello.epoch}: a newer one has taken over"
+            text = (
+                f"{name} has been here with epoch {known.epoch}, you come with "
+                f"{hello.epoch}: a newer one has taken over"
+            )
             return Refuse("old_epoch", text)
-        if known is not None and known.up and known.boot != hello.boot and hello.epoch == known.epoch:
-            return Refuse("name_taken", f"another process is connected as {name}: stop it, or take another name")
+        if (
+            known is not None
+            and known.up
+            and known.boot != hello.boot
+            and hello.epoch == known.epoch
+        ):
+            return Refuse(
+                "name_taken",
+                f"another process is connected as {name}: stop it, or take another name",
+            )
         mine, its = self._directory, hello.directory
         if mine and its and mine != its and not self._any_directory:
             text = f"your services.toml ({its[:12]}) is not {self._node}'s ({mine[:12]})"
-            return Refuse("directory", f"{text}: copy the same file to each host and start its node again")
+            return Refuse(
+                "directory", f"{text}: copy the same file to each host and start its node again"
+            )
         return None
 
     def come(self, name: str, hello: Hello, local: bool) -> str:
-        """A caller is welcome. Gives the name of the oldest of too many that are away, which is forgotten; else empty."""
+        """A caller is welcome. Gives the name of the oldest of too many that are away, which is
+        forgotten; else empty."""
         self._peers.pop(name, None)
         self._peers[name] = Peer(hello.role, hello.boot, hello.epoch, local)
         if len(self._peers) > KNOWN:
@@ -84,13 +102,16 @@ class Peers:
             return False
         peer.up, peer.down_at = False, now
         if leaves:
-            self._leases = {device: holder for device, holder in self._leases.items() if holder != name}
+            self._leases = {
+                device: holder for device, holder in self._leases.items() if holder != name
+            }
         return True
 
     def refusal_of_call(
         self, now: float, name: str, call: Call, offer: Offer | None, in_use: Callable[[str], bool]
     ) -> tuple[str, str] | None:
-        """Why this call is not begun: cause and text; None if it is, and then the caller holds the lease of its device.
+        """Why this call is not begun: cause and text; None if it is, and then the caller holds the
+        lease of its device.
 
         `in_use(device)` says whether a run goes on that needs it.
         """
@@ -100,21 +121,31 @@ class Peers:
         if offer is None:
             return (
                 "unknown_service",
-                f"{self._node} offers no {call.service}: services.toml places it elsewhere or nowhere",
+                f"{self._node} offers no {call.service}: services.toml places it elsewhere "
+                "or nowhere",
             )
         if call.epoch < peer.epoch and peer.role == COORDINATOR:
-            return "old_epoch", f"{name} is at epoch {peer.epoch}, the call is of epoch {call.epoch}"
+            return (
+                "old_epoch",
+                f"{name} is at epoch {peer.epoch}, the call is of epoch {call.epoch}",
+            )
         if offer.scope == "local" and not peer.local:
             return "local_only", f"{call.service} serves callers on the host of {self._node} alone"
         if offer.roles and peer.role not in offer.roles:
-            return "not_for_role", f"{call.service} serves {' and '.join(sorted(offer.roles))}, not a {peer.role}"
+            return (
+                "not_for_role",
+                f"{call.service} serves {' and '.join(sorted(offer.roles))}, not a {peer.role}",
+            )
         return self._lease(now, name, peer, offer.device, in_use) if offer.device else None
 
     def _lease(
         self, now: float, name: str, peer: Peer, device: str, in_use: Callable[[str], bool]
     ) -> tuple[str, str] | None:
         if peer.role == NODE:
-            return "device_needs_coordinator", f"{device} takes orders from a coordinator alone, not from node {name}"
+            return (
+                "device_needs_coordinator",
+                f"{device} takes orders from a coordinator alone, not from node {name}",
+            )
         holder = self._leases.get(device, name)
         if holder != name and (self._is_near(now, holder) or in_use(device)):
             return "device_leased", f"{device} takes orders from {holder}"

@@ -1,7 +1,9 @@
-"""Plain data: what may stand in a message's arguments, values and data, checked on its way in and on its way out.
+"""Plain data: what may stand in a message's arguments, values and data, checked on its way in and
+on its way out.
 
-Plain is None, bool, int (64 bits), float, str, bytes, list and dict with str keys, nested at most `DEPTH` deep. Arrays of
-numbers (`ndarray` of uint8 or float64) are plain only inside the envelopes of lock step.
+Plain is None, bool, int (64 bits), float, str, bytes, list and dict with str keys, nested at most
+`DEPTH` deep. Arrays of numbers (`ndarray` of uint8 or float64) are plain only inside the envelopes
+of lock step.
 """
 
 from __future__ import annotations
@@ -32,7 +34,8 @@ _KEY, _SHORT_INT = 60, 200
 _MOST_FOREIGN = 100_000
 """Items of a mapping that is not a dict: what yields them may never end."""
 
-# The base's own method takes the content of a subclass as it is, whatever the subclass has made of `str()` or `__iter__`.
+# The base's own method takes the content of a subclass as it is, whatever the subclass has made of
+# `str()` or `__iter__`.
 _BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = (
     (str, str.__str__),
     (bytes, lambda value: b"".join((value,))),
@@ -56,16 +59,21 @@ class NotPlainError(TypeError):
 def plain(value: Any, where: str = "value") -> Any:
     """The same data in plain types only: a copy, tuples as lists, numpy scalars as Python numbers.
 
-    Done by the sender, so that a value is refused where it was made and both ends see the same types whether they live in
-    one process or in two. `where` names the data in the error. Raises NotPlainError; whether a whole message of it is small
-    enough is for `codec.encode` to say.
+    Done by the sender, so that a value is refused where it was made and both ends see the same
+    types whether they live in one process or in two. `where` names the data in the error. Raises
+    NotPlainError; whether a whole message of it is small enough is for `codec.encode` to say.
     """
     left = [MAX_CONTAINERS]
-    return _plain_dict(value, where, DEPTH, left) if type(value) is dict else _plain(value, where, DEPTH, left)
+    return (
+        _plain_dict(value, where, DEPTH, left)
+        if type(value) is dict
+        else _plain(value, where, DEPTH, left)
+    )
 
 
 def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
-    """`left` counts down the containers: of data that holds one of its parts many times over there may be no end."""
+    """`left` counts down the containers: of data that holds one of its parts many times over there
+    may be no end."""
     kind = type(value)
     if kind in _SIMPLE:
         return value
@@ -82,10 +90,16 @@ def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
     if left[0] < 0 or len(value) > LARGEST:
         most = f"{MAX_CONTAINERS:,} lists and dicts" if left[0] < 0 else f"{LARGEST:,} items"
         raise NotPlainError(f"{where}: more than {most}; store them in a file and give its name")
-    return _plain_dict(value, where, depth, left) if kind is dict else _plain_list(value, where, depth, left)
+    return (
+        _plain_dict(value, where, depth, left)
+        if kind is dict
+        else _plain_list(value, where, depth, left)
+    )
 
 
-def _plain_dict(value: Mapping[Any, Any], where: str, depth: int, left: list[int]) -> dict[str, Any]:
+def _plain_dict(
+    value: Mapping[Any, Any], where: str, depth: int, left: list[int]
+) -> dict[str, Any]:
     copy: dict[str, Any] = {}
     for key, item in value.items():
         if type(key) is not str:
@@ -124,14 +138,18 @@ def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
     if isinstance(value, Mapping):
         items = list(islice(value.items(), _MOST_FOREIGN + 1))
         if len(items) > _MOST_FOREIGN:
-            raise NotPlainError(f"{where}: a {type(value).__name__} of more than {_MOST_FOREIGN:,} items; use a dict")
+            raise NotPlainError(
+                f"{where}: a {type(value).__name__} of more than {_MOST_FOREIGN:,} items; "
+                "use a dict"
+            )
         return _plain(dict(items), where, depth, left)
     remedy = "; use .tolist()" if isinstance(value, np.ndarray) else ""
     raise NotPlainError(f"{where}: a {type(value).__name__} is not plain data{remedy}")
 
 
 def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH) -> None:
-    """Refuse decoded data that is not plain or nested too deep. `extra` are further leaf types. Raises NotPlainError."""
+    """Refuse decoded data that is not plain or nested too deep. `extra` are further leaf types.
+    Raises NotPlainError."""
     kind = type(value)
     if kind is dict:
         if depth == 0:
@@ -140,7 +158,9 @@ def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH
             if type(key) is not str:
                 raise NotPlainError("a key of a map is not a str")
             inner = type(item)
-            if inner not in SCALARS and not (inner is list and depth > 1 and SCALARS.issuperset(map(type, item))):
+            if inner not in SCALARS and not (
+                inner is list and depth > 1 and SCALARS.issuperset(map(type, item))
+            ):
                 inspect(item, extra, depth - 1)
     elif kind is list or kind is tuple:
         if depth == 0:
@@ -154,13 +174,15 @@ def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH
 
 
 def pack_array(array: NDArray[Any]) -> bytes:
-    """An array as bytes: dtype code, number of dimensions, u32 lengths, numbers in C order. Raises NotPlainError."""
+    """An array as bytes: dtype code, number of dimensions, u32 lengths, numbers in C order. Raises
+    NotPlainError."""
     code = _code(array)
     return struct.pack(f">BB{array.ndim}I", code, array.ndim, *array.shape) + array.tobytes()
 
 
 def copy_array(array: NDArray[Any]) -> NDArray[Any]:
-    """What `unpack_array` makes of `pack_array`'s bytes, read-only, at the price of one copy. Raises NotPlainError."""
+    """What `unpack_array` makes of `pack_array`'s bytes, read-only, at the price of one copy.
+    Raises NotPlainError."""
     _code(array)
     copy: NDArray[Any] = np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
     return copy
@@ -169,13 +191,21 @@ def copy_array(array: NDArray[Any]) -> NDArray[Any]:
 def _code(array: NDArray[Any]) -> int:
     code = _CODES.get(array.dtype)
     if code is None or array.ndim > _MAX_DIMENSIONS:
-        raise NotPlainError(f"an array of {array.dtype} with {array.ndim} dimensions: only uint8 or float64, at most 4")
+        raise NotPlainError(
+            f"an array of {array.dtype} with {array.ndim} dimensions: only uint8 or float64, "
+            "at most 4"
+        )
     return code
 
 
 def unpack_array(data: bytes) -> NDArray[Any]:
     """Inverse of `pack_array`, read-only. Raises NotPlainError on anything but a whole array."""
-    if len(data) < 2 or data[0] not in _DTYPES or data[1] > _MAX_DIMENSIONS or len(data) < 2 + 4 * data[1]:
+    if (
+        len(data) < 2
+        or data[0] not in _DTYPES
+        or data[1] > _MAX_DIMENSIONS
+        or len(data) < 2 + 4 * data[1]
+    ):
         raise NotPlainError("malformed array")
     dtype = _DTYPES[data[0]]
     start = 2 + 4 * data[1]

@@ -1,7 +1,7 @@
 """Numbers on the command line: argparse types that say in words which numbers there may be.
 
-argparse words a ValueError by the name of the function that raised it; what these raise is printed as it is:
-`argument --runs: abc is not a whole number of at least 1`.
+argparse words a ValueError by the name of the function that raised it; what these raise is printed
+as it is: `argument --runs: abc is not a whole number of at least 1`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ def whole(least: int = 1) -> Callable[[str], int]:
 def number(
     *, above: float | None = None, least: float | None = None, most: float | None = None
 ) -> Callable[[str], float]:
-    """The type of an option that takes a finite number: more than `above`, at least `least`, at most `most`."""
+    """The type of an option that takes a finite number: more than `above`, at least `least`, at
+    most `most`."""
     bounds = (("more than", above), ("at least", least), ("at most", most))
     asked = " and ".join(f"{words} {bound:g}" for words, bound in bounds if bound is not None)
 
@@ -40,12 +41,15 @@ def number(
             value = float("nan")
         low = (above is None or value > above) and (least is None or value >= least)
         if not (isfinite(value) and low and (most is None or value <= most)):
-            raise ArgumentTypeError(f"{text} is not a number of {asked}" if asked else f"{text} is no finite number")
+            raise ArgumentTypeError(
+                f"{text} is not a number of {asked}" if asked else f"{text} is no finite number"
+            )
         return value
 
     return read
 
 
 def probability(text: str) -> float:
-    """The type of an option that takes a probability which something is to reach: more than 0, at most 1."""
+    """The type of an option that takes a probability which something is to reach: more than 0, at
+    most 1."""
     return number(above=0.0, most=1.0)(text)

@@ -1,4 +1,5 @@
-"""What a node remembers of calls that have ended: results until they are acknowledged, ids for longer."""
+"""What a node remembers of calls that have ended: results until they are acknowledged, ids for
+longer."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from dataclasses import dataclass
 from types import NoneType
 from typing import Any
 
-from services.comm.messages import Outcome
+from petrobot.services.comm.messages import Outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +21,14 @@ class Keeping:
     result_count: int = 1_000
     """and how many of them,"""
     result_bytes: int = 64 << 20
-    """and how much they may weigh together (bytes, about as on the wire); the newest is kept whatever it weighs."""
+    """and how much they may weigh together (bytes, about as on the wire); the newest is kept
+    whatever it weighs."""
     id_groups: int = 100_000
-    """Groups of ids that are remembered once their results are gone (`FinishedIds`); there is no limit of time."""
+    """Groups of ids that are remembered once their results are gone (`FinishedIds`); there is no
+    limit of time."""
     lease: float = 2.0
-    """Seconds after which the lease of a device is free when its holder is away and none of its runs goes on."""
+    """Seconds after which the lease of a device is free when its holder is away and none of its
+    runs goes on."""
 
 
 _SCALAR = 9
@@ -55,10 +59,12 @@ _GROUP = 4_096
 
 
 class FinishedIds:
-    """Ids of calls whose results are gone, grouped so that they need never be forgotten in ordinary use.
+    """Ids of calls whose results are gone, grouped so that they need never be forgotten in ordinary
+    use.
 
-    Callers count their calls (docs/protocol.md, `id`), so an id is split into its text and its trailing number, and the
-    numbers of one text are kept as bits. At most `limit` groups of 4,096 numbers are kept, the oldest is forgotten first.
+    Callers count their calls (docs/protocol.md, `id`), so an id is split into its text and its
+    trailing number, and the numbers of one text are kept as bits. At most `limit` groups of 4,096
+    numbers are kept, the oldest is forgotten first.
     """
 
     def __init__(self, limit: int) -> None:
@@ -82,7 +88,8 @@ class FinishedIds:
 
 
 def _split(id_: str) -> tuple[str, int]:
-    """An id as its text and its trailing number; no two ids give the same, since leading zeros stay with the text."""
+    """An id as its text and its trailing number; no two ids give the same, since leading zeros stay
+    with the text."""
     text = id_.rstrip(_DIGITS)
     digits = id_[len(text) :]
     if digits[:1] == "0":
@@ -109,7 +116,8 @@ class ResultStore:
         return id_ in self._results or id_ in self.gone
 
     def add(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
-        """Keep a result for its caller. `weight` is its length on the wire (bytes) where that is known, else it is estimated."""
+        """Keep a result for its caller. `weight` is its length on the wire (bytes) where that is
+        known, else it is estimated."""
         if weight is None:
             weight = weight_of(outcome.values) if outcome.values else 0
         results, id_ = self._results, outcome.id

@@ -1,10 +1,12 @@
-"""Proof of a shared key and the seal of each frame: HMAC-SHA256 (RFC 2104, FIPS 180-4) from the standard library.
+"""Proof of a shared key and the seal of each frame: HMAC-SHA256 (RFC 2104, FIPS 180-4) from the
+standard library.
 
-Both ends draw a nonce; the transcript is all bytes of HELLO and CHALLENGE, the name of the wanted server among them. The
-client proves the key over the transcript, the server over transcript and WELCOME, and each direction gets a sealing key of
-its own, so neither a recorded nor a mirrored frame is ever accepted, and neither the version range nor the wanted name can be
-changed on the way. The key itself never crosses the wire. Without a key each frame carries a CRC-32 in the seal's place: it
-finds accidents, not attacks.
+Both ends draw a nonce; the transcript is all bytes of HELLO and CHALLENGE, the name of the wanted
+server among them. The client proves the key over the transcript, the server over transcript and
+WELCOME, and each direction gets a sealing key of its own, so neither a recorded nor a mirrored
+frame is ever accepted, and neither the version range nor the wanted name can be changed on the way.
+The key itself never crosses the wire. Without a key each frame carries a CRC-32 in the seal's
+place: it finds accidents, not attacks.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from pathlib import Path
 from typing import Protocol
 from zlib import crc32
 
-from services.comm.whole_file import write_whole
+from petrobot.services.comm.whole_file import write_whole
 
 NONCE_BYTES = 32
 PROOF_BYTES = 32
@@ -29,13 +31,16 @@ KEY_BYTES = 32
 LARGEST_SECRET = 1 << 16
 """Bytes of a key file that are read at most."""
 CHECK_BYTES = 4
-"""CRC-32 (IEEE 802.3, as zlib's), big endian: in the place of proof and seal where there is no key."""
+"""CRC-32 (IEEE 802.3, as zlib's), big endian: in the place of proof and seal where there is no
+key."""
 
 UNPROVEN = "unauthenticated refusal"
-"""A refusal that does not prove the key: a man in the middle can say it, too, so it counts as a broken link, no more."""
+"""A refusal that does not prove the key: a man in the middle can say it, too, so it counts as a
+broken link, no more."""
 
 Keys = bytes | tuple[bytes, ...]
-"""The shared key, or all keys that are accepted while the key is being replaced, the newest first."""
+"""The shared key, or all keys that are accepted while the key is being replaced, the newest
+first."""
 
 _BLOCK = 64
 
@@ -63,11 +68,14 @@ def is_loopback(host: str) -> bool:
 
 
 def require_key(name: str, host: str, key: Keys | bool | None) -> None:
-    """Refuse to listen where other hosts can connect unless there is a key, or certificates. Raises KeyNeededError."""
+    """Refuse to listen where other hosts can connect unless there is a key, or certificates. Raises
+    KeyNeededError."""
     if not key and not is_loopback(host):
         raise KeyNeededError(
-            f"{name}: refuses to listen on {host}, which other hosts can reach, without a key; make a key file (or "
-            "certificates) with `petrobot keys`, copy it to each host and name it under [keys] in services.toml, or "
+            f"{name}: refuses to listen on {host}, which other hosts can reach, without a "
+            "key; make a key file (or "
+            "certificates) with `petrobot keys`, copy it to each host and name it under "
+            "[keys] in services.toml, or "
             "listen on 127.0.0.1"
         )
 
@@ -87,16 +95,19 @@ def same(a: bytes, b: bytes) -> bool:
 
 
 class Seal:
-    """MAC of one direction of one connection: each frame's number and body under a key of this connection alone.
+    """MAC of one direction of one connection: each frame's number and body under a key of this
+    connection alone.
 
-    The number is counted by both ends and not sent, so a frame lost, repeated or moved breaks the seal.
+    The number is counted by both ends and not sent, so a frame lost, repeated or moved breaks the
+    seal.
     """
 
     __slots__ = ("_inner", "_number", "_outer")
 
     def __init__(self, key: bytes, direction: str, transcript: bytes) -> None:
         own = proof(key, direction, transcript).ljust(_BLOCK, b"\0")
-        # The two half-way states of HMAC are kept: a third of the time of hmac.digest on a short frame.
+        # The two half-way states of HMAC are kept: a third of the time of hmac.digest on a short
+        # frame.
         self._inner: _Hash = hashlib.sha256(bytes(byte ^ 0x36 for byte in own))
         self._outer: _Hash = hashlib.sha256(bytes(byte ^ 0x5C for byte in own))
         self._number = 0
@@ -115,8 +126,8 @@ class Seal:
 class Check:
     """What stands in the place of a seal on a connection without a key: CRC-32 of the body alone.
 
-    TCP keeps the order and the number of frames, but its own sum has 16 bits and misses some of the changed ones (Stone and
-    Partridge, "When the CRC and TCP checksum disagree", SIGCOMM 2000).
+    TCP keeps the order and the number of frames, but its own sum has 16 bits and misses some of the
+    changed ones (Stone and Partridge, "When the CRC and TCP checksum disagree", SIGCOMM 2000).
     """
 
     __slots__ = ()
@@ -142,36 +153,50 @@ def new_key() -> bytes:
 
 
 def write_key(path: Path, key: bytes) -> None:
-    """Write a key file, one line of hexadecimal digits that its owner alone may read. Raises KeyFileError if it exists."""
+    """Write a key file, one line of hexadecimal digits that its owner alone may read. Raises
+    KeyFileError if it exists."""
     try:
         write_whole(path, key.hex() + "\n", mode=0o600, fresh=True)
     except FileExistsError:
-        raise KeyFileError(f"{path}: exists already; remove it first if no host uses it any more") from None
+        raise KeyFileError(
+            f"{path}: exists already; remove it first if no host uses it any more"
+        ) from None
     except OSError as fault:
-        raise KeyFileError(f"{path}: {fault.strerror}; give --file a place that can be written") from None
+        raise KeyFileError(
+            f"{path}: {fault.strerror}; give --file a place that can be written"
+        ) from None
 
 
 def read_secret(path: Path) -> bytes:
-    """What is in a file that its owner alone may read. Raises KeyFileError if others may, OSError if it cannot be read.
+    """What is in a file that its owner alone may read. Raises KeyFileError if others may, OSError
+    if it cannot be read.
 
-    The file is opened once, and what is looked at is what was opened: a name could lead to another file a moment later. A link
-    to it is followed, as whoever may write services.toml could name any file; whose file it is in the end decides.
+    The file is opened once, and what is looked at is what was opened: a name could lead to another
+    file a moment later. A link to it is followed, as whoever may write services.toml could name any
+    file; whose file it is in the end decides.
     """
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe of that name must not hold us up
+    handle = os.open(
+        path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+    )  # a pipe of that name must not hold us up
     with os.fdopen(handle, "rb") as file:
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):
-            raise KeyFileError(f"{path}: not a regular file; name a key file that `petrobot keys` made")
+            raise KeyFileError(
+                f"{path}: not a regular file; name a key file that `petrobot keys` made"
+            )
         if about.st_uid not in (os.geteuid(), 0):
             text = f"{path}: belongs to another user (uid {about.st_uid}), who could change it"
-            raise KeyFileError(f"{text}; run `chown {os.geteuid()} {path}`, or make another with `petrobot keys`")
+            raise KeyFileError(
+                f"{text}; run `chown {os.geteuid()} {path}`, or make another with `petrobot keys`"
+            )
         if stat.S_IMODE(about.st_mode) & 0o077:
             raise KeyFileError(f"{path}: other users may read it; run `chmod 600 {path}`")
         return file.read(LARGEST_SECRET)
 
 
 def read_key(path: Path) -> bytes:
-    """The shared key in a key file. Raises KeyFileError if it is missing, of another user, readable by others, or no key."""
+    """The shared key in a key file. Raises KeyFileError if it is missing, of another user, readable
+    by others, or no key."""
     try:
         key = bytes.fromhex(read_secret(path).decode("ascii").strip())
     except OSError as fault:
@@ -181,5 +206,7 @@ def read_key(path: Path) -> bytes:
     except ValueError:
         key = b""
     if len(key) != KEY_BYTES:
-        raise KeyFileError(f"{path}: not {2 * KEY_BYTES} hexadecimal digits; make a key file with `petrobot keys`")
+        raise KeyFileError(
+            f"{path}: not {2 * KEY_BYTES} hexadecimal digits; make a key file with `petrobot keys`"
+        )
     return key

@@ -6,7 +6,8 @@
     callee.finish(server.now(), id, "success", values)
     server.flush()
 
-Services answered on the spot (`Offer.inline`) never leave the loop; everything else comes to `on_orders`.
+Services answered on the spot (`Offer.inline`) never leave the loop; everything else comes to
+`on_orders`.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ import ssl
 from collections.abc import Callable
 from datetime import UTC, datetime
 
-from services.comm.admission import Bucket, Knocks
-from services.comm.callee import Callee, Order
-from services.comm.credentials import may_speak_as, name_on
-from services.comm.expiry import DAY, look_again
-from services.comm.link import READ_BUFFER, Limits, Link, Timing
-from services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
-from services.comm.security import Keys, is_loopback, require_key
-from services.comm.tls_listener import Admission, TlsListener
-from services.comm.wire import ProtocolError, Side, State
+from petrobot.services.comm.admission import Bucket, Knocks
+from petrobot.services.comm.callee import Callee, Order
+from petrobot.services.comm.credentials import may_speak_as, name_on
+from petrobot.services.comm.expiry import DAY, look_again
+from petrobot.services.comm.link import READ_BUFFER, Limits, Link, Timing
+from petrobot.services.comm.messages import Answer, Bye, Call, Hello, Message, Outcome, Refuse
+from petrobot.services.comm.security import Keys, is_loopback, require_key
+from petrobot.services.comm.tls_listener import Admission, TlsListener
+from petrobot.services.comm.wire import ProtocolError, Side, State
 
 OnOrders = Callable[[float, list[Order]], None]
 AT_ONCE = 16
@@ -32,7 +33,8 @@ AT_ONCE = 16
 BACKLOG = 128
 """Connections that may wait to be accepted, and"""
 ACCEPTED = 16
-"""how many are accepted in one turn of the loop: a crowd at the door must not keep those inside waiting."""
+"""how many are accepted in one turn of the loop: a crowd at the door must not keep those inside
+waiting."""
 COUNTED = 256
 """Messages of a caller after which its rate is looked at."""
 
@@ -41,7 +43,9 @@ class _ServerLink(Link):
     """A caller's connection."""
 
     def __init__(self, server: Server) -> None:
-        super().__init__(Side.SERVER, server.callee.name, server.key, server.timing, server.limits, server.buffer)
+        super().__init__(
+            Side.SERVER, server.callee.name, server.key, server.timing, server.limits, server.buffer
+        )
         self._server = server
         self.peer = ""
         """The caller's name, once it is welcome."""
@@ -61,8 +65,13 @@ class _ServerLink(Link):
             return
         at_once = min(len(messages), AT_ONCE)
         for message in messages:
-            if type(message) is Call and peer and (answer := callee.answer_inline(now, peer, message)) is not None:
-                # The shortest way for what is answered on the spot; the caller reads while its answer is being kept here.
+            if (
+                type(message) is Call
+                and peer
+                and (answer := callee.answer_inline(now, peer, message)) is not None
+            ):
+                # The shortest way for what is answered on the spot; the caller reads while its
+                # answer is being kept here.
                 answer, frame = self._framed(answer)
                 self.frames.append(frame)
                 if len(self.frames) >= at_once:
@@ -81,12 +90,16 @@ class _ServerLink(Link):
             self._server.arm()
 
     def _framed(self, answer: Outcome) -> tuple[Outcome, bytes]:
-        """A result and its frame; where no frame can carry it, what is answered in its place, which is then what is kept."""
+        """A result and its frame; where no frame can carry it, what is answered in its place, which
+        is then what is kept."""
         try:
             return answer, self.connection.send(answer)
         except ProtocolError as fault:
             if self.connection.state is not State.OPEN:
-                return answer, b""  # its last word came with the call: it may ask again when it is back
+                return (
+                    answer,
+                    b"",
+                )  # its last word came with the call: it may ask again when it is back
             answer = _bad_result(answer, fault)
             return answer, self.connection.send(answer)
 
@@ -95,7 +108,8 @@ class _ServerLink(Link):
         return self._taken < COUNTED or self._in_time(now)
 
     def _in_time(self, now: float) -> bool:
-        """Read no more for a while from one that sends faster than it may; False: it is too much, and it must go."""
+        """Read no more for a while from one that sends faster than it may; False: it is too much,
+        and it must go."""
         wait = self._budget.take(now, self._taken)
         self._taken = 0
         if wait <= 0.0 or self._transport is None:
@@ -103,7 +117,10 @@ class _ServerLink(Link):
         self._server.count("too_fast")
         if wait > self.timing.silence / 2:
             limits = self.limits
-            text = f"at most {limits.messages_at_once} messages at once and {limits.messages:g} a second: send fewer"
+            text = (
+                f"at most {limits.messages_at_once} messages at once and "
+                f"{limits.messages:g} a second: send fewer"
+            )
             self.end(f"too_fast: {text}", Refuse("too_fast", text))
             return False
         self._transport.pause_reading()
@@ -124,7 +141,10 @@ class _ServerLink(Link):
     def _greet(self, now: float, hello: Hello) -> None:
         certified = self.certified()
         if certified is not None and not may_speak_as(certified, hello.role, hello.name):
-            text = f"the certificate of {certified or 'nobody'} does not let you speak as {hello.role} {hello.name}"
+            text = (
+                f"the certificate of {certified or 'nobody'} does not let you speak as "
+                f"{hello.role} {hello.name}"
+            )
             self._server.count("certificate")
             self.end(f"certificate: {text}", Refuse("certificate", text))
             return
@@ -161,7 +181,8 @@ def _bad_result(outcome: Outcome, fault: ProtocolError) -> Outcome:
 
 
 class Server:
-    """Serves a callee on one address. `on_orders(now, orders)` gets what the node has to do, in the loop."""
+    """Serves a callee on one address. `on_orders(now, orders)` gets what the node has to do, in the
+    loop."""
 
     def __init__(
         self,
@@ -198,14 +219,19 @@ class Server:
         return self._loop.time()
 
     async def start(self, host: str, port: int) -> None:
-        """Listen. Raises KeyNeededError if other hosts could connect and there is no key, OSError if it cannot be done."""
+        """Listen. Raises KeyNeededError if other hosts could connect and there is no key, OSError
+        if it cannot be done."""
         require_key(self.callee.name, host, self.key or self.tls is not None)
         self._loop = asyncio.get_running_loop()
         if self.tls is None:
-            server = await self._loop.create_server(lambda: _ServerLink(self), host, port, backlog=ACCEPTED)
+            server = await self._loop.create_server(
+                lambda: _ServerLink(self), host, port, backlog=ACCEPTED
+            )
             for sock in server.sockets:
                 with sock.dup() as own:
-                    own.listen(BACKLOG)  # asyncio takes as many in one turn as it lets wait: of that we want less
+                    own.listen(
+                        BACKLOG
+                    )  # asyncio takes as many in one turn as it lets wait: of that we want less
             self._server = server
         else:
             listener = TlsListener(host, port, self.tls, self.timing.handshake, self.limits.opening)
@@ -296,7 +322,8 @@ class Server:
     # What links report.
 
     def came(self, link: _ServerLink) -> None:
-        """A connection stands. Above the limits the oldest one that has not shown who it is gives way, else the new one."""
+        """A connection stands. Above the limits the oldest one that has not shown who it is gives
+        way, else the new one."""
         if self.tls is None and not self.admits(link.address):
             link.cut("too many handshakes of its address have failed")
             self.count("knocks")

@@ -1,11 +1,12 @@
-"""What a caller remembers of calls that have ended: which results are safe, what was given up, what is to be acknowledged."""
+"""What a caller remembers of calls that have ended: which results are safe, what was given up, what
+is to be acknowledged."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from typing import Final
 
-from services.comm.messages import ResultAck
+from petrobot.services.comm.messages import ResultAck
 
 REMEMBERED: Final = 10_000
 """Ids of ended calls that are remembered at least."""
@@ -18,7 +19,8 @@ _NEVER: Final = float("inf")
 
 
 class Settled:
-    """Ended calls of one caller. An acknowledgement waits up to `delay` seconds for others to go with it."""
+    """Ended calls of one caller. An acknowledgement waits up to `delay` seconds for others to go
+    with it."""
 
     def __init__(self, delay: float) -> None:
         self._delay = delay
@@ -33,7 +35,8 @@ class Settled:
         self._safe[id_] = safe
 
     def _prune(self) -> None:
-        """Forget the oldest in bulk, so that a single call pays nothing for it; what is not safe yet stays."""
+        """Forget the oldest in bulk, so that a single call pays nothing for it; what is not safe
+        yet stays."""
         for old in list(self._safe)[:REMEMBERED]:
             if self._safe[old]:
                 del self._safe[old]
@@ -53,7 +56,8 @@ class Settled:
         return id_ in self._given_up
 
     def turn_up(self, id_: str) -> None:
-        """The peer's own result of a call that had ended here has come late; it is only recorded."""
+        """The peer's own result of a call that had ended here has come late; it is only
+        recorded."""
         self._given_up.pop(id_, None)
         self.end(id_, True)
 
@@ -73,7 +77,9 @@ class Settled:
     def take_acks(self) -> list[ResultAck]:
         """The acknowledgements of all that wait. To be asked for once they are `due`."""
         acks, self._acks, self.due = self._acks, [], _NEVER
-        return [ResultAck(acks[n], tuple(acks[n + 1 : n + IN_ONE])) for n in range(0, len(acks), IN_ONE)]
+        return [
+            ResultAck(acks[n], tuple(acks[n + 1 : n + IN_ONE])) for n in range(0, len(acks), IN_ONE)
+        ]
 
     def link_lost(self) -> None:
         """What waits is not told any more: the peer lists what it keeps when it is back."""

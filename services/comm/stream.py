@@ -1,9 +1,10 @@
 """Set points from node to node, each stream on a connection of its own: newest value wins.
 
-The sender opens with the handshake of the node protocol (role "stream"), then STREAM_OPEN, then one SET_POINT a period for
-as long as it stands by its values, and WITHDRAW when it does no more. Nothing here waits: a value that finds no room is
-dropped, since a newer one follows; the receiver drains its sockets to the newest value, and withdraws it once it is older
-than three periods, what it lost on its way included. Pacing is the sender's loop's.
+The sender opens with the handshake of the node protocol (role "stream"), then STREAM_OPEN, then one
+SET_POINT a period for as long as it stands by its values, and WITHDRAW when it does no more.
+Nothing here waits: a value that finds no room is dropped, since a newer one follows; the receiver
+drains its sockets to the newest value, and withdraws it once it is older than three periods, what
+it lost on its way included. Pacing is the sender's loop's.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm.messages import (
+from petrobot.services.comm.messages import (
     Bye,
     Hello,
     Message,
@@ -29,9 +30,9 @@ from services.comm.messages import (
     Welcome,
     Withdraw,
 )
-from services.comm.security import UNPROVEN, Keys, require_key, same
-from services.comm.stream_line import STALE_AFTER, Incoming, Inlet, Line, Sink
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, ProtocolError, Side, State
+from petrobot.services.comm.security import UNPROVEN, Keys, require_key, same
+from petrobot.services.comm.stream_line import STALE_AFTER, Incoming, Inlet, Line, Sink
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION, ProtocolError, Side, State
 
 __all__ = ["STALE_AFTER", "Incoming", "Inlet", "Sink", "StreamReceiver", "StreamSender"]
 
@@ -39,16 +40,19 @@ _CONNECTIONS: Final = 16
 _ADMITTED: Final = 4
 """Connections taken in a poll, and"""
 _STRANGERS_CHUNK: Final = 2048
-"""bytes read in a poll from one that has not opened a stream: strangers must not hold up the servo loop that polls."""
+"""bytes read in a poll from one that has not opened a stream: strangers must not hold up the servo
+loop that polls."""
 _HANDSHAKE: Final = 2.0
 _RETRY: Final = 0.1
 
 
 class StreamSender:
-    """Sending end of one stream, for the loop of a worker: `send` never blocks, the connection looks after itself.
+    """Sending end of one stream, for the loop of a worker: `send` never blocks, the connection
+    looks after itself.
 
-    It connects when there is first something to send, and again at most every 0.1 s when that fails or the receiver is
-    gone. `name` says who sends, `receiver` the name of the device that is to receive: another one is sent nothing.
+    It connects when there is first something to send, and again at most every 0.1 s when that fails
+    or the receiver is gone. `name` says who sends, `receiver` the name of the device that is to
+    receive: another one is sent nothing.
     """
 
     def __init__(
@@ -86,7 +90,8 @@ class StreamSender:
         return self._line is not None and self._line.connection.state is State.OPEN
 
     def send(self, values: Sequence[float], held: float = 0.0) -> bool:
-        """Send the newest values, which the sender has stood by for `held` seconds. False if they were dropped."""
+        """Send the newest values, which the sender has stood by for `held` seconds. False if they
+        were dropped."""
         line = self._line if self.up else self.advance()
         if line is not None and line.unsent:
             line = self.advance()
@@ -114,7 +119,8 @@ class StreamSender:
         self._drop(0.0)
 
     def advance(self) -> Line | None:
-        """Look after the connection: connect, shake hands, notice its end. Gives it when the stream is open."""
+        """Look after the connection: connect, shake hands, notice its end. Gives it when the stream
+        is open."""
         now = self._clock()
         if self._line is None and now >= self._again:
             self._connect(now)
@@ -196,7 +202,8 @@ class _Guest:
 
 
 class StreamReceiver:
-    """Receiving end of a process: listens, and at each `poll` passes the newest value of each stream to its sink.
+    """Receiving end of a process: listens, and at each `poll` passes the newest value of each
+    stream to its sink.
 
     Raises KeyNeededError when other hosts could connect and there is no key.
     """
@@ -222,7 +229,9 @@ class StreamReceiver:
         self._guests: dict[int, _Guest] = {}
         """By the number of their sockets."""
         self._ready = select.epoll()
-        self._listener = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        self._listener = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
         self._listener.setblocking(False)
         self._ready.register(self._listener, select.EPOLLIN)
 
@@ -238,7 +247,8 @@ class StreamReceiver:
 
     def poll(self) -> None:
         """Take in all that has arrived; never blocks."""
-        # Asked for first: a read of each socket in vain is an exception each, and this is called in every servo cycle.
+        # Asked for first: a read of each socket in vain is an exception each, and this is called in
+        # every servo cycle.
         ready = {number for number, _ in self._ready.poll(0.0)}
         now = self._clock()
         for number, guest in list(self._guests.items()):
@@ -265,7 +275,9 @@ class StreamReceiver:
                 self._ready.register(sock, select.EPOLLIN)
                 newest = self._guests[sock.fileno()] = _Guest(line, now)
                 if len(self._guests) > _CONNECTIONS:
-                    self._end(next((one for one in self._guests.values() if one.inlet is None), newest))
+                    self._end(
+                        next((one for one in self._guests.values() if one.inlet is None), newest)
+                    )
 
     def _wait(self, now: float, guest: _Guest) -> None:
         """Nothing came: what is there grows older."""
@@ -276,7 +288,11 @@ class StreamReceiver:
 
     def _serve(self, now: float, guest: _Guest) -> None:
         try:
-            messages = guest.line.read() if guest.inlet is not None else guest.line.read(1, _STRANGERS_CHUNK)
+            messages = (
+                guest.line.read()
+                if guest.inlet is not None
+                else guest.line.read(1, _STRANGERS_CHUNK)
+            )
             guest.line.write(b"")
         except ProtocolError as fault:
             if guest.inlet is not None:
@@ -316,13 +332,20 @@ class StreamReceiver:
         incoming = self._streams.get(opening.stream)
         if incoming is None:
             return Refuse(
-                "unknown_stream", f"{self._name} takes no stream {opening.stream}: see [streams] in services.toml"
+                "unknown_stream",
+                f"{self._name} takes no stream {opening.stream}: see [streams] in services.toml",
             )
         if not math.isclose(opening.period, incoming.period):
-            text = f"{opening.stream} has a period of {incoming.period:g} s here, {opening.period:g} s there"
+            text = (
+                f"{opening.stream} has a period of {incoming.period:g} s here, "
+                f"{opening.period:g} s there"
+            )
             return Refuse("period", f"{text}: copy the same services.toml to both hosts")
         if incoming.ticket and not same(opening.ticket.encode(), incoming.ticket.encode()):
-            return Refuse("ticket", f"the ticket for {opening.stream} is not the one that {self._name} gave out")
+            return Refuse(
+                "ticket",
+                f"the ticket for {opening.stream} is not the one that {self._name} gave out",
+            )
         return None
 
     def _replace(self, guest: _Guest, stream: str) -> None:

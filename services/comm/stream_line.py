@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from services.comm.messages import Message, SetPoint, Withdraw
-from services.comm.security import NONCE_BYTES, Keys
-from services.comm.wire import Connection, Side
+from petrobot.services.comm.messages import Message, SetPoint, Withdraw
+from petrobot.services.comm.security import NONCE_BYTES, Keys
+from petrobot.services.comm.wire import Connection, Side
 
 STALE_AFTER: Final = 3
 """Periods after which a set point is too old."""
@@ -34,7 +34,8 @@ class Sink(Protocol):
 
 
 class Lateness:
-    """How much longer a message took than the quickest one of its stream: from arrivals and the sender's own durations."""
+    """How much longer a message took than the quickest one of its stream: from arrivals and the
+    sender's own durations."""
 
     __slots__ = ("_at", "_best")
 
@@ -43,18 +44,22 @@ class Lateness:
         self._at = 0.0
 
     def of(self, now: float, elapsed: float) -> float:
-        """Seconds that a message sent `elapsed` seconds into the stream has lost on its way when it arrives at `now`."""
+        """Seconds that a message sent `elapsed` seconds into the stream has lost on its way when it
+        arrives at `now`."""
         offset = now - elapsed
-        # The quickest passage is forgotten at the rate at which clocks may drift, so an old one cannot make all look late.
+        # The quickest passage is forgotten at the rate at which clocks may drift, so an old one
+        # cannot make all look late.
         self._best = min(self._best + _DRIFT * (now - self._at), offset)
         self._at = now
         return offset - self._best
 
 
 class Inlet:
-    """Receiving end of one open stream, without socket or clock: what is older than three periods does not count.
+    """Receiving end of one open stream, without socket or clock: what is older than three periods
+    does not count.
 
-    What a set point lost on its way counts as age, so one that was held up is not taken for a fresh one.
+    What a set point lost on its way counts as age, so one that was held up is not taken for a fresh
+    one.
     """
 
     __slots__ = ("_lateness", "_limit", "_sink", "_until")
@@ -66,7 +71,8 @@ class Inlet:
         self._until = math.inf
 
     def receive(self, now: float, messages: Sequence[Message]) -> None:
-        """Take what has arrived by `now`: the newest counts, the others only show how late things are."""
+        """Take what has arrived by `now`: the newest counts, the others only show how late things
+        are."""
         newest: Message | None = None
         late = 0.0
         for message in messages:
@@ -84,7 +90,8 @@ class Inlet:
 
 @dataclass(frozen=True, slots=True)
 class Incoming:
-    """A stream that a receiver takes: its period (s), where its values go, and what its sender must show."""
+    """A stream that a receiver takes: its period (s), where its values go, and what its sender must
+    show."""
 
     period: float
     sink: Sink
@@ -125,8 +132,8 @@ class Line:
         self.unsent = data[sent:]
 
     def read(self, reads: int = _READS, chunk: int = _CHUNK) -> list[Message]:
-        """Messages that have arrived, of at most so many reads. Raises OSError when the connection is gone, ProtocolError
-        when it is no good."""
+        """Messages that have arrived, of at most so many reads. Raises OSError when the connection
+        is gone, ProtocolError when it is no good."""
         messages: list[Message] = []
         for _ in range(reads):
             try:

@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from services.comm.cell import CellError
-from services.comm.messages import Bye, Hello, Message, Refuse, Tick
-from services.comm.wire import Connection, ProtocolError
+from petrobot.services.comm.cell import CellError
+from petrobot.services.comm.messages import Bye, Hello, Message, Refuse, Tick
+from petrobot.services.comm.wire import Connection, ProtocolError
 
 _CHUNK: Final = 1 << 18
 
@@ -26,8 +26,9 @@ class PartyLostError(CellError):
 class TickLink:
     """The connection to one peer. Never blocks.
 
-    `before` is the broken connection that this one takes the place of: its Ticks still count, and what the peer repeats of them is
-    left out. A member that `joins` a cell that goes on takes any Tick as the first.
+    `before` is the broken connection that this one takes the place of: its Ticks still count, and
+    what the peer repeats of them is left out. A member that `joins` a cell that goes on takes any
+    Tick as the first.
     """
 
     def __init__(
@@ -92,7 +93,8 @@ class TickLink:
             raise PartyLostError(self.peer, f"its connection broke: {fault.strerror}") from None
 
     def read(self) -> None:
-        """Take in what has arrived. Raises PartyLostError if the peer is gone, failed or broke the protocol."""
+        """Take in what has arrived. Raises PartyLostError if the peer is gone, failed or broke the
+        protocol."""
         try:
             data = self.sock.recv(_CHUNK)
         except BlockingIOError:
@@ -115,7 +117,9 @@ class TickLink:
                 if self._repeats and self.newest is not None and message.number <= self.newest:
                     continue
                 if self.newest is not None and message.number != self.newest + 1:
-                    raise PartyLostError(self.peer, f"tick {message.number} came after tick {self.newest}")
+                    raise PartyLostError(
+                        self.peer, f"tick {message.number} came after tick {self.newest}"
+                    )
                 self.newest = message.number
                 self._ticks.append(message)
             elif isinstance(message, Bye):
@@ -123,7 +127,9 @@ class TickLink:
             elif isinstance(message, Refuse):
                 raise PartyLostError(self.peer, message.text)
             else:
-                raise PartyLostError(self.peer, f"a {type(message).__name__} has no place in lock step")
+                raise PartyLostError(
+                    self.peer, f"a {type(message).__name__} has no place in lock step"
+                )
 
 
 def family(host: str) -> socket.AddressFamily:
@@ -136,8 +142,11 @@ def tune(sock: socket.socket) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
-def handshake(sock: socket.socket, connection: Connection, hello: Hello | None, deadline: float) -> list[Message]:
-    """Blocking: say HELLO if this side begins, go on until the other side has said something for the owner."""
+def handshake(
+    sock: socket.socket, connection: Connection, hello: Hello | None, deadline: float
+) -> list[Message]:
+    """Blocking: say HELLO if this side begins, go on until the other side has said something for
+    the owner."""
     if hello is not None:
         sock.sendall(connection.send(hello))
     while True:

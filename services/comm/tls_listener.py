@@ -1,8 +1,10 @@
-"""A listening TLS socket whose handshakes are bounded: asyncio's own would begin one for every connection that comes.
+"""A listening TLS socket whose handshakes are bounded: asyncio's own would begin one for every
+connection that comes.
 
-Each handshake of asyncio's TLS has a buffer of 256 KiB, so 10,000 strangers would take 2.5 GiB before one showed a certificate.
-Here a connection costs a socket until its first bytes are there; then its handshake begins. Of both kinds there are so many at
-most; the oldest gives way, so that a good caller, who is quick, gets in between any number of slow ones.
+Each handshake of asyncio's TLS has a buffer of 256 KiB, so 10,000 strangers would take 2.5 GiB
+before one showed a certificate. Here a connection costs a socket until its first bytes are there;
+then its handshake begins. Of both kinds there are so many at most; the oldest gives way, so that a
+good caller, who is quick, gets in between any number of slow ones.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ class Admission:
 class TlsListener:
     """Listens on one address. Not for threads: the running loop owns it."""
 
-    def __init__(self, host: str, port: int, tls: ssl.SSLContext, handshake: float, limit: int) -> None:
+    def __init__(
+        self, host: str, port: int, tls: ssl.SSLContext, handshake: float, limit: int
+    ) -> None:
         """`handshake`: seconds that one may take; `limit`: how many at a time. Raises OSError."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._listener = socket.create_server((host, port), family=family, backlog=128)
@@ -117,7 +121,9 @@ class TlsListener:
         self._ending.add(task)
         task.cancel()
 
-    def _forget(self, sock: socket.socket, address: str, admission: Admission, task: asyncio.Task[None]) -> None:
+    def _forget(
+        self, sock: socket.socket, address: str, admission: Admission, task: asyncio.Task[None]
+    ) -> None:
         self._shaking.pop(task, None)
         self._ending.discard(task)
         if task.cancelled():  # broken off, perhaps before it began

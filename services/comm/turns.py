@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Enum
 
-from services.comm.messages import (
+from petrobot.services.comm.messages import (
     Accept,
     Answer,
     Bye,
@@ -73,7 +73,18 @@ STATES: Mapping[Phase, State] = {
 
 _BOTH = frozenset(cls.KIND for cls in (Ping, Pong, Tick, Bye, Refuse))
 _FROM_CLIENT = _BOTH | {
-    cls.KIND for cls in (Call, ResultAck, Cancel, EventAck, Subscribe, Command, StreamOpen, SetPoint, Withdraw)
+    cls.KIND
+    for cls in (
+        Call,
+        ResultAck,
+        Cancel,
+        EventAck,
+        Subscribe,
+        Command,
+        StreamOpen,
+        SetPoint,
+        Withdraw,
+    )
 }
 _FROM_SERVER = _BOTH | {cls.KIND for cls in (Accept, Feedback, Outcome, Event, Answer)}
 NOTHING: frozenset[int] = frozenset()

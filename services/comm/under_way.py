@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from services.comm.messages import Call, Executed, Outcome
+from petrobot.services.comm.messages import Call, Executed, Outcome
 
 NEVER: Final = float("inf")
 _SPARE: Final = 256
@@ -62,12 +62,14 @@ class Pending:
 
     @property
     def if_unsent(self) -> Executed:
-        """What is known when it ends unsent: its owner may have sent it before the owner was restarted."""
+        """What is known when it ends unsent: its owner may have sent it before the owner was
+        restarted."""
         return Executed.NO if self.any_boot and not self.call.again else Executed.UNKNOWN
 
 
 class UnderWay(dict[str, Pending]):
-    """Calls under way by id, with their watches: for ACCEPT a queue (all wait equally long), for RESULT a heap."""
+    """Calls under way by id, with their watches: for ACCEPT a queue (all wait equally long), for
+    RESULT a heap."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -81,7 +83,8 @@ class UnderWay(dict[str, Pending]):
         accepts = self._accepts
         accepts.append((due, id_))
         if len(accepts) > self._most:
-            # Most of them have ended long before their time: a second of quick calls is a hundred thousand of them.
+            # Most of them have ended long before their time: a second of quick calls is a hundred
+            # thousand of them.
             self._drop_past()
 
     def watch_accept(self, pending: Pending, due: float) -> None:

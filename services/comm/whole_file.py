@@ -1,7 +1,9 @@
-"""Writes a file in one piece: a kill or a power cut leaves the old one or the new one, never a part.
+"""Writes a file in one piece: a kill or a power cut leaves the old one or the new one, never a
+part.
 
-What is written is on the disk when the function returns: the content, then the file's name in its folder, and the names of
-folders that were made for it. Nothing may be acknowledged on the strength of a file before that.
+What is written is on the disk when the function returns: the content, then the file's name in its
+folder, and the names of folders that were made for it. Nothing may be acknowledged on the strength
+of a file before that.
 """
 
 from __future__ import annotations
@@ -12,12 +14,15 @@ import os
 from pathlib import Path
 
 
-def write_whole(path: Path, content: str | bytes, *, mode: int | None = None, fresh: bool = False) -> None:
+def write_whole(
+    path: Path, content: str | bytes, *, mode: int | None = None, fresh: bool = False
+) -> None:
     """Replace the file's content, synced before this returns.
 
-    `mode` is the file's mode (None: that of the file there is, else the usual one). With `fresh` a file that exists is left as it
-    is. What is no regular file (a terminal, a pipe) is simply written to. Raises FileExistsError with `fresh`, else OSError; both
-    name the path, and leave no draft behind.
+    `mode` is the file's mode (None: that of the file there is, else the usual one). With `fresh` a
+    file that exists is left as it is. What is no regular file (a terminal, a pipe) is simply
+    written to. Raises FileExistsError with `fresh`, else OSError; both name the path, and leave no
+    draft behind.
     """
     path = path.resolve()  # a link is followed, not replaced
     data = content.encode("utf-8") if isinstance(content, str) else content
@@ -44,7 +49,9 @@ def write_whole(path: Path, content: str | bytes, *, mode: int | None = None, fr
 
 def _write_draft(draft: Path, data: bytes, mode: int | None) -> None:
     draft.unlink(missing_ok=True)  # of a process of this number that was killed
-    handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else 0o600)
+    handle = os.open(
+        draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else 0o600
+    )
     with os.fdopen(handle, "wb") as file:
         if mode is not None:
             os.fchmod(file.fileno(), mode)
@@ -54,7 +61,8 @@ def _write_draft(draft: Path, data: bytes, mode: int | None) -> None:
 
 
 def _linked(draft: Path, path: Path) -> bool:
-    """Give the draft its name by a link, which unlike a rename fails if the name is taken; False where no links can be made."""
+    """Give the draft its name by a link, which unlike a rename fails if the name is taken; False
+    where no links can be made."""
     try:
         os.link(draft, path)
     except FileExistsError:
@@ -67,7 +75,8 @@ def _linked(draft: Path, path: Path) -> bool:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those that it stands in, their names synced before this returns. Raises OSError."""
+    """Make a folder and those that it stands in, their names synced before this returns. Raises
+    OSError."""
     if folder.is_dir():
         return
     make_folder(folder.absolute().parent)

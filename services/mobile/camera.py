@@ -1,4 +1,5 @@
-"""The driver of the camera that looks at the floor ahead: starts and stops images, hands them to actions."""
+"""The driver of the camera that looks at the floor ahead: starts and stops images, hands them to
+actions."""
 
 from __future__ import annotations
 
@@ -7,11 +8,11 @@ from typing import Any
 
 import cv2
 
-from services.action import Context
-from services.comm.image import Image
-from services.device import Ports
-from services.mobile.model import NOMINAL, nominal_rover, read_rover
-from services.mobile.watching import FloorWatch
+from petrobot.services.action import Context
+from petrobot.services.comm.image import Image
+from petrobot.services.device import Ports
+from petrobot.services.mobile.model import NOMINAL, nominal_rover, read_rover
+from petrobot.services.mobile.watching import FloorWatch
 
 
 class CameraError(ValueError):
@@ -19,10 +20,11 @@ class CameraError(ValueError):
 
 
 class FloorCamera:
-    """A device without cyclic duty. Its keys in services.toml, all optional but those of its source:
+    """A device without cyclic duty. Its keys in services.toml, all optional but those of its
+    source:
 
-    `rover`: file of numbers beside services.toml (default: the shipped one); `rate`: images/s (default: the file's);
-    `threads`: for OpenCV (default 1: cores are shared with other nodes).
+    `rover`: file of numbers beside services.toml (default: the shipped one); `rate`: images/s
+    (default: the file's); `threads`: for OpenCV (default 1: cores are shared with other nodes).
     """
 
     period: float | None = None
@@ -35,7 +37,10 @@ class FloorCamera:
         self.floor = FloorWatch.of(rover)
         self.usual_rate = float(config.get("rate", rover.camera.rate))
         if not 0.0 < self.usual_rate <= 1000.0:
-            raise CameraError(f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, such as 25")
+            raise CameraError(
+                f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, "
+                "such as 25"
+            )
         self._rate = 0.0
         self._count = 0
         self._newest: Image | None = None
@@ -61,7 +66,8 @@ class FloorCamera:
         self._rate, self._newest = 0.0, None
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
-        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError for one of another size."""
+        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError
+        for one of another size."""
         await ctx.wait(self._arrived, timeout)
         image, self._newest = self._newest, None
         if image is None:
@@ -70,7 +76,8 @@ class FloorCamera:
         if image.pixels.shape != (view.height, view.width):
             high, wide = image.pixels.shape
             raise CameraError(
-                f"the camera gives {wide}x{high} images, its numbers say {view.width}x{view.height}: "
+                f"the camera gives {wide}x{high} images, its numbers say "
+                f"{view.width}x{view.height}: "
                 f"change [camera] of {NOMINAL} or the camera's settings"
             )
         self._count += 1

@@ -1,7 +1,8 @@
-"""Places in scan rows that look like the track: polarity-free, since its colour changes from square to square.
+"""Places in scan rows that look like the track: polarity-free, since its colour changes from square
+to square.
 
-Two ways: pairs of opposite edges a track's width apart, and ridges, bright or dark, of that width. A single edge (of a
-square, of a shadow) is neither.
+Two ways: pairs of opposite edges a track's width apart, and ridges, bright or dark, of that width.
+A single edge (of a square, of a shadow) is neither.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.floor import ScanGrid
+from petrobot.services.mobile.floor import ScanGrid
 
 Vector = NDArray[np.float64]
 Grey = NDArray[np.float32]
@@ -41,11 +42,15 @@ def contrast_threshold(samples: Grey) -> float:
 
 def edge_pairs(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
     """Middles of pairs of opposite edges about `width` (m) apart."""
-    gradient = samples[:, 4:] - samples[:, :-4]  # the rise over 25 mm: edges are blurred by optics and motion
+    gradient = (
+        samples[:, 4:] - samples[:, :-4]
+    )  # the rise over 25 mm: edges are blurred by optics and motion
     size = np.abs(gradient)
     size[~(grid.seen[:, 4:] & grid.seen[:, :-4])] = 0.0
     middle = size[:, 1:-1]
-    peak = (middle > contrast_threshold(samples)) & (middle >= size[:, :-2]) & (middle > size[:, 2:])
+    peak = (
+        (middle > contrast_threshold(samples)) & (middle >= size[:, :-2]) & (middle > size[:, 2:])
+    )
     row, column = np.nonzero(peak)
     if row.size < 2:
         return Candidates(row[:0], np.empty(0), np.empty(0))
@@ -61,7 +66,12 @@ def edge_pairs(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
 
 
 def _paired(
-    row: NDArray[np.intp], place: Vector, sign: NDArray[np.bool_], size: Grey, gap: int, width: float
+    row: NDArray[np.intp],
+    place: Vector,
+    sign: NDArray[np.bool_],
+    size: Grey,
+    gap: int,
+    width: float,
 ) -> tuple[NDArray[np.intp], Vector, Vector]:
     """Edges that are `gap` apart in the list and may be the two sides of a track."""
     apart = place[gap:] - place[:-gap]
@@ -73,9 +83,11 @@ def _paired(
 
 
 def ridge_strength(grid: ScanGrid, samples: Grey, width: float) -> Grey:
-    """How far (grey levels) each spot differs from both its sides, the lesser of the two; 0 where they differ oppositely.
+    """How far (grey levels) each spot differs from both its sides, the lesser of the two; 0 where
+    they differ oppositely.
 
-    The absolute second difference of a row, made blind to steps: at a step one of the two differences vanishes.
+    The absolute second difference of a row, made blind to steps: at a step one of the two
+    differences vanishes.
     """
     side = round(width / grid.step)
     core = max(1, round(0.3 * width / grid.step))
@@ -91,7 +103,8 @@ def ridge_strength(grid: ScanGrid, samples: Grey, width: float) -> Grey:
 
 
 def ridges(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
-    """Middles of ridges of about `width` (m): peaks of `ridge_strength`, each at its centre of gravity."""
+    """Middles of ridges of about `width` (m): peaks of `ridge_strength`, each at its centre of
+    gravity."""
     strength = ridge_strength(grid, samples, width)
     reach = max(1, round(0.5 * width / grid.step))
     middle = strength[:, reach:-reach]

@@ -1,7 +1,8 @@
 """Finding the track in an image, four ways of different cost and reliability.
 
-All look at scan rows of the floor (see `ScanGrid`) and give the centre line as points of the body frame. `expected` is the
-line of the image before, if there was one: then only what goes on with it counts.
+All look at scan rows of the floor (see `ScanGrid`) and give the centre line as points of the body
+frame. `expected` is the line of the image before, if there was one: then only what goes on with it
+counts.
 """
 
 from __future__ import annotations
@@ -12,14 +13,21 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.candidates import Candidates, contrast_threshold, edge_pairs, ridge_strength, ridges
-from services.mobile.floor import Grey, ScanGrid
-from services.mobile.sight import UNSEEN, Line, Sight, Vector, polynomial
+from petrobot.services.mobile.candidates import (
+    Candidates,
+    contrast_threshold,
+    edge_pairs,
+    ridge_strength,
+    ridges,
+)
+from petrobot.services.mobile.floor import Grey, ScanGrid
+from petrobot.services.mobile.sight import UNSEEN, Line, Sight, Vector, polynomial
 
 GATE = 0.07
 """m that the line may be off the one expected."""
 STEP_GATE = 0.016
-"""m that a point may be off the line drawn through those before it, and STEP_SLOPE m more for each metre onwards."""
+"""m that a point may be off the line drawn through those before it, and STEP_SLOPE m more for each
+metre onwards."""
 STEP_SLOPE = 0.55
 GAP = 0.13
 """m without a sight after which a line counts as broken off: square edges and glare hide less."""
@@ -41,12 +49,14 @@ class Detector(Protocol):
 
 
 def detect_edges(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
-    """Pairs of opposite edges, chained from near to far: the cheapest and most accurate on clean paint."""
+    """Pairs of opposite edges, chained from near to far: the cheapest and most accurate on clean
+    paint."""
     return chain(grid, edge_pairs(grid, samples, width), expected)
 
 
 def detect_ridge(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
-    """Ridges of the absolute second difference, chained from near to far: averages noise over the track's width."""
+    """Ridges of the absolute second difference, chained from near to far: averages noise over the
+    track's width."""
     return chain(grid, ridges(grid, samples, width), expected)
 
 
@@ -63,7 +73,8 @@ class _Chain:
         return self.y[-1] + self.slope * (x - self.x[-1])
 
     def add(self, x: float, y: float) -> None:
-        """Take a point; the slope follows the points of the last tenth of a metre and turns on with them."""
+        """Take a point; the slope follows the points of the last tenth of a metre and turns on with
+        them."""
         self.x.append(x)
         self.y.append(y)
         back = len(self.x) - 1
@@ -79,7 +90,8 @@ class _Chain:
 
 
 def chain(grid: ScanGrid, candidates: Candidates, expected: Line | None) -> Sight:
-    """The best line through candidates: each row's nearest to where the line should be, from the nearest rows on."""
+    """The best line through candidates: each row's nearest to where the line should be, from the
+    nearest rows on."""
     rows = _by_row(grid, candidates)
     begun = _seeds(grid, rows, expected)
     best: _Chain | None = None
@@ -99,7 +111,9 @@ def _by_row(grid: ScanGrid, candidates: Candidates) -> list[list[float]]:
     return rows
 
 
-def _seeds(grid: ScanGrid, rows: list[list[float]], expected: Line | None) -> list[tuple[_Chain, int]]:
+def _seeds(
+    grid: ScanGrid, rows: list[list[float]], expected: Line | None
+) -> list[tuple[_Chain, int]]:
     """Beginnings of lines with the row after which each goes on."""
     seeds: list[tuple[_Chain, int]] = []
     x = grid.rows
@@ -123,7 +137,9 @@ def _seeds(grid: ScanGrid, rows: list[list[float]], expected: Line | None) -> li
     return seeds
 
 
-def _pairs_on(x: tuple[float, ...], rows: list[list[float]], i: int, y: float) -> list[tuple[_Chain, int]]:
+def _pairs_on(
+    x: tuple[float, ...], rows: list[list[float]], i: int, y: float
+) -> list[tuple[_Chain, int]]:
     """Lines from a place to each place of the next rows that is not too far aside."""
     for j in range(i + 1, min(i + 4, len(x))):
         slopes = [(other - y) / (x[j] - x[i]) for other in rows[j]]
@@ -171,7 +187,7 @@ def _broke_off(grid: ScanGrid, line: _Chain) -> bool:
     return 0 < column < grid.y.size and bool(grid.seen[min(row, grid.x.size - 1), column])
 
 
-# --- whole-line fits -----------------------------------------------------------------------------------------------------
+# --- whole-line fits --------------------------------------------------------------------------
 
 WINDOW = 0.55
 """m of line to which a parabola is fitted as a whole."""
@@ -182,9 +198,11 @@ DRAWS = 60
 
 
 def consensus(random: Callable[[], np.random.Generator]) -> Detector:
-    """A detector that fits a parabola to edge pairs by random sample consensus (Fischler and Bolles 1981).
+    """A detector that fits a parabola to edge pairs by random sample consensus (Fischler and Bolles
+    1981).
 
-    It finds the line among many false pairs, where a chain may take a wrong one; `random` gives the generator to draw from.
+    It finds the line among many false pairs, where a chain may take a wrong one; `random` gives the
+    generator to draw from.
     """
 
     def detect(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
@@ -211,36 +229,44 @@ def _plausible(grid: ScanGrid, found: Candidates, expected: Line | None) -> NDAr
     if expected is not None:
         d = x - expected.near
         keep &= (
-            np.abs(expected.offset + expected.slope * d + 0.5 * expected.bend * d * d - found.y) < 1.5 * GATE + 0.3 * d
+            np.abs(expected.offset + expected.slope * d + 0.5 * expected.bend * d * d - found.y)
+            < 1.5 * GATE + 0.3 * d
         )
     return keep
 
 
 def _through(x: Vector, y: Vector, picks: NDArray[np.int64]) -> Vector:
-    """Parabolas [c0, c1, c2] through triples of points that are apart, not too steep and not too bent (k, 3)."""
+    """Parabolas [c0, c1, c2] through triples of points that are apart, not too steep and not too
+    bent (k, 3)."""
     px, py = x[picks], y[picks]
     apart = np.minimum(
-        np.minimum(np.abs(px[:, 0] - px[:, 1]), np.abs(px[:, 1] - px[:, 2])), np.abs(px[:, 0] - px[:, 2])
+        np.minimum(np.abs(px[:, 0] - px[:, 1]), np.abs(px[:, 1] - px[:, 2])),
+        np.abs(px[:, 0] - px[:, 2]),
     )
     ok = apart > 0.05
     px, py = px[ok], py[ok]
     if px.size == 0:
         return np.empty((0, 3))
-    curves = np.linalg.solve(np.stack([np.ones_like(px), px, px * px], axis=2), py[:, :, None])[:, :, 0]
+    curves = np.linalg.solve(np.stack([np.ones_like(px), px, px * px], axis=2), py[:, :, None])[
+        :, :, 0
+    ]
     slope = curves[:, 1] + 2.0 * curves[:, 2] * px.min(axis=1)
     kept: Vector = curves[(np.abs(slope) < STEEPEST) & (np.abs(curves[:, 2]) < 2.5)]
     return kept
 
 
 def chain_about(grid: ScanGrid, found: Candidates, curve: Vector) -> Sight:
-    """The line that goes on from a parabola's inliers: they seed a chain, so that it is followed beyond the window."""
+    """The line that goes on from a parabola's inliers: they seed a chain, so that it is followed
+    beyond the window."""
     x = grid.x[found.row]
     inlier = np.abs(curve[0] + curve[1] * x + curve[2] * x * x - found.y) < INLIER
     if int(inlier.sum()) < 5:
         return UNSEEN
     near = float(x[inlier].min())
     slope, bend = float(curve[1] + 2.0 * curve[2] * near), float(2.0 * curve[2])
-    line = Line(near, near + WINDOW, float(curve[0] + curve[1] * near + curve[2] * near * near), slope, bend)
+    line = Line(
+        near, near + WINDOW, float(curve[0] + curve[1] * near + curve[2] * near * near), slope, bend
+    )
     return chain(grid, found, line)
 
 
@@ -250,10 +276,11 @@ BENDS = np.array([-1.6, -0.8, 0.0, 0.8, 1.6])
 
 
 class TemplateBank:
-    """A detector that tries whole lines: parabolas on a lattice of offset, slope and bend, scored by ridge strength.
+    """A detector that tries whole lines: parabolas on a lattice of offset, slope and bend, scored
+    by ridge strength.
 
-    Every row votes, so noise and dim light matter least; it costs most, and bends between the lattice's are refined by a
-    weighted fit around the best one.
+    Every row votes, so noise and dim light matter least; it costs most, and bends between the
+    lattice's are refined by a weighted fit around the best one.
     """
 
     def __init__(self) -> None:
@@ -267,7 +294,9 @@ class TemplateBank:
         votes = np.minimum(strength[: self._rows], np.float32(contrast_threshold(samples)))
         score = votes.ravel().take(self._at).sum(axis=1)
         if expected is not None:
-            score = np.where(np.abs(self._start - expected.at(float(grid.x[0]))) < GATE + 0.02, score, 0.0)
+            score = np.where(
+                np.abs(self._start - expected.at(float(grid.x[0]))) < GATE + 0.02, score, 0.0
+            )
         best = int(score.argmax())
         if score[best] < 0.5 * self._rows * contrast_threshold(samples):
             return UNSEEN
@@ -277,7 +306,9 @@ class TemplateBank:
         """Columns of each parabola in each row, for this grid."""
         self._grid, self._rows = grid, int(np.searchsorted(grid.x, grid.x[0] + WINDOW))
         d = grid.x[: self._rows] - grid.x[0]
-        offset, slope, bend = (a.ravel() for a in np.meshgrid(OFFSETS, SLOPES, BENDS, indexing="ij"))
+        offset, slope, bend = (
+            a.ravel() for a in np.meshgrid(OFFSETS, SLOPES, BENDS, indexing="ij")
+        )
         y = offset[:, None] + slope[:, None] * d + 0.5 * bend[:, None] * d * d
         inside = np.abs(y).max(axis=1) < grid.y[-1]
         y, self._start = y[inside], offset[inside]
@@ -286,11 +317,14 @@ class TemplateBank:
         self._at = np.arange(self._rows, dtype=np.intp)[None, :] * grid.y.size + column
 
     def _refined(self, grid: ScanGrid, strength: Grey, best: int) -> Sight:
-        """Centres of gravity around the best parabola, smoothed by a weighted fit, and the line beyond it."""
+        """Centres of gravity around the best parabola, smoothed by a weighted fit, and the line
+        beyond it."""
         rows = np.arange(self._rows)
         half = round(0.04 / grid.step)
         columns = np.rint((self._lines[best] - grid.y[0]) / grid.step).astype(np.intp)
-        columns = np.clip(columns[:, None] + np.arange(-half, half + 1)[None, :], 0, grid.y.size - 1)
+        columns = np.clip(
+            columns[:, None] + np.arange(-half, half + 1)[None, :], 0, grid.y.size - 1
+        )
         weight = strength[rows[:, None], columns].astype(float)
         mass = weight.sum(axis=1)
         heavy = mass > 0.25 * mass.max()
@@ -320,5 +354,7 @@ LEAST_RIDGE = 20.0
 
 def _joined(a: Candidates, b: Candidates) -> Candidates:
     return Candidates(
-        np.concatenate([a.row, b.row]), np.concatenate([a.y, b.y]), np.concatenate([a.strength, b.strength])
+        np.concatenate([a.row, b.row]),
+        np.concatenate([a.y, b.y]),
+        np.concatenate([a.strength, b.strength]),
     )

@@ -1,7 +1,9 @@
-"""The rover's primitive actions: enable the drives, follow the track, recover it across an interruption, search, stop at the T.
+"""The rover's primitive actions: enable the drives, follow the track, recover it across an
+interruption, search, stop at the T.
 
-All are coroutines that see the driver only through `ctx.device`, a `Remote` of `services.mobile.rover:Rover`. Error causes:
-`drive_fault`, `power`, `bus` (as the driver says), `stale_set_point`, `no_line`, `refused`, `timeout`.
+All are coroutines that see the driver only through `ctx.device`, a `Remote` of
+`petrobot.services.mobile.rover:Rover`. Error causes: `drive_fault`, `power`, `bus` (as the driver
+says), `stale_set_point`, `no_line`, `refused`, `timeout`.
 """
 
 from __future__ import annotations
@@ -10,17 +12,18 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
-from services.action import Cancelled, Context, Result, error, failure, success
-from services.mobile import paths
-from services.mobile.odometry import Pose, turned
-from services.mobile.sight import TrackEnd
+from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.mobile import paths
+from petrobot.services.mobile.odometry import Pose, turned
+from petrobot.services.mobile.sight import TrackEnd
 
 RENEW: Final = 0.1
 """s between repeated motion commands: a driver that hears none for 0.4 s rests."""
 ANSWER: Final = 0.5
 """s within which the driver takes a command."""
 TAKE_OVER: Final = 0.34
-"""m before the end of the line at which following has done its part: what comes next begins on the move."""
+"""m before the end of the line at which following has done its part: what comes next begins on the
+move."""
 BEYOND: Final = 0.6
 """m that a plan goes on straight where the track should have been found."""
 ROLLED: Final = 0.3
@@ -48,7 +51,8 @@ Judge = Callable[[Mapping[str, Any]], Result | None]
 
 
 async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = False) -> Result:
-    """Reset faults and enable both drives; the rover stands. ERROR as the driver says if they stay in fault.
+    """Reset faults and enable both drives; the rover stands. ERROR as the driver says if they stay
+    in fault.
 
     With `forget` the map of the track is emptied: the rover has been carried elsewhere.
     """
@@ -60,26 +64,36 @@ async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = Fa
         await _command(ctx, {"do": "forget"})
         await _command(ctx, {"do": "stretch"})
     if not await ctx.wait(lambda: bool(ctx.device.state["enabled"]), max(0.0, until - ctx.now)):
-        return _trouble(ctx.device.state) or error("timeout", f"the drives were not enabled within {timeout} s")
+        return _trouble(ctx.device.state) or error(
+            "timeout", f"the drives were not enabled within {timeout} s"
+        )
     return success()
 
 
 async def follow_feed_forward(
     ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0
 ) -> Result:
-    """Follow the track to its end by its own curvature plus PD on the error at the axle. See `_follow`."""
+    """Follow the track to its end by its own curvature plus PD on the error at the axle. See
+    `_follow`."""
     return await _follow(ctx, "feed_forward", speed, timeout, patience)
 
 
-async def follow_pursuit(ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0) -> Result:
+async def follow_pursuit(
+    ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0
+) -> Result:
     """Follow the track to its end by pure pursuit of a point of it ahead. See `_follow`."""
     return await _follow(ctx, "pursuit", speed, timeout, patience)
 
 
 async def home_on_reflector(
-    ctx: Context, *, line_end: Sequence[float] | None = None, speed: float = 0.5, timeout: float = 25.0
+    ctx: Context,
+    *,
+    line_end: Sequence[float] | None = None,
+    speed: float = 0.5,
+    timeout: float = 25.0,
 ) -> Result:
-    """Recover the track by the reflector above the point where it resumes: drive the circle through it. See `_recover`.
+    """Recover the track by the reflector above the point where it resumes: drive the circle through
+    it. See `_recover`.
 
     FAILURE `no_reflector` when none answers from where the track can resume.
     """
@@ -99,7 +113,9 @@ async def home_on_reflector(
         await drive.until(lambda state: success() if found() else None, REFLECTOR_PATIENCE)
     if where is None:
         await drive.rest()
-        return failure("no_reflector", "no reflector answers from where the track can resume", recovered=False)
+        return failure(
+            "no_reflector", "no reflector answers from where the track can resume", recovered=False
+        )
     return await _along(drive, paths.arc_through(end, *where, BEYOND))
 
 
@@ -111,7 +127,8 @@ async def dead_reckon(
     curvature: float = 0.0,
     timeout: float = 25.0,
 ) -> Result:
-    """Recover the track by driving on along the curve that the missing element is expected to have. See `_recover`.
+    """Recover the track by driving on along the curve that the missing element is expected to have.
+    See `_recover`.
 
     `curvature` (1/m, to the left positive): 0 expects a straight, 1 or -1 a quarter arc.
     """
@@ -123,7 +140,9 @@ async def dead_reckon(
     square, _ = ctx.device.state["element"]
     length = square if curvature == 0.0 else 0.5 * math.pi / abs(curvature)
     last = Pose(*paths.arc(end, curvature, length)[-1], end.heading + curvature * length)
-    return await _along(drive, paths.arc(end, curvature, length) + paths.arc(last, 0.0, BEYOND - 0.2))
+    return await _along(
+        drive, paths.arc(end, curvature, length) + paths.arc(last, 0.0, BEYOND - 0.2)
+    )
 
 
 async def search_pattern(
@@ -134,10 +153,11 @@ async def search_pattern(
     rate: float = 1.2,
     timeout: float = 60.0,
 ) -> Result:
-    """Recover the track by going into the empty square and looking straight on, to the left and to the right.
+    """Recover the track by going into the empty square and looking straight on, to the left and to
+    the right.
 
-    Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. A rover that stands looks around
-    where it is first: the line may be in view. See `_recover`.
+    Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. A rover
+    that stands looks around where it is first: the line may be in view. See `_recover`.
     """
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
@@ -153,8 +173,11 @@ async def search_pattern(
     return ended or failure("no_track", "the track is not where it can resume", recovered=False)
 
 
-async def stop_at_t(ctx: Context, *, line_end: Sequence[float], speed: float = 0.35, timeout: float = 12.0) -> Result:
-    """Come to stand with the axle just behind the T's bar. SUCCESS when standing within 0.3 m of it; ERROR as the driver says."""
+async def stop_at_t(
+    ctx: Context, *, line_end: Sequence[float], speed: float = 0.35, timeout: float = 12.0
+) -> Result:
+    """Come to stand with the axle just behind the T's bar. SUCCESS when standing within 0.3 m of
+    it; ERROR as the driver says."""
     end = Pose(*map(float, line_end))
     drive = _Drive(ctx, "feed_forward", speed, timeout)
     stuck = await drive.start((), look=False)
@@ -170,7 +193,10 @@ async def stop_at_t(ctx: Context, *, line_end: Sequence[float], speed: float = 0
     ahead, aside = end.body(x, y)
     if not (-0.1 < ahead < 0.3 and abs(aside) < 0.3):
         return failure(
-            "off_the_t", f"stands {ahead:.2f} m beyond and {aside:.2f} m beside the T", ahead=ahead, aside=aside
+            "off_the_t",
+            f"stands {ahead:.2f} m beyond and {aside:.2f} m beside the T",
+            ahead=ahead,
+            aside=aside,
         )
     return success(ahead=ahead, aside=aside)
 
@@ -182,16 +208,21 @@ def _stands(state: Mapping[str, Any]) -> bool:
 async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience: float) -> Result:
     """Follow the streamed track until its end is near; the rover rolls on for what comes next.
 
-    SUCCESS: `at_t` says whether the T or an interruption ends it, `line_end` where (pose in the odometry frame). FAILURE
-    `unannounced_end` (same values) when the line just ceased. ERROR: `no_line` when none was seen within `patience` s,
-    `stale_set_point` when the stream ceased, or as the driver says.
+    SUCCESS: `at_t` says whether the T or an interruption ends it, `line_end` where (pose in the
+    odometry frame). FAILURE `unannounced_end` (same values) when the line just ceased. ERROR:
+    `no_line` when none was seen within `patience` s, `stale_set_point` when the stream ceased, or
+    as the driver says.
     """
     drive = _Drive(ctx, law, speed, timeout)
     begun, way = ctx.now, ctx.device.state["way"]
     lost: dict[str, float] = {}
 
     def judge(state: Mapping[str, Any]) -> Result | None:
-        if state["end"] is not None and state["ahead"] < TAKE_OVER and state["line_end"] is not None:
+        if (
+            state["end"] is not None
+            and state["ahead"] < TAKE_OVER
+            and state["line_end"] is not None
+        ):
             return success(at_t=state["end"] == TrackEnd.T, line_end=list(state["line_end"]))
         why = state["reason"]
         if why not in ("no_line", "stale") or not state["standing"]:
@@ -204,7 +235,9 @@ async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience
         if why == "stale":
             return error("stale_set_point", f"the stream of sights has ceased for {stuck:.1f} s")
         if state["way"] - way > ROLLED and state["line_end"] is not None:
-            return failure("unannounced_end", "the line ceased", at_t=False, line_end=list(state["line_end"]))
+            return failure(
+                "unannounced_end", "the line ceased", at_t=False, line_end=list(state["line_end"])
+            )
         return error("no_line", f"no line to follow for {stuck:.1f} s")
 
     try:
@@ -232,12 +265,17 @@ def _recovered(state: Mapping[str, Any]) -> Result | None:
     if state["regained"]:
         return success(recovered=True)
     if state["standing"] and (state["ahead"] < 0.08 or state["reason"] == "no_line"):
-        return failure("no_track", "the way expected has been driven to its end and no track was seen", recovered=False)
+        return failure(
+            "no_track",
+            "the way expected has been driven to its end and no track was seen",
+            recovered=False,
+        )
     return None
 
 
 async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
-    """Go to a place by turning towards it and driving straight; None when there, else how the run ends."""
+    """Go to a place by turning towards it and driving straight; None when there, else how the run
+    ends."""
     ctx = drive.ctx
     x, y, heading = ctx.device.state["pose"]
     away = math.hypot(to.x - x, to.y - y)
@@ -266,7 +304,8 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
 
 
 async def _turn(drive: _Drive, heading: float, rate: float, *, look: bool = False) -> Result | None:
-    """Turn on the spot to a heading (rad, odometry frame), with `look` until the track is seen; None when done."""
+    """Turn on the spot to a heading (rad, odometry frame), with `look` until the track is seen;
+    None when done."""
     ended = await drive.until(
         lambda state: success() if _turned(state) or (look and state["sights"] > 1) else None,
         min(8.0, drive.left()),
@@ -290,7 +329,8 @@ async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
 
 
 async def _where_it_stands(drive: _Drive) -> Result | None:
-    """Look without a move; drive to the track if it is there. None when it is not, or the rover still rolls."""
+    """Look without a move; drive to the track if it is there. None when it is not, or the rover
+    still rolls."""
     ctx = drive.ctx
     if not ctx.device.state["standing"]:
         return None
@@ -299,7 +339,8 @@ async def _where_it_stands(drive: _Drive) -> Result | None:
 
 
 async def _join(drive: _Drive) -> Result | None:
-    """Drive to the track where it was seen to begin; None if it was not seen, or is not there after all."""
+    """Drive to the track where it was seen to begin; None if it was not seen, or is not there after
+    all."""
     state = drive.ctx.device.state
     if not state["sights"]:
         return None
@@ -312,7 +353,8 @@ async def _join(drive: _Drive) -> Result | None:
 
 
 class _Drive:
-    """Repeats the motion command as the driver asks for, and looks at its state whenever there is something new."""
+    """Repeats the motion command as the driver asks for, and looks at its state whenever there is
+    something new."""
 
     def __init__(self, ctx: Context, law: str, speed: float, timeout: float) -> None:
         self.ctx = ctx
@@ -325,7 +367,8 @@ class _Drive:
         return max(0.0, self._until - self.ctx.now)
 
     async def start(self, gates: Sequence[Pose], *, look: bool = True) -> Result | None:
-        """Begin a new stretch that leads through one of the gates; how the run ends if the driver refuses."""
+        """Begin a new stretch that leads through one of the gates; how the run ends if the driver
+        refuses."""
         self._stretch |= {"gates": [tuple(gate) for gate in gates], "look": look}
         return await self.again()
 
@@ -338,8 +381,11 @@ class _Drive:
         """Brake and stand."""
         await _command(self.ctx, {"do": "rest"})
 
-    async def until(self, judge: Judge, timeout: float, body: Mapping[str, Any] | None = None) -> Result:
-        """Go on until `judge(state)` gives a result, the driver is in trouble, or `timeout` s are over."""
+    async def until(
+        self, judge: Judge, timeout: float, body: Mapping[str, Any] | None = None
+    ) -> Result:
+        """Go on until `judge(state)` gives a result, the driver is in trouble, or `timeout` s are
+        over."""
         ctx, wanted = self.ctx, body or self._follow
         until, renewed = ctx.now + timeout, -math.inf
         while ctx.now <= until:
@@ -357,15 +403,21 @@ class _Drive:
         return error("timeout", f"nothing came of it in {timeout:.1f} s")
 
 
-def _geometry(ctx: Context, line_end: Sequence[float] | None) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
-    """The line's end (where the rover is, if none was ever known) and where the track can resume."""
+def _geometry(
+    ctx: Context, line_end: Sequence[float] | None
+) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
+    """The line's end (where the rover is, if none was ever known) and where the track can
+    resume."""
     state = ctx.device.state
     end = Pose(*map(float, state["pose"] if line_end is None else line_end))
     return end, paths.resume_poses(end, *state["element"])
 
 
-def _marked(reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]) -> tuple[float, float] | None:
-    """The reflector above one of the places where the track can resume: the one nearest to such a place and heard of late."""
+def _marked(
+    reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]
+) -> tuple[float, float] | None:
+    """The reflector above one of the places where the track can resume: the one nearest to such a
+    place and heard of late."""
     best: tuple[float, float, float] | None = None
     for x, y, _, age in reflectors:
         off = min(math.hypot(x - gate.x, y - gate.y) for gate in gates) + STALENESS * age
@@ -383,7 +435,8 @@ def _trouble(state: Mapping[str, Any]) -> Result | None:
 
 
 async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
-    """Send a command and wait until the driver has taken it; gives why it was refused, empty if it was not."""
+    """Send a command and wait until the driver has taken it; gives why it was refused, empty if it
+    was not."""
     number = ctx.device.send(body)
     if not await ctx.wait(lambda: ctx.device.handled >= number, ANSWER):
         return "the driver does not answer"

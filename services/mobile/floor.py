@@ -1,8 +1,9 @@
-"""The floor as the camera sees it: which pixel shows which spot, and samples of an image along lines of the floor.
+"""The floor as the camera sees it: which pixel shows which spot, and samples of an image along
+lines of the floor.
 
-Body frame: origin on the floor below the middle of the axle, x forward, y to the left (m). The camera looks along x and is
-only pitched, so an image row shows the floor at one distance x, and along a row y is linear in the column: no image has
-to be warped to see the floor from above.
+Body frame: origin on the floor below the middle of the axle, x forward, y to the left (m). The
+camera looks along x and is only pitched, so an image row shows the floor at one distance x, and
+along a row y is linear in the column: no image has to be warped to see the floor from above.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.model import CameraModel
+from petrobot.services.mobile.model import CameraModel
 
 Vector = NDArray[np.float64]
 Grey = NDArray[np.float32]
@@ -73,7 +74,8 @@ class FloorView:
 
 @dataclass(frozen=True)
 class ScanGrid:
-    """Where scan rows are sampled: distances `x` (rows,) and sideways places `y` (columns,) in m, ascending."""
+    """Where scan rows are sampled: distances `x` (rows,) and sideways places `y` (columns,) in m,
+    ascending."""
 
     x: Vector
     y: Vector
@@ -85,8 +87,15 @@ class ScanGrid:
     """`x` as plain numbers."""
 
     @staticmethod
-    def of(view: FloorView, far: float, spacing: float = 0.03, step: float = 0.00625, reach: float = 0.6) -> ScanGrid:
-        """Image rows about `spacing` apart on the floor up to `far`, sampled every `step` to `reach` on both sides (m)."""
+    def of(
+        view: FloorView,
+        far: float,
+        spacing: float = 0.03,
+        step: float = 0.00625,
+        reach: float = 0.6,
+    ) -> ScanGrid:
+        """Image rows about `spacing` apart on the floor up to `far`, sampled every `step` to
+        `reach` on both sides (m)."""
         distances = view.distances()
         rows, last = [], -math.inf
         for row in range(view.height - 1, -1, -1):
@@ -111,7 +120,8 @@ class ScanGrid:
         return float(self.y[1] - self.y[0])
 
     def sample(self, image: NDArray[np.uint8]) -> Grey:
-        """Grey levels (rows, columns); the image's rim is repeated where it does not show the spot."""
+        """Grey levels (rows, columns); the image's rim is repeated where it does not show the
+        spot."""
         flat = image.ravel()
         left = flat.take(self._at).astype(np.float32)
         right = flat.take(self._at + 1).astype(np.float32)

@@ -1,4 +1,5 @@
-"""Following a line: laws that give the curvature to drive, and the speed that goes with it. Pure."""
+"""Following a line: laws that give the curvature to drive, and the speed that goes with it.
+Pure."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from services.mobile.track_map import Fit
+from petrobot.services.mobile.track_map import Fit
 
 Look = Callable[[float], Fit | None]
 """Gives the line so many metres ahead, body frame; None where it is not known."""
@@ -23,9 +24,11 @@ def capped(value: float, limit: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class PurePursuit:
-    """Drive the circle, tangent to the heading, that leads to the point of the line `distance` m away (Coulter 1992).
+    """Drive the circle, tangent to the heading, that leads to the point of the line `distance` m
+    away (Coulter 1992).
 
-    Needs neither direction nor curvature of the line, so it stands coarse sights; cuts where the curvature changes.
+    Needs neither direction nor curvature of the line, so it stands coarse sights; cuts where the
+    curvature changes.
     """
 
     distance: float = 0.34
@@ -45,11 +48,12 @@ class PurePursuit:
 
 @dataclass(frozen=True, slots=True)
 class FeedForward:
-    """The line's own curvature where the wheels will have answered, plus PD on the error at the axle.
+    """The line's own curvature where the wheels will have answered, plus PD on the error at the
+    axle.
 
-    With kappa = kappa_line + p e + d sin(heading error) the error obeys e'' + d e' + p e = 0 along the way: critically damped for
-    d = 2 sqrt(p), for which the wheels' lag asks for a little more. The way in which it dies out, 1 / sqrt(p) m, does not depend
-    on the speed.
+    With kappa = kappa_line + p e + d sin(heading error) the error obeys e'' + d e' + p e = 0 along
+    the way: critically damped for d = 2 sqrt(p), for which the wheels' lag asks for a little more.
+    The way in which it dies out, 1 / sqrt(p) m, does not depend on the speed.
     """
 
     gain: float = 60.0
@@ -57,9 +61,11 @@ class FeedForward:
     lead: float = 0.09
     """s from a set point until the wheels have answered."""
     bent: float = 1.2
-    """1/m that a line is believed to be curved at most: the track's arcs have 1 m radius, what seems tighter is a kink."""
+    """1/m that a line is believed to be curved at most: the track's arcs have 1 m radius, what
+    seems tighter is a kink."""
     steepest: float = 0.5
-    """Sine of the angle at which a line far aside is approached at most: the camera must not lose it."""
+    """Sine of the angle at which a line far aside is approached at most: the camera must not lose
+    it."""
 
     def curvature(self, look: Look, speed: float) -> float | None:
         """1/m, None where the line is not known at the axle and just ahead of it."""
@@ -72,7 +78,10 @@ class FeedForward:
         return capped(bent + damping * (towards + math.sin(here.heading)), TIGHTEST)
 
 
-LAWS: Final[Mapping[str, PurePursuit | FeedForward]] = {"feed_forward": FeedForward(), "pursuit": PurePursuit()}
+LAWS: Final[Mapping[str, PurePursuit | FeedForward]] = {
+    "feed_forward": FeedForward(),
+    "pursuit": PurePursuit(),
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,9 @@
 """How the line ends: at the edge of a square that carries no track, or in the crossbar of the T.
 
-Both are looked for in a patch of floor around the line's last point, in columns beside the line: a crossbar is a stripe
-across it with the square's colour on both sides, the edge of a square a step in one straight line, farther out than a bar
-reaches. The colours do not matter, nor does a small error in the direction of the line: stripe and edge may be askew.
+Both are looked for in a patch of floor around the line's last point, in columns beside the line: a
+crossbar is a stripe across it with the square's colour on both sides, the edge of a square a step
+in one straight line, farther out than a bar reaches. The colours do not matter, nor does a small
+error in the direction of the line: stripe and edge may be askew.
 """
 
 from __future__ import annotations
@@ -12,14 +13,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.floor import FloorView, Grey
-from services.mobile.model import Track
-from services.mobile.sight import End, Sight, TrackEnd, Vector, polynomial
+from petrobot.services.mobile.floor import FloorView, Grey
+from petrobot.services.mobile.model import Track
+from petrobot.services.mobile.sight import End, Sight, TrackEnd, Vector, polynomial
 
 BACK, ON, STEP = 0.16, 0.26, 0.01
 """m before and after the last point of the line that are searched, and the step."""
 AT_LEAST, AT_MOST = -0.06, 0.20
-"""m from the line's last point to its end: rows are centimetres apart, and the last ones may have been missed."""
+"""m from the line's last point to its end: rows are centimetres apart, and the last ones may have
+been missed."""
 SURE = 0.012
 """m, root mean square, that a stripe or an edge may be off a straight line."""
 ASKEW = 0.45
@@ -28,7 +30,8 @@ LEAST_CONTRAST = 14.0
 CONTRAST_SHARE = 0.3
 """Share of the patch's range of grey that an edge or a stripe must have."""
 NEEDED = 3
-"""Columns on each side of the line that must show the stripe; edges that must be seen near the line and farther out."""
+"""Columns on each side of the line that must show the stripe; edges that must be seen near the line
+and farther out."""
 
 
 class EndFinder:
@@ -45,7 +48,8 @@ class EndFinder:
         self._s = np.arange(-BACK, ON + 1e-9, STEP)
 
     def judge(self, image: NDArray[np.uint8], sight: Sight) -> End | None:
-        """How a line that broke off ends; None when it is neither, or too little is in view to tell."""
+        """How a line that broke off ends; None when it is neither, or too little is in view to
+        tell."""
         if not (sight.seen and sight.broke_off):
             return None
         x, y, direction = _last(sight)
@@ -72,11 +76,17 @@ class EndFinder:
         s, t = self._s[None, :], self._aside[:, None]
         return self._view.sample(image, x + s * cos - t * sin, y + s * sin + t * cos)
 
-    def _stripe(self, grey: Grey, valid: NDArray[np.bool_], least: float) -> tuple[float | None, bool]:
-        """Where a crossbar's middle meets the line (m from its last point), None without one; and whether much looks like one."""
+    def _stripe(
+        self, grey: Grey, valid: NDArray[np.bool_], least: float
+    ) -> tuple[float | None, bool]:
+        """Where a crossbar's middle meets the line (m from its last point), None without one; and
+        whether much looks like one."""
         side = round(self._bar / STEP)
         core = (grey[:, :-2] + grey[:, 1:-1] + grey[:, 2:]) / np.float32(3.0)
-        left, right = core[:, side:-side] - core[:, : -2 * side], core[:, side:-side] - core[:, 2 * side :]
+        left, right = (
+            core[:, side:-side] - core[:, : -2 * side],
+            core[:, side:-side] - core[:, 2 * side :],
+        )
         lesser = np.minimum(np.abs(left), np.abs(right))
         size = np.where((left * right > 0.0) & valid[:, None], lesser, np.float32(0.0))
         best, place = _peaks(size, self._s[0] + (1 + side) * STEP)
@@ -90,7 +100,8 @@ class EndFinder:
         return (line[0] if fits else None), striped
 
     def _edge(self, grey: Grey, valid: NDArray[np.bool_], least: float) -> float | None:
-        """Where the edge of the square meets the line (m from its last point), None if there is none."""
+        """Where the edge of the square meets the line (m from its last point), None if there is
+        none."""
         size = np.where(valid[:, None], np.abs(grey[:, 3:] - grey[:, :-3]), np.float32(0.0))
         best, place = _peaks(size, self._s[0] + 1.5 * STEP)
         shows = (best > least) & valid
@@ -102,7 +113,8 @@ class EndFinder:
 
 
 def _peaks(size: Grey, first: float) -> tuple[Grey, Vector]:
-    """Each row's greatest value and its place (m), to a fraction of a step; column 0 lies at `first` (m)."""
+    """Each row's greatest value and its place (m), to a fraction of a step; column 0 lies at
+    `first` (m)."""
     row = np.arange(size.shape[0])
     best = np.clip(size.argmax(axis=1), 1, size.shape[1] - 2)
     before, at, after = size[row, best - 1], size[row, best], size[row, best + 1]
@@ -111,7 +123,8 @@ def _peaks(size: Grey, first: float) -> tuple[Grey, Vector]:
 
 
 def _straight(aside: Vector, place: Vector) -> tuple[list[float], float]:
-    """The straight line through points but for the worst one (at 0 and slope), and how far the rest is off it (m, rms)."""
+    """The straight line through points but for the worst one (at 0 and slope), and how far the rest
+    is off it (m, rms)."""
     line = polynomial(aside, place, 1)
     off = np.abs(place - line[0] - line[1] * aside)
     keep = np.arange(place.size) != int(off.argmax())

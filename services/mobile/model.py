@@ -13,7 +13,8 @@ NOMINAL = "rover.toml"
 
 
 class ModelError(ValueError):
-    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key and remedy."""
+    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key
+    and remedy."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,13 @@ class _Table:
         """From a file's tables. Raises ModelError."""
         table = tables.get(name)
         if not isinstance(table, Mapping):
-            raise ModelError(f"{source}: table [{name}] is missing; see the one that comes with petrobot, {NOMINAL}")
-        return cls(**{field.name: _number(table, name, field.name, source) for field in fields(cls)})
+            raise ModelError(
+                f"{source}: table [{name}] is missing; see the one that comes with petrobot, "
+                f"{NOMINAL}"
+            )
+        return cls(
+            **{field.name: _number(table, name, field.name, source) for field in fields(cls)}
+        )
 
 
 @dataclass(frozen=True)
@@ -117,7 +123,9 @@ def read_rover(text: str, source: str = NOMINAL) -> Rover:
 @lru_cache(maxsize=1)
 def nominal_rover() -> Rover:
     """The rover that comes with petrobot."""
-    return read_rover(files("services.mobile").joinpath(NOMINAL).read_text(encoding="utf-8"))
+    return read_rover(
+        files("petrobot.services.mobile").joinpath(NOMINAL).read_text(encoding="utf-8")
+    )
 
 
 def _number(table: Mapping[str, Any], name: str, key: str, source: str) -> Any:
@@ -125,7 +133,10 @@ def _number(table: Mapping[str, Any], name: str, key: str, source: str) -> Any:
     if key == "principal_px":
         if isinstance(value, list) and len(value) == 2 and all(_positive(v) for v in value):
             return float(value[0]), float(value[1])
-        raise ModelError(f"{source}: [{name}] {key} = {value!r}: give two positive numbers, column and row in pixels")
+        raise ModelError(
+            f"{source}: [{name}] {key} = {value!r}: give two positive numbers, column and "
+            "row in pixels"
+        )
     if value is None or not _positive(value):
         raise ModelError(f"{source}: [{name}] {key} = {value!r}: a positive number is needed")
     return float(value)

@@ -1,4 +1,5 @@
-"""Where the rover is, by its wheels: pose in a frame of its own (the odometry frame), and where it was a moment ago."""
+"""Where the rover is, by its wheels: pose in a frame of its own (the odometry frame), and where it
+was a moment ago."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def turned(angle: float) -> float:
 
 
 class Odometry:
-    """Integrates the ways of both wheels. `track_width` is the distance between their contact points (m)."""
+    """Integrates the ways of both wheels. `track_width` is the distance between their contact
+    points (m)."""
 
     def __init__(self, track_width: float) -> None:
         self._width = track_width
@@ -55,7 +57,8 @@ class Odometry:
         self._history.append((now, self.pose))
 
     def at(self, time: float) -> Pose:
-        """The pose at a time (s) of the last second, interpolated; the oldest one known for earlier ones."""
+        """The pose at a time (s) of the last second, interpolated; the oldest one known for earlier
+        ones."""
         later: tuple[float, Pose] | None = None
         for then, pose in reversed(self._history):
             if then <= time:

@@ -1,11 +1,12 @@
-"""Ways to plan where the track cannot be seen: arcs, straights and joins as points (m), and where a track may resume. Pure."""
+"""Ways to plan where the track cannot be seen: arcs, straights and joins as points (m), and where a
+track may resume. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from services.mobile.odometry import Pose, turned
+from petrobot.services.mobile.odometry import Pose, turned
 
 SPACING = 0.05
 """m between points."""
@@ -13,9 +14,11 @@ Points = list[tuple[float, float]]
 
 
 def resume_poses(end: Pose, square: float, radius: float) -> tuple[Pose, Pose, Pose]:
-    """Where the track goes on beyond a square without one that is entered at `end`: straight on, to the left, to the right.
+    """Where the track goes on beyond a square without one that is entered at `end`: straight on, to
+    the left, to the right.
 
-    By the rules every element leads from the middle of one edge of its square to the middle of another.
+    By the rules every element leads from the middle of one edge of its square to the middle of
+    another.
     """
     ways = ((square, 0.0, 0.0), (radius, radius, 0.5 * math.pi), (radius, -radius, -0.5 * math.pi))
     return tuple(Pose(*end.floor(ahead, left), end.heading + turn) for ahead, left, turn in ways)  # type: ignore[return-value]
@@ -35,15 +38,21 @@ def _along(begin: Pose, curvature: float, way: float) -> tuple[float, float]:
 
 
 def arc_through(begin: Pose, x: float, y: float, beyond: float) -> Points:
-    """The circle tangent to a pose that leads through a point ahead of it, and `beyond` m straight on from there.
+    """The circle tangent to a pose that leads through a point ahead of it, and `beyond` m straight
+    on from there.
 
-    On a chessboard track it is the very element that is missing: whether straight or arc, it is tangent to the line's end.
+    On a chessboard track it is the very element that is missing: whether straight or arc, it is
+    tangent to the line's end.
     """
     ahead, left = begin.body(x, y)
     squared = ahead * ahead + left * left
     curvature = 2.0 * left / squared
     bearing = math.atan2(left, ahead)
-    length = math.sqrt(squared) if abs(bearing) < 1e-6 else math.sqrt(squared) * bearing / math.sin(bearing)
+    length = (
+        math.sqrt(squared)
+        if abs(bearing) < 1e-6
+        else math.sqrt(squared) * bearing / math.sin(bearing)
+    )
     there = Pose(x, y, begin.heading + 2.0 * bearing)
     return arc(begin, curvature, length) + arc(there, 0.0, beyond)
 
@@ -58,7 +67,10 @@ def join(begin: Pose, end: Pose, beyond: float) -> Points:
     """A cubic Hermite curve from one pose to another, and `beyond` m straight on."""
     size = math.hypot(end.x - begin.x, end.y - begin.y)
     count = max(4, round(size / SPACING))
-    a, b = (math.cos(begin.heading), math.sin(begin.heading)), (math.cos(end.heading), math.sin(end.heading))
+    a, b = (
+        (math.cos(begin.heading), math.sin(begin.heading)),
+        (math.cos(end.heading), math.sin(end.heading)),
+    )
     points: Points = []
     for i in range(count + 1):
         t = i / count
@@ -71,10 +83,12 @@ def join(begin: Pose, end: Pose, beyond: float) -> Points:
 
 
 def passes(points: Sequence[tuple[float, float]], gate: Pose, aside: float, turn: float) -> bool:
-    """Whether a line seen as points (near to far) leads through a gate: within `aside` m of it, `turn` rad of its heading.
+    """Whether a line seen as points (near to far) leads through a gate: within `aside` m of it,
+    `turn` rad of its heading.
 
-    The line counts as going on straight for half a metre before its first point and after its last. One that is seen the
-    other way round, by a rover that has gone too far and looks back, does not count: it would be followed backwards.
+    The line counts as going on straight for half a metre before its first point and after its last.
+    One that is seen the other way round, by a rover that has gone too far and looks back, does not
+    count: it would be followed backwards.
     """
     near, far = points[0], points[-1]
     direction = math.atan2(far[1] - near[1], far[0] - near[0])
@@ -82,7 +96,9 @@ def passes(points: Sequence[tuple[float, float]], gate: Pose, aside: float, turn
     begin = math.atan2(first[1] - near[1], first[0] - near[0])
     places = [Pose(*near, begin).floor(-0.5 + 0.1 * i, 0.0) for i in range(5)]
     places += [*points, *(Pose(*far, direction).floor(0.1 * i, 0.0) for i in range(1, 6))]
-    closest = min(range(len(places)), key=lambda i: math.hypot(places[i][0] - gate.x, places[i][1] - gate.y))
+    closest = min(
+        range(len(places)), key=lambda i: math.hypot(places[i][0] - gate.x, places[i][1] - gate.y)
+    )
     if math.hypot(places[closest][0] - gate.x, places[closest][1] - gate.y) > aside:
         return False
     i = min(closest, len(places) - 2)

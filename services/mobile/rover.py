@@ -1,10 +1,13 @@
-"""The rover's driver: every 20 ms it reads wheels and sensor, takes the newest sight of the track, and sets two wheel speeds.
+"""The rover's driver: every 20 ms it reads wheels and sensor, takes the newest sight of the track,
+and sets two wheel speeds.
 
-It follows its map of the track, whether the points in it were seen or are only planned; it turns on the spot; it rests. It
-never drives where the map does not reach, and rests when the stream is stale or the action that wanted the motion is silent.
+It follows its map of the track, whether the points in it were seen or are only planned; it turns on
+the spot; it rests. It never drives where the map does not reach, and rests when the stream is stale
+or the action that wanted the motion is silent.
 
-Commands: {"do": "follow", "law", "speed"} (repeat it within `LEASE` s), {"do": "plan", "points"}, {"do": "turn", "to", "rate"}
-(also repeated), {"do": "stretch"} (a new stretch begins), {"do": "forget"}, {"do": "rest"}, {"do": "reset"}, {"do": "disable"}.
+Commands: {"do": "follow", "law", "speed"} (repeat it within `LEASE` s), {"do": "plan", "points"},
+{"do": "turn", "to", "rate"} (also repeated), {"do": "stretch"} (a new stretch begins), {"do":
+"forget"}, {"do": "rest"}, {"do": "reset"}, {"do": "disable"}.
 """
 
 from __future__ import annotations
@@ -13,15 +16,15 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from services.device import Ports, Setpoint
-from services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
-from services.mobile.model import Rover as Numbers
-from services.mobile.model import nominal_rover, read_rover
-from services.mobile.odometry import Odometry, Pose, turned
-from services.mobile.reflectors import ReflectorMap, parse_echoes
-from services.mobile.sight import TrackAhead, TrackEnd
-from services.mobile.track_map import Fit, TrackMap
-from services.mobile.wheel_drives import Phase, WheelMaster
+from petrobot.services.device import Ports, Setpoint
+from petrobot.services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
+from petrobot.services.mobile.model import Rover as Numbers
+from petrobot.services.mobile.model import nominal_rover, read_rover
+from petrobot.services.mobile.odometry import Odometry, Pose, turned
+from petrobot.services.mobile.reflectors import ReflectorMap, parse_echoes
+from petrobot.services.mobile.sight import TrackAhead, TrackEnd
+from petrobot.services.mobile.track_map import Fit, TrackMap
+from petrobot.services.mobile.wheel_drives import Phase, WheelMaster
 
 LEASE: Final = 0.4
 """s after which a motion that nobody asks for again ends."""
@@ -39,8 +42,8 @@ TURNED: Final = 0.02
 END_REACH: Final = 0.45
 """m of line that tell its direction at its end."""
 REGAINED_SIGHTS: Final = 4
-"""Sights of a new stretch after which it can be followed, if it begins so many m ahead (not behind: the rover may have
-turned since), at most so many aside and so many rad askew."""
+"""Sights of a new stretch after which it can be followed, if it begins so many m ahead (not behind:
+the rover may have turned since), at most so many aside and so many rad askew."""
 REGAINED_AHEAD: Final = (0.2, 0.62)
 REGAINED_ASIDE: Final = 0.25
 REGAINED_TURN: Final = 0.6
@@ -49,20 +52,25 @@ DRIVES_SHARE: Final = 0.95
 
 
 class Rover:
-    """Driver of the rover (see `services.device.Driver`). Its keys in services.toml, all optional but those of its bus:
+    """Driver of the rover (see `services.device.Driver`). Its keys in services.toml, all optional
+    but those of its bus:
 
     `rover`: file of numbers beside services.toml (default: the shipped one).
     """
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:
         name = str(config.get("rover", ""))
-        self.numbers: Numbers = read_rover(ports.file(name).decode(), name) if name else nominal_rover()
+        self.numbers: Numbers = (
+            read_rover(ports.file(name).decode(), name) if name else nominal_rover()
+        )
         wheels, bus = self.numbers.wheels, self.numbers.bus
         self.period: float | None = bus.period
         self._ports = ports
         self._bus = ports.can()
         self._setpoint: Setpoint = ports.stream(STREAM)
-        self._master = WheelMaster(round(bus.left), round(bus.right), round(bus.sensor), bus.period, wheels.quick_stop)
+        self._master = WheelMaster(
+            round(bus.left), round(bus.right), round(bus.sensor), bus.period, wheels.quick_stop
+        )
         self._odometry = Odometry(wheels.track_width)
         self._map = TrackMap()
         self._reflectors = ReflectorMap(self.numbers.sensor, self.numbers.track.reflector_height)
@@ -91,10 +99,13 @@ class Rover:
     # Driver contract
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed now."""
+        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed
+        now."""
         act = self._commands.get(str(body.get("do")))
         if act is None:
-            raise ValueError(f"unknown command {body.get('do')!r}: know {', '.join(self._commands)}")
+            raise ValueError(
+                f"unknown command {body.get('do')!r}: know {', '.join(self._commands)}"
+            )
         act(now, body)
 
     def step(self, now: float) -> None:
@@ -142,7 +153,9 @@ class Rover:
             "element": (self.numbers.track.square, self.numbers.track.radius),
             "sensor": self._master.sensor_alive,
             "limited": self._master.limited,
-            "faults": [(t.cause, self._master.wheel(t), t.code, t.text) for t in self._master.troubles],
+            "faults": [
+                (t.cause, self._master.wheel(t), t.code, t.text) for t in self._master.troubles
+            ],
             "cycles": self._cycles,
         }
 
@@ -195,8 +208,12 @@ class Rover:
     def _stretch(self, body: Mapping[str, Any]) -> None:
         gates = body.get("gates", ())
         if any(len(gate) != 3 or not all(math.isfinite(c) for c in gate) for gate in gates):
-            raise ValueError("stretch: gates are poses of three finite numbers (m, m, rad, odometry frame)")
-        self._map.begin([Pose(*map(float, gate)) for gate in gates], look=bool(body.get("look", True)))
+            raise ValueError(
+                "stretch: gates are poses of three finite numbers (m, m, rad, odometry frame)"
+            )
+        self._map.begin(
+            [Pose(*map(float, gate)) for gate in gates], look=bool(body.get("look", True))
+        )
 
     def _forget(self, body: Mapping[str, Any]) -> None:
         if body.get("seen", True):
@@ -210,7 +227,10 @@ class Rover:
 
     def _ready(self, what: str) -> None:
         if not self._master.enabled:
-            troubles = "; ".join(trouble.text for trouble in self._master.troubles) or self._master.phase.value
+            troubles = (
+                "; ".join(trouble.text for trouble in self._master.troubles)
+                or self._master.phase.value
+            )
             raise ValueError(f"cannot {what}: the drives are not enabled ({troubles})")
 
     def _lease(self, now: float, mode: str) -> None:
@@ -305,16 +325,23 @@ class Rover:
         return self._set_wheels(self._speed, self._speed * capped(curvature, 1.5))
 
     def _set_wheels(self, speed: float, turning: float) -> tuple[float, float]:
-        """Wheel speeds (rad/s) with a lead over the wheels' lag, both scaled down when one is beyond what it can do."""
+        """Wheel speeds (rad/s) with a lead over the wheels' lag, both scaled down when one is
+        beyond what it can do."""
         wheels, period = self.numbers.wheels, self.numbers.bus.period
         half = 0.5 * wheels.track_width
-        left, right = (speed - turning * half) / wheels.wheel_radius, (speed + turning * half) / wheels.wheel_radius
+        left, right = (
+            (speed - turning * half) / wheels.wheel_radius,
+            (speed + turning * half) / wheels.wheel_radius,
+        )
         most = max(abs(left), abs(right)) / (DRIVES_SHARE * wheels.top_speed)
         if most > 1.0:
             left, right = left / most, right / most
         before, self._set = self._set, (left, right)
         steepest = wheels.acceleration
-        leads = (capped((new - old) / period, steepest) for new, old in zip(self._set, before, strict=True))
+        leads = (
+            capped((new - old) / period, steepest)
+            for new, old in zip(self._set, before, strict=True)
+        )
         lead_left, lead_right = (wheels.wheel_lag * lead for lead in leads)
         return left + lead_left, right + lead_right
 
@@ -335,7 +362,8 @@ class Rover:
         return None if fit is None else (*place, pose.heading + fit.heading)
 
     def _found_again(self) -> bool:
-        """Whether a stretch that was looked for has been seen often and lies well before the rover."""
+        """Whether a stretch that was looked for has been seen often and lies well before the
+        rover."""
         near = self._map.entry
         if not self._map.gated or self._map.sights < REGAINED_SIGHTS or near is None:
             return False

@@ -1,18 +1,25 @@
 """The camera's primitive actions: find the track in four ways, and watch it until it ends.
 
-All stream what each image shows as set points of `track_ahead` (`services.mobile.sight.TrackAhead`), also that it shows
-nothing: a stream that falls silent says that the camera is dead. Error causes: `no_line`, `no_image`, `bad_image`.
+All stream what each image shows as set points of `track_ahead`
+(`services.mobile.sight.TrackAhead`), also that it shows nothing: a stream that falls silent says
+that the camera is dead. Error causes: `no_line`, `no_image`, `bad_image`.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from services.action import Cancelled, Context, Result, error, failure, success
-from services.mobile.camera import CameraError, FloorCamera
-from services.mobile.detection import Detector, TemplateBank, consensus, detect_edges, detect_ridge
-from services.mobile.sight import Sight, TrackAhead, TrackEnd, thinned
-from services.mobile.watching import LineWatcher
+from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.mobile.camera import CameraError, FloorCamera
+from petrobot.services.mobile.detection import (
+    Detector,
+    TemplateBank,
+    consensus,
+    detect_edges,
+    detect_ridge,
+)
+from petrobot.services.mobile.sight import Sight, TrackAhead, TrackEnd, thinned
+from petrobot.services.mobile.watching import LineWatcher
 
 STREAM: Final = "track_ahead"
 CONFIRMED: Final = 3
@@ -36,36 +43,51 @@ async def find_ridge(ctx: Context, *, timeout: float = 30.0, image_timeout: floa
     return await _find(ctx, detect_ridge, timeout, image_timeout)
 
 
-async def find_consensus(ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5) -> Result:
-    """Find the track by random sample consensus of a parabola: stands false edges. As `find_edges`."""
+async def find_consensus(
+    ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5
+) -> Result:
+    """Find the track by random sample consensus of a parabola: stands false edges. As
+    `find_edges`."""
     return await _find(ctx, consensus(lambda: ctx.random("consensus")), timeout, image_timeout)
 
 
-async def find_template(ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5) -> Result:
-    """Find the track by whole-line templates: stands noise and dim light best, costs most. As `find_edges`."""
+async def find_template(
+    ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5
+) -> Result:
+    """Find the track by whole-line templates: stands noise and dim light best, costs most. As
+    `find_edges`."""
     return await _find(ctx, TemplateBank(), timeout, image_timeout)
 
 
-async def watch_edges(ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5) -> Result:
+async def watch_edges(
+    ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
+) -> Result:
     """Stream the track ahead until it ends, by pairs of edges.
 
-    SUCCESS when an interruption or the T has been recognised and has passed below the image; `at_t` says which. FAILURE
-    `patchy` (same values) when the line was missing in too many images. ERROR `no_line` when it was lost without an end.
+    SUCCESS when an interruption or the T has been recognised and has passed below the image; `at_t`
+    says which. FAILURE `patchy` (same values) when the line was missing in too many images. ERROR
+    `no_line` when it was lost without an end.
     """
     return await _watch(ctx, detect_edges, lost_after, image_timeout)
 
 
-async def watch_ridge(ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5) -> Result:
+async def watch_ridge(
+    ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
+) -> Result:
     """Stream the track ahead until it ends, by ridges of its width. As `watch_edges`."""
     return await _watch(ctx, detect_ridge, lost_after, image_timeout)
 
 
-async def watch_consensus(ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5) -> Result:
+async def watch_consensus(
+    ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
+) -> Result:
     """Stream the track ahead until it ends, by random sample consensus. As `watch_edges`."""
     return await _watch(ctx, consensus(lambda: ctx.random("consensus")), lost_after, image_timeout)
 
 
-async def watch_template(ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5) -> Result:
+async def watch_template(
+    ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
+) -> Result:
     """Stream the track ahead until it ends, by whole-line templates. As `watch_edges`."""
     return await _watch(ctx, TemplateBank(), lost_after, image_timeout)
 
@@ -83,7 +105,11 @@ async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout:
             row = row + 1 if sight.seen else 0
             if row == CONFIRMED:
                 shape = sight.describe()
-                values = {"offset": shape.offset, "heading": shape.heading, "curvature": shape.curvature}
+                values = {
+                    "offset": shape.offset,
+                    "heading": shape.heading,
+                    "curvature": shape.curvature,
+                }
                 return success(images=watcher.images, **values)
     except Cancelled:
         ctx.withdraw(STREAM)
@@ -91,7 +117,9 @@ async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout:
     return error("no_line", f"no line was seen in {timeout} s", images=watcher.images)
 
 
-async def _watch(ctx: Context, detector: Detector, lost_after: float, image_timeout: float) -> Result:
+async def _watch(
+    ctx: Context, detector: Detector, lost_after: float, image_timeout: float
+) -> Result:
     camera: FloorCamera = ctx.device
     watcher = LineWatcher(camera.floor, detector)
     ended = TrackEnd.NONE
@@ -111,7 +139,9 @@ async def _watch(ctx: Context, detector: Detector, lost_after: float, image_time
             elif ended is not TrackEnd.NONE and watcher.unseen >= GONE:
                 return _ended(ended, watcher)
             elif ctx.now - seen_at > lost_after:
-                return error("no_line", f"the line was lost for {lost_after} s", images=watcher.images)
+                return error(
+                    "no_line", f"the line was lost for {lost_after} s", images=watcher.images
+                )
     except Cancelled:
         ctx.withdraw(STREAM)
         raise
@@ -120,11 +150,15 @@ async def _watch(ctx: Context, detector: Detector, lost_after: float, image_time
 def _ended(kind: TrackEnd, watcher: LineWatcher) -> Result:
     values = {"at_t": kind is TrackEnd.T, "images": watcher.images, "share": watcher.share}
     if watcher.share < PATCHY:
-        return failure("patchy", f"the line was seen in only {watcher.share:.0%} of the images", **values)
+        return failure(
+            "patchy", f"the line was seen in only {watcher.share:.0%} of the images", **values
+        )
     return success(**values)
 
 
-async def _next(ctx: Context, camera: FloorCamera, watcher: LineWatcher, image_timeout: float) -> Sight | Result:
+async def _next(
+    ctx: Context, camera: FloorCamera, watcher: LineWatcher, image_timeout: float
+) -> Sight | Result:
     """What the next image shows, streamed; or how the run ends without one."""
     try:
         image = await camera.read(ctx, image_timeout)

@@ -1,4 +1,5 @@
-"""What one image shows of the track: points of its centre line, and offset, heading and curvature made of them."""
+"""What one image shows of the track: points of its centre line, and offset, heading and curvature
+made of them."""
 
 from __future__ import annotations
 
@@ -44,7 +45,8 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """The line in one image, body frame at exposure: `x` ascending, `y` to the left (m); empty when none was seen.
+    """The line in one image, body frame at exposure: `x` ascending, `y` to the left (m); empty when
+    none was seen.
 
     `confidence` is 0 to 1: the share of rows within reach in which the line was found.
     """
@@ -62,14 +64,17 @@ class Sight:
         return self.x.size > 2
 
     def line(self) -> Line:
-        """A parabola over the first half metre, to know where to look next. Raises ValueError when no line was seen."""
+        """A parabola over the first half metre, to know where to look next. Raises ValueError when
+        no line was seen."""
         x, y = self._near()
         return fit_line(x, y)
 
     def describe(self) -> Shape:
-        """Offset, heading and curvature at the nearest point. Raises ValueError when no line was seen.
+        """Offset, heading and curvature at the nearest point. Raises ValueError when no line was
+        seen.
 
-        The parabola is fitted along the chord: against the body's axis an arc seen at 60 degrees is none.
+        The parabola is fitted along the chord: against the body's axis an arc seen at 60 degrees is
+        none.
         """
         x, y = self._near()
         chord = math.atan2(float(y[-1] - y[0]), float(x[-1] - x[0]))
@@ -77,7 +82,12 @@ class Sight:
         along = fit_line((x - x[0]) * cos + (y - y[0]) * sin, (y - y[0]) * cos - (x - x[0]) * sin)
         steep = 1.0 + along.slope * along.slope
         offset = float(y[0]) + along.offset / max(0.2, math.cos(chord))
-        return Shape(float(x[0]), offset, chord + math.atan(along.slope), along.bend / (steep * math.sqrt(steep)))
+        return Shape(
+            float(x[0]),
+            offset,
+            chord + math.atan(along.slope),
+            along.bend / (steep * math.sqrt(steep)),
+        )
 
     def _near(self) -> tuple[Vector, Vector]:
         if not self.seen:
@@ -91,7 +101,8 @@ UNSEEN = Sight(np.empty(0), np.empty(0))
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The line at its nearest point, `near` m ahead: offset (m) and heading (rad) to the left, curvature (1/m, bending left)."""
+    """The line at its nearest point, `near` m ahead: offset (m) and heading (rad) to the left,
+    curvature (1/m, bending left)."""
 
     near: float
     offset: float
@@ -101,7 +112,8 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A parabola y = offset + slope (x - near) + bend (x - near)^2 / 2 over [near, far] (m, body frame)."""
+    """A parabola y = offset + slope (x - near) + bend (x - near)^2 / 2 over [near, far] (m, body
+    frame)."""
 
     near: float
     far: float
@@ -125,7 +137,8 @@ def fit_line(x: Vector, y: Vector) -> Line:
 
 
 def polynomial(x: Vector, y: Vector, degree: int, weights: Vector | None = None) -> list[float]:
-    """Coefficients, constant first, of the weighted least-squares polynomial. Raises LinAlgError for too few places."""
+    """Coefficients, constant first, of the weighted least-squares polynomial. Raises LinAlgError
+    for too few places."""
     powers = [np.ones_like(x)]
     for _ in range(2 * degree):
         powers.append(powers[-1] * x)
@@ -140,10 +153,12 @@ def polynomial(x: Vector, y: Vector, degree: int, weights: Vector | None = None)
 
 @dataclass(frozen=True, slots=True)
 class TrackAhead:
-    """A set point of the stream `track_ahead`: [age, confidence, end, end_x, end_y, x1, y1, x2, y2, ...].
+    """A set point of the stream `track_ahead`: [age, confidence, end, end_x, end_y, x1, y1, x2, y2,
+    ...].
 
-    `age` s since mid-exposure when it was published; `confidence` 0: no line; `end` a `TrackEnd` at (end_x, end_y); then up to
-    `STREAMED` points of the centre line, near to far (m, body frame at exposure).
+    `age` s since mid-exposure when it was published; `confidence` 0: no line; `end` a `TrackEnd` at
+    (end_x, end_y); then up to `STREAMED` points of the centre line, near to far (m, body frame at
+    exposure).
     """
 
     age: float
@@ -159,11 +174,13 @@ class TrackAhead:
 
     @staticmethod
     def parse(values: Sequence[float], held: float = 0.0) -> TrackAhead:
-        """From numbers that their sender has stood by for `held` s. Raises ValueError when they are none."""
+        """From numbers that their sender has stood by for `held` s. Raises ValueError when they are
+        none."""
         rest = len(values) - HEAD
         if rest < 0 or rest % 2 or rest // 2 > STREAMED or not all(map(math.isfinite, values)):
             raise ValueError(
-                f"{len(values)} numbers are no set point of track_ahead: {HEAD} and up to {STREAMED} pairs"
+                f"{len(values)} numbers are no set point of track_ahead: {HEAD} and up to "
+                f"{STREAMED} pairs"
             )
         age, confidence, kind, x, y = values[:HEAD]
         if kind not in tuple(TrackEnd) or age < 0.0:

@@ -1,8 +1,9 @@
-"""What is known of the track near the rover: points of its centre line in the odometry frame, seen or only expected.
+"""What is known of the track near the rover: points of its centre line in the odometry frame, seen
+or only expected.
 
-The camera sees the track only from 0.4 m ahead on; what it saw is kept until the axle has passed over it, so that the error at
-the axle itself is known. Where the track is interrupted, the points of a plan stand in for what cannot be seen: whoever
-follows the map need not know the difference.
+The camera sees the track only from 0.4 m ahead on; what it saw is kept until the axle has passed
+over it, so that the error at the axle itself is known. Where the track is interrupted, the points
+of a plan stand in for what cannot be seen: whoever follows the map need not know the difference.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.odometry import Pose
-from services.mobile.paths import join, passes
-from services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.mobile.odometry import Pose
+from petrobot.services.mobile.paths import join, passes
+from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
 
 Vector = NDArray[np.float64]
 
@@ -27,7 +28,8 @@ STEP = 0.015
 """m or, turning, about as many degrees between two places from which sights are taken."""
 TURN_STEP = 0.03
 ALIKE = 5
-"""Sights that are taken from one place: a standing rover's noise is averaged, then it learns nothing new."""
+"""Sights that are taken from one place: a standing rover's noise is averaged, then it learns
+nothing new."""
 REACH = 0.22
 """m around a place within which points bear on the fit there, the nearer the more."""
 NEEDED = 3
@@ -44,7 +46,8 @@ ENDS = 12
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The line near a place, in the body frame of a pose: y, slope and bend at that distance ahead (m, 1, 1/m)."""
+    """The line near a place, in the body frame of a pose: y, slope and bend at that distance ahead
+    (m, 1, 1/m)."""
 
     y: float
     slope: float
@@ -87,17 +90,20 @@ class TrackMap:
         """Whether the stretch that `begin` gave gates for has been found; see `settle`."""
 
     def begin(self, gates: Sequence[Pose] = (), *, look: bool = True) -> None:
-        """A new stretch begins: what lies behind stays for the axle to pass over, the end of the last one is forgotten.
+        """A new stretch begins: what lies behind stays for the axle to pass over, the end of the
+        last one is forgotten.
 
-        With `gates` only a line that leads through one of them is taken for it until `settle` is called: others may be in
-        view, also while the rover turns on the spot. Without `look` no sight is taken until the next stretch begins.
+        With `gates` only a line that leads through one of them is taken for it until `settle` is
+        called: others may be in view, also while the rover turns on the spot. Without `look` no
+        sight is taken until the next stretch begins.
         """
         self._ends.clear()
         self.sights, self.refused, self.entry = 0, 0, None
         self._gates, self._looks, self.regained = tuple(gates), look, False
 
     def settle(self) -> None:
-        """The stretch has been found and lies before the rover: from now on what goes on with it is taken."""
+        """The stretch has been found and lies before the rover: from now on what goes on with it is
+        taken."""
         self._gates, self.regained = (), True
 
     @property
@@ -107,13 +113,15 @@ class TrackMap:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing needs to be seen any more: the end is known, or no sights are taken at all."""
+        """Whether nothing needs to be seen any more: the end is known, or no sights are taken at
+        all."""
         return not self._looks or bool(self._ends)
 
     # Taking in
 
     def take(self, pose: Pose, ahead: TrackAhead) -> bool:
-        """A sight from `pose` (where the rover was at exposure). False if it was not taken: nothing new, or something else."""
+        """A sight from `pose` (where the rover was at exposure). False if it was not taken: nothing
+        new, or something else."""
         if len(ahead.points) < 3 or not self._looks:
             return False
         if not self._admitted(pose, ahead.points) or self._contradicts(pose, ahead.points):
@@ -161,7 +169,10 @@ class TrackMap:
         last = self._taken_at
         if last is None:
             return False
-        here = math.hypot(pose.x - last.x, pose.y - last.y) < STEP and abs(pose.heading - last.heading) < TURN_STEP
+        here = (
+            math.hypot(pose.x - last.x, pose.y - last.y) < STEP
+            and abs(pose.heading - last.heading) < TURN_STEP
+        )
         self._alike = self._alike + 1 if here else 0
         return self._alike >= ALIKE
 
@@ -175,8 +186,9 @@ class TrackMap:
     def _see_instead_of_plan(self, pose: Pose, points: Sequence[tuple[float, float]]) -> None:
         """What was planned for where the line is now seen is planned no more.
 
-        A line that lies well beside the plan replaces all that was known, for a step in the map would look like a bend; a
-        smooth way from here to where it begins is planned instead, since it may begin far ahead.
+        A line that lies well beside the plan replaces all that was known, for a step in the map
+        would look like a bend; a smooth way from here to where it begins is planned instead, since
+        it may begin far ahead.
         """
         if not len(self._planned):
             return
@@ -221,15 +233,23 @@ class TrackMap:
         return (end[1], end[2]) if end is not None else self.tip
 
     def ahead(self, pose: Pose) -> float:
-        """How far ahead (m) the line is known, up to its end if that was seen; negative when that lies behind."""
+        """How far ahead (m) the line is known, up to its end if that was seen; negative when that
+        lies behind."""
         place = self.end_place
         if place is None:
             return 0.0
         x, y = pose.body(*place)
-        return math.copysign(math.hypot(x, y), x) if abs(x) < 0.3 else (x if x < 0.0 else math.hypot(x, y))
+        return (
+            math.copysign(math.hypot(x, y), x)
+            if abs(x) < 0.3
+            else (x if x < 0.0 else math.hypot(x, y))
+        )
 
-    def fit(self, pose: Pose, x: float, reach: float = REACH, *, planned: bool = True) -> Fit | None:
-        """The line `x` m ahead of a pose, from the points within `reach` of it; None where there are too few."""
+    def fit(
+        self, pose: Pose, x: float, reach: float = REACH, *, planned: bool = True
+    ) -> Fit | None:
+        """The line `x` m ahead of a pose, from the points within `reach` of it; None where there
+        are too few."""
         near = self._near(pose, x, reach, planned)
         if near is None:
             return None
@@ -237,10 +257,14 @@ class TrackMap:
         spread = float(d.max() - d.min())
         if spread < 0.25 * reach:
             return None
-        degree = 2 if spread > 0.8 * reach and d.min() < 0.3 * reach and d.max() > -0.3 * reach else 1
+        degree = (
+            2 if spread > 0.8 * reach and d.min() < 0.3 * reach and d.max() > -0.3 * reach else 1
+        )
         return _weighted(d, y, w, degree)
 
-    def _near(self, pose: Pose, x: float, reach: float, planned: bool) -> tuple[Vector, Vector, Vector] | None:
+    def _near(
+        self, pose: Pose, x: float, reach: float, planned: bool
+    ) -> tuple[Vector, Vector, Vector] | None:
         """Distances from the place, y and weights of the points that bear on it."""
         ahead, y, w, seen = self._around(pose)
         if not planned:
@@ -258,7 +282,8 @@ class TrackMap:
         return d, y, part
 
     def _around(self, pose: Pose) -> tuple[Vector, Vector, Vector, int]:
-        """Points near a pose in its body frame, weights, and how many of them were seen; kept, since several fits ask for them."""
+        """Points near a pose in its body frame, weights, and how many of them were seen; kept,
+        since several fits ask for them."""
         if self._local is not None and self._local[0] == pose:
             return self._local[1]
         seen = self._points[: min(self._count, CAPACITY)]

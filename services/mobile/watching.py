@@ -1,4 +1,5 @@
-"""From image to image: goes on where the line was last, and believes an end only when several images show the same.
+"""From image to image: goes on where the line was last, and believes an end only when several
+images show the same.
 
 Pure: images in, sights out.
 """
@@ -11,11 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.detection import Detector
-from services.mobile.floor import FloorView, ScanGrid
-from services.mobile.line_end import EndFinder
-from services.mobile.model import Rover
-from services.mobile.sight import UNSEEN, End, Line, Sight, TrackEnd
+from petrobot.services.mobile.detection import Detector
+from petrobot.services.mobile.floor import FloorView, ScanGrid
+from petrobot.services.mobile.line_end import EndFinder
+from petrobot.services.mobile.model import Rover
+from petrobot.services.mobile.sight import UNSEEN, End, Line, Sight, TrackEnd
 
 FOLLOW_FAR, FIND_FAR = 1.2, 1.5
 """m ahead up to which scan rows lie while the line is followed, and while it is looked for."""
@@ -93,7 +94,8 @@ class LineWatcher:
 
     @property
     def _is_near(self) -> bool:
-        """Whether the line begins where the image does: then rows far ahead tell nothing that matters yet."""
+        """Whether the line begins where the image does: then rows far ahead tell nothing that
+        matters yet."""
         return self._expected is not None and self._expected.near < NEAR
 
     def _believed(self, image: NDArray[np.uint8], sight: Sight) -> End | None:

@@ -1,17 +1,19 @@
-"""The CANopen master of the rover's bus: two wheel drives and the reflector sensor, on `services.comm.canopen_master`.
+"""The CANopen master of the rover's bus: two wheel drives and the reflector sensor, on
+`services.comm.canopen_master`.
 
-A machine: frames in, frames out, times passed in. It knows neither track nor actions: each cycle it is given two wheel speeds
-(rad/s) and says how far the wheels have turned. A sensor that falls silent is reported, but stops nobody.
+A machine: frames in, frames out, times passed in. It knows neither track nor actions: each cycle it
+is given two wheel speeds (rad/s) and says how far the wheels have turned. A sensor that falls
+silent is reported, but stops nobody.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-from services.comm import canopen
-from services.comm.canbus import Frame
-from services.comm.canopen import Mapped, SdoClient, Transfer, Type
-from services.comm.canopen_master import (
+from petrobot.services.comm import canopen
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import Mapped, SdoClient, Transfer, Type
+from petrobot.services.comm.canopen_master import (
     CanopenMaster,
     Companion,
     Manner,
@@ -23,7 +25,7 @@ from services.comm.canopen_master import (
     unfit,
     usual_transfers,
 )
-from services.comm.cia402 import (
+from petrobot.services.comm.cia402 import (
     SENT,
     VELOCITY_RECEIVED,
     Mode,
@@ -34,7 +36,7 @@ from services.comm.cia402 import (
     state_of,
     to_units,
 )
-from services.mobile.reflectors import ECHOES
+from petrobot.services.mobile.reflectors import ECHOES
 
 HEARTBEAT_PATIENCE: Final = 0.25
 """s of silence after which a node counts as lost (both ways)."""
@@ -43,7 +45,8 @@ SILENT_CYCLES: Final = 5
 RESET_CYCLES: Final = 5
 """Cycles between two fault resets."""
 STOP_CYCLES: Final = 40
-"""Cycles that a drive is given to stop quickly before its power is taken away and its brake holds."""
+"""Cycles that a drive is given to stop quickly before its power is taken away and its brake
+holds."""
 SENSOR_TIMER_MS: Final = 40
 SENSOR_OBJECTS: Final = tuple(
     Mapped(0x2010, sub, Type.INTEGER16 if sub % 2 else Type.UNSIGNED16) for sub in range(1, 5)
@@ -75,10 +78,13 @@ class WheelLink:
         self._turned = 0
 
     def transfers(self, cycle: float) -> list[Transfer]:
-        """The configuration of this drive for a bus cycle of so many seconds, and what is read from it."""
+        """The configuration of this drive for a bus cycle of so many seconds, and what is read from
+        it."""
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
-            Transfer(Object.QUICK_STOP_DECELERATION, 0, Type.UNSIGNED32, to_units(self._quick_stop)),
+            Transfer(
+                Object.QUICK_STOP_DECELERATION, 0, Type.UNSIGNED32, to_units(self._quick_stop)
+            ),
             *pdo_transfers(self.node, VELOCITY_RECEIVED),
         ]
 
@@ -87,9 +93,12 @@ class WheelLink:
         return unfit(self.node, self.sdo.results, _MODE)
 
     def take(self, data: bytes) -> bool:
-        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes that are none."""
+        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes
+        that are none."""
         if len(data) != _TPDO.size:
-            raise ValueError(f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}")
+            raise ValueError(
+                f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}"
+            )
         statusword, position, _ = _TPDO.unpack(data)
         before = self.state, self.limited
         self.state = state_of(statusword)
@@ -106,7 +115,8 @@ class WheelLink:
         return from_units(turned)
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
-        """The RPDO: a controlword that leads to where the master wants the drive, and the target speed (rad/s)."""
+        """The RPDO: a controlword that leads to where the master wants the drive, and the target
+        speed (rad/s)."""
         word = self._power.word(self.state, wanted, resetting)
         return Frame(canopen.RPDO1_BASE + self.node, _RPDO.pack(word, to_units(target)))
 
@@ -119,10 +129,18 @@ class WheelMaster(CanopenMaster[WheelLink]):
         self.sensor = sensor
         self.echoes: list[bytes] = []
         """Data of the sensor's TPDOs since they were last taken."""
-        wheels = {"left wheel": WheelLink(left, quick_stop), "right wheel": WheelLink(right, quick_stop)}
+        wheels = {
+            "left wheel": WheelLink(left, quick_stop),
+            "right wheel": WheelLink(right, quick_stop),
+        }
         transfers = companion_transfers(sensor, SENSOR_TIMER_MS, SENSOR_OBJECTS)
         companion = Companion(sensor, transfers, self._take_echoes, needed=False)
-        super().__init__(wheels, (companion,), cycle, Manner(SILENT_CYCLES, HEARTBEAT_PATIENCE, old_emergencies=True))
+        super().__init__(
+            wheels,
+            (companion,),
+            cycle,
+            Manner(SILENT_CYCLES, HEARTBEAT_PATIENCE, old_emergencies=True),
+        )
 
     @property
     def sensor_alive(self) -> bool:

@@ -1,16 +1,18 @@
 """The driver `Arm`: the PUMA's servo on its bus, in cycles of 4 ms.
 
-Each cycle it reads the bus, moves the commanded trajectory on within the joint limits and the guard's, and sends the drives
-their set points. Commands (plain data, key `do`):
+Each cycle it reads the bus, moves the commanded trajectory on within the joint limits and the
+guard's, and sends the drives their set points. Commands (plain data, key `do`):
 
     {"do": "move", "pose": NAME or six angles (rad), "speed": 0 to 1}   all joints arrive together
-    {"do": "follow", "strategy": NAME, ...}    go where the stream's newest prediction can be caught; must be repeated within
+    {"do": "follow", "strategy": NAME, ...}    go where the stream's newest prediction can be
+                                               caught; must be repeated within
                                                `LEASE` seconds, else the arm holds
     {"do": "hold"}      come to rest and stay there
     {"do": "reset"}     forget faults, configure and enable the drives again, hold
     {"do": "disable"}   come to rest, then take the power away: the brakes hold
 
-No set point older than three of its periods is ever executed: the arm then brakes at its limits and holds.
+No set point older than three of its periods is ever executed: the arm then brakes at its limits and
+holds.
 """
 
 from __future__ import annotations
@@ -24,16 +26,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from services.device import Ports, Setpoint
-from services.motion.arm_settings import Settings, drive_settings, numbers
-from services.motion.barrier import Barrier
-from services.motion.drive_master import DriveMaster, Phase
-from services.motion.following import Follower
-from services.motion.interception import STRATEGIES, Interceptor, Strategy
-from services.motion.kinematics import Puma, branch_of
-from services.motion.limits import Guard
-from services.motion.model import JOINTS
-from services.motion.steering import Steering
+from petrobot.services.device import Ports, Setpoint
+from petrobot.services.motion.arm_settings import Settings, drive_settings, numbers
+from petrobot.services.motion.barrier import Barrier
+from petrobot.services.motion.drive_master import DriveMaster, Phase
+from petrobot.services.motion.following import Follower
+from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
+from petrobot.services.motion.kinematics import Puma, branch_of
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import JOINTS
+from petrobot.services.motion.steering import Steering
 
 PERIOD: Final = 0.004
 """s, the servo's and the bus's cycle."""
@@ -48,7 +50,8 @@ IN_PLACE: Final = 0.003
 NEAR_PLACE: Final = 0.02
 """rad, the same while following, where small corrections never end: 5 mm at the cup."""
 LAG_CYCLES: Final = 8
-"""Cycles by which the measured joints may follow the commanded ones: bus, links, interpolation, sampling."""
+"""Cycles by which the measured joints may follow the commanded ones: bus, links, interpolation,
+sampling."""
 LAG_PERIOD: Final = 5
 """Cycles after which the following error is worked out anew: 20 ms."""
 LOST: Final = 0.15
@@ -69,10 +72,14 @@ class Arm:
         self._puma = Puma.of(self.model)
         self._guard = Guard(self._puma, self.model, cell)
         home = self.model.poses["home"]
-        self._interceptor = Interceptor(self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home)))
+        self._interceptor = Interceptor(
+            self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home))
+        )
         self._full_speed = (self.model.speed * (settings.speed * SPEED_SHARE)).tolist()
         self._full_acceleration = self.model.acceleration.tolist()
-        self._steering = Steering(self._guard, self._interceptor.retreat, home, PERIOD, self.model.acceleration)
+        self._steering = Steering(
+            self._guard, self._interceptor.retreat, home, PERIOD, self.model.acceleration
+        )
         self._trajectory = self._steering.trajectory
         self._master = DriveMaster(drive_settings(self.model), PERIOD, enable=settings.enable)
         self._setpoint: Setpoint = ports.stream(settings.stream)
@@ -101,10 +108,13 @@ class Arm:
 
     # Driver contract.
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed now."""
+        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed
+        now."""
         act = self._commands.get(str(body.get("do")))
         if act is None:
-            raise ValueError(f"unknown command {body.get('do')!r}: know {', '.join(self._commands)}")
+            raise ValueError(
+                f"unknown command {body.get('do')!r}: know {', '.join(self._commands)}"
+            )
         act(now, body)
 
     def step(self, now: float) -> None:
@@ -147,7 +157,10 @@ class Arm:
             "following_error": self._off_path if self._mode != "off" else 0.0,
             "guard": self._steering.refused,
             "limited": master.limited,
-            "faults": [(trouble.cause, trouble.axis, trouble.code, trouble.text) for trouble in master.troubles],
+            "faults": [
+                (trouble.cause, trouble.axis, trouble.code, trouble.text)
+                for trouble in master.troubles
+            ],
             "power": None if master.inputs is None else bool(master.inputs & POWER),
             "ball_in_cup": self._ball.present,
             "barrier": self._ball.interrupted,
@@ -165,13 +178,17 @@ class Arm:
         self._rest("stopped")
 
     def quick_stop(self, now: float) -> None:
-        """Emergency stop: the drives stop quickly with the next cycle; then their power goes and the brakes hold."""
+        """Emergency stop: the drives stop quickly with the next cycle; then their power goes and
+        the brakes hold."""
         self._master.give_up("emergency stop", "emergency_stop", 0)
 
     def stopped(self) -> bool:
         """Whether the arm stands still, held by its drives or its brakes."""
         if self._mode == "off":
-            return self._master.phase is not Phase.RUNNING or max(map(abs, self._measured_speed)) < _STANDING
+            return (
+                self._master.phase is not Phase.RUNNING
+                or max(map(abs, self._measured_speed)) < _STANDING
+            )
         return self._trajectory.still and self._standing()
 
     def hold(self, now: float) -> str:
@@ -216,7 +233,10 @@ class Arm:
 
     def _ready(self, what: str) -> None:
         if self._mode == "off":
-            troubles = "; ".join(trouble.text for trouble in self._master.troubles) or self._master.phase.value
+            troubles = (
+                "; ".join(trouble.text for trouble in self._master.troubles)
+                or self._master.phase.value
+            )
             raise ValueError(f"cannot {what}: the drives are not enabled ({troubles})")
 
     def _pose(self, pose: Any) -> list[float]:
@@ -224,7 +244,11 @@ class Arm:
             if pose not in self.model.poses:
                 raise ValueError(f"unknown pose {pose!r}: know {', '.join(self.model.poses)}")
             return list(self.model.poses[pose])
-        if not isinstance(pose, Sequence) or len(pose) != JOINTS or not all(math.isfinite(angle) for angle in pose):
+        if (
+            not isinstance(pose, Sequence)
+            or len(pose) != JOINTS
+            or not all(math.isfinite(angle) for angle in pose)
+        ):
             raise ValueError(f"a pose is a name or {JOINTS} angles in rad, not {pose!r}")
         return [float(angle) for angle in pose]
 
@@ -236,7 +260,9 @@ class Arm:
 
     def _measure(self) -> None:
         before, self._measured = self._measured, self._master.positions
-        self._measured_speed = [(new - old) / PERIOD for new, old in zip(self._measured, before, strict=True)]
+        self._measured_speed = [
+            (new - old) / PERIOD for new, old in zip(self._measured, before, strict=True)
+        ]
 
     def _sense(self, now: float) -> None:
         """The light barrier."""
@@ -274,7 +300,9 @@ class Arm:
 
     def _advance(self) -> None:
         self._commanded.append(self._trajectory.q)
-        late = self._ports.now  # receiving and planning took time: what counts is the clock at the last moment
+        late = (
+            self._ports.now
+        )  # receiving and planning took time: what counts is the clock at the last moment
         if self._follows() and not self._follower.fresh(late):
             self._let_go()
         self._steering.cycle(self._paused)
@@ -286,7 +314,8 @@ class Arm:
         return self._mode == "follow" and self._steering.goal is not None and not self._paused
 
     def _let_go(self) -> None:
-        """The last set point is stale: come to rest, and take its values for new ones if they come again."""
+        """The last set point is stale: come to rest, and take its values for new ones if they come
+        again."""
         self._steering.rest()
         self._follower.drop()
         self._reason = "no_setpoint"
@@ -301,7 +330,9 @@ class Arm:
             if not follower.fresh(now):
                 self._let_go()
             return
-        plan = follower.plan_with(self._interceptor, trajectory, self._speeds(), self._full_acceleration, now)
+        plan = follower.plan_with(
+            self._interceptor, trajectory, self._speeds(), self._full_acceleration, now
+        )
         self._reason = "" if plan is not None else "unreachable"
         if plan is None:
             self._steering.rest()
@@ -320,7 +351,8 @@ class Arm:
         self._mode, self._reason, self._after_stop = "off", reason, ""
 
     def _lag(self) -> float:
-        """How far (rad) the measured joints are off the path commanded of late; how late they are on it does not count."""
+        """How far (rad) the measured joints are off the path commanded of late; how late they are
+        on it does not count."""
         if self._mode == "off" or not self._commanded:
             return 0.0
         least, before, measured = math.inf, None, self._measured
@@ -339,16 +371,23 @@ class Arm:
         return least
 
     def _lost(self) -> bool:
-        """Whether the measured joints are too far off all of that path; most often the first look settles it."""
+        """Whether the measured joints are too far off all of that path; most often the first look
+        settles it."""
         return bool(self._commanded) and all(self._off_by(q) > LOST for q in self._commanded)
 
     def _in_place(self) -> bool:
-        """Whether the measured joints are where they are wanted: at the end of a move, or at the newest plan's pose."""
+        """Whether the measured joints are where they are wanted: at the end of a move, or at the
+        newest plan's pose."""
         if self._mode == "follow":
             plan = self._follower.plan
             return plan is not None and self._off_by(plan.q) < NEAR_PLACE
         goal = self._steering.goal
-        return self._mode == "move" and goal is not None and self._steering.arrived and self._off_by(goal) < IN_PLACE
+        return (
+            self._mode == "move"
+            and goal is not None
+            and self._steering.arrived
+            and self._off_by(goal) < IN_PLACE
+        )
 
     def _off_by(self, q: Sequence[float]) -> float:
         farthest: float = max(map(abs, map(sub, q, self._measured)))
@@ -363,18 +402,25 @@ _STANDING: Final = 0.01
 
 
 def _share(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not LEAST_SHARE <= value <= 1.0:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not LEAST_SHARE <= value <= 1.0
+    ):
         raise ValueError(f"speed = {value!r}: must be at least {LEAST_SHARE:g} and at most 1")
     return float(value)
 
 
 def _strategy(body: Mapping[str, Any], present: Strategy) -> Strategy:
-    """The strategy that a command names, with its own values where it gives any; without a name the present one."""
+    """The strategy that a command names, with its own values where it gives any; without a name the
+    present one."""
     name = body.get("strategy")
     if name is not None and name not in STRATEGIES:
         raise ValueError(f"unknown strategy {name!r}: know {', '.join(STRATEGIES)}")
     strategy = present if name is None else STRATEGIES[name]
-    changes: dict[str, Any] = {key: float(body[key]) for key in ("tilt", "preferred", "margin") if key in body}
+    changes: dict[str, Any] = {
+        key: float(body[key]) for key in ("tilt", "preferred", "margin") if key in body
+    }
     if "depths" in body:
         changes["depths"] = tuple(float(depth) for depth in body["depths"])
     return replace(strategy, **changes) if changes else strategy

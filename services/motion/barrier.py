@@ -9,7 +9,8 @@ BALL_SETTLE: Final = 0.06
 
 
 class Barrier:
-    """A ball counts once it has lain there for `BALL_SETTLE`, and is told of once, if one was waited for with an empty cup."""
+    """A ball counts once it has lain there for `BALL_SETTLE`, and is told of once, if one was
+    waited for with an empty cup."""
 
     def __init__(self) -> None:
         self.interrupted = False

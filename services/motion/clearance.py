@@ -1,15 +1,17 @@
-"""Kernels of the guard: whether a pose, and the way to rest of the next commanded step, is clear. Lengths m, angles rad.
+"""Kernels of the guard: whether a pose, and the way to rest of the next commanded step, is clear.
+Lengths m, angles rad.
 
-The guard (limits.py) knows the same solids in words. Square roots and squares only, so that compiled kernels decide as they do
-as they stand; sine and cosine come from the same library in both.
+The guard (limits.py) knows the same solids in words. Square roots and squares only, so that
+compiled kernels decide as they do as they stand; sine and cosine come from the same library in
+both.
 """
 
 from __future__ import annotations
 
 import math
 
-from services.comm.compiled import kernel
-from services.motion.trajectory import Six, braked_for, braking_times, rest_of, toward
+from petrobot.services.comm.compiled import kernel
+from petrobot.services.motion.trajectory import Six, braked_for, braking_times, rest_of, toward
 
 Point = tuple[float, float, float]
 Links = tuple[float, float, float, float, float]
@@ -17,8 +19,8 @@ Links = tuple[float, float, float, float, float]
 Cup = tuple[Point, Point, float, float]
 """Mouth and outward axis in the flange's frame, length and outer radius."""
 Solids = tuple[float, float, float, float, float, float, float, float]
-"""Greatest x beside the table for the arm and for the cup, least z above it for each, margin to the floor, height of the
-pedestal, and its radius for the wrist and for the cup, margins included."""
+"""Greatest x beside the table for the arm and for the cup, least z above it for each, margin to the
+floor, height of the pedestal, and its radius for the wrist and for the cup, margins included."""
 Radii = tuple[float, float]
 """Of forearm and wrist."""
 Pose = tuple[Links, Radii, Cup, Solids]
@@ -121,7 +123,9 @@ def turned(turn: Turn, vector: Point) -> Point:
 
 
 @kernel
-def clear(q: Six, lower: Six, upper: Six, links: Links, radii: Radii, cup: Cup, solids: Solids) -> bool:
+def clear(
+    q: Six, lower: Six, upper: Six, links: Links, radii: Radii, cup: Cup, solids: Solids
+) -> bool:
     """Whether a joint pose is within the limits and touches nothing."""
     return within(q, lower, upper) and pose_clear(q, links, radii, cup, solids)
 
@@ -156,9 +160,11 @@ def clear_step(
     cup: Cup,
     solids: Solids,
 ) -> tuple[Six, Six, bool]:
-    """The next cycle toward `target`: positions and velocities after it, and whether the arm can come to rest from there.
+    """The next cycle toward `target`: positions and velocities after it, and whether the arm can
+    come to rest from there.
 
-    A way to rest of more than `near` rad is looked at where it begins, after a quarter and after half of its time.
+    A way to rest of more than `near` rad is looked at where it begins, after a quarter and after
+    half of its time.
     """
     q, qd = toward(period, q, qd, target, speed, acceleration)
     rest = rest_of(period, q, qd, brakes)

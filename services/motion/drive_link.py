@@ -1,15 +1,16 @@
-"""What the master knows of one drive: its configuration, what it says in its TPDO, and the RPDO that it is sent."""
+"""What the master knows of one drive: its configuration, what it says in its TPDO, and the RPDO
+that it is sent."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
-from services.comm import canopen
-from services.comm.canbus import Frame
-from services.comm.canopen import SdoClient, Transfer, Type
-from services.comm.canopen_master import Power, pdo_transfers, unfit, usual_transfers
-from services.comm.cia402 import (
+from petrobot.services.comm import canopen
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import SdoClient, Transfer, Type
+from petrobot.services.comm.canopen_master import Power, pdo_transfers, unfit, usual_transfers
+from petrobot.services.comm.cia402 import (
     ENABLING,
     RECEIVED,
     SENT,
@@ -27,14 +28,21 @@ HEARTBEAT_PATIENCE: Final = 0.2
 RESET_CYCLES: Final = 10
 """Cycles between two fault resets."""
 STOP_CYCLES: Final = 125
-"""Cycles that a drive is given to stop quickly and stand, before its power is taken away and its brake holds."""
+"""Cycles that a drive is given to stop quickly and stand, before its power is taken away and its
+brake holds."""
 SPEED_POLL: Final = 1.0
 """Seconds between two looks at a drive's greatest speed."""
 LIMITED_POLL: Final = 0.02
 """The same while a drive says that it is too slow for its set points."""
 
 _MODE: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION
-_U8, _U16, _U32, _I8, _I32 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8, Type.INTEGER32
+_U8, _U16, _U32, _I8, _I32 = (
+    Type.UNSIGNED8,
+    Type.UNSIGNED16,
+    Type.UNSIGNED32,
+    Type.INTEGER8,
+    Type.INTEGER32,
+)
 _TPDO: Final = canopen.pdo_struct(SENT)
 _RPDO: Final = canopen.pdo_struct(RECEIVED)
 
@@ -76,7 +84,8 @@ class DriveLink:
         self._power = Power(RESET_CYCLES, STOP_CYCLES)
 
     def transfers(self, cycle: float) -> list[Transfer]:
-        """The configuration of this drive for a bus cycle of so many seconds, and what is read from it."""
+        """The configuration of this drive for a bus cycle of so many seconds, and what is read from
+        it."""
         settings = self.settings
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
@@ -92,19 +101,23 @@ class DriveLink:
         ]
 
     def wrong(self) -> str:
-        """What makes the device at this node unfit, in words; empty if nothing. Takes over its greatest speed."""
+        """What makes the device at this node unfit, in words; empty if nothing. Takes over its
+        greatest speed."""
         wrong = unfit(self.node, self.sdo.results, _MODE)
         if not wrong:
             self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
         return wrong
 
     def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
-        """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow down by themselves."""
+        """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow
+        down by themselves."""
         if self._reading:
             if self.sdo.busy:
                 return self.sdo.advance(now)
             self._reading = False
-            self.max_speed = from_units(self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed)))
+            self.max_speed = from_units(
+                self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed))
+            )
         if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
             return []
         self._asked, self._reading = now, True
@@ -112,12 +125,15 @@ class DriveLink:
         return self.sdo.advance(now)
 
     def take(self, data: bytes) -> bool:
-        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes that are none."""
+        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes
+        that are none."""
         if data == self._taken and self.spoken:  # a drive at rest
             self.silent = 0
             return False
         if len(data) != _TPDO.size:
-            raise ValueError(f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}")
+            raise ValueError(
+                f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}"
+            )
         statusword, position, torque = _TPDO.unpack(data)
         other = statusword != self.statusword or not self.spoken
         if other:
@@ -128,7 +144,8 @@ class DriveLink:
         return other
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
-        """The RPDO: a controlword that leads to where the master wants the drive, and the target position (rad)."""
+        """The RPDO: a controlword that leads to where the master wants the drive, and the target
+        position (rad)."""
         if wanted and self.state is State.OPERATION_ENABLED:
             self._power.stopping = 0
             self.controlword = _GO_ON

@@ -1,4 +1,5 @@
-"""Following a stream of catch points: which set points may be executed, and the plan made of the newest one."""
+"""Following a stream of catch points: which set points may be executed, and the plan made of the
+newest one."""
 
 from __future__ import annotations
 
@@ -6,16 +7,24 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from services.device import Setpoint
-from services.motion.interception import STRATEGIES, Interceptor, Plan, Prediction, Strategy
-from services.motion.trajectory import Trajectory
+from petrobot.services.device import Setpoint
+from petrobot.services.motion.interception import (
+    STRATEGIES,
+    Interceptor,
+    Plan,
+    Prediction,
+    Strategy,
+)
+from petrobot.services.motion.trajectory import Trajectory
 
 STALE_PERIODS: Final = 3
 """Periods of the stream after which a set point is not executed any more."""
 FROZEN: Final = 0.03
-"""s before the ball from which the cup keeps still: what can still be corrected is less than what a moving rim can spoil."""
+"""s before the ball from which the cup keeps still: what can still be corrected is less than what a
+moving rim can spoil."""
 SAME_PLACE: Final = 0.0003
-"""m, SAME_SPEED m/s, SAME_TIME s: what two predictions may differ by and still lead to one plan; 0.5 mm at the cup."""
+"""m, SAME_SPEED m/s, SAME_TIME s: what two predictions may differ by and still lead to one plan;
+0.5 mm at the cup."""
 SAME_SPEED: Final = 0.002
 SAME_TIME: Final = 0.002
 SAME_SIGMA: Final = 0.002
@@ -53,13 +62,15 @@ class Follower:
         return self.age <= STALE_PERIODS * self._period + ROUNDING
 
     def executed(self, now: float) -> None:
-        """A cycle went towards the last good set point: its age is kept account of apart from what decides about it."""
+        """A cycle went towards the last good set point: its age is kept account of apart from what
+        decides about it."""
         age = now - self._came
         self.oldest = max(self.oldest, age)
         self.stale += age > STALE_PERIODS * self._period + ROUNDING
 
     def take(self, setpoint: Setpoint, now: float) -> bool:
-        """Take a set point with new values if there is one that may be executed; a repeat only makes the last one younger."""
+        """Take a set point with new values if there is one that may be executed; a repeat only
+        makes the last one younger."""
         values = setpoint.values
         if setpoint.count == self.count or values is None:
             return False
@@ -86,9 +97,12 @@ class Follower:
         acceleration: Sequence[float],
         now: float,
     ) -> Plan | None:
-        """Plan for the prediction just taken; None if it cannot be reached (the plan of before is forgotten)."""
+        """Plan for the prediction just taken; None if it cannot be reached (the plan of before is
+        forgotten)."""
         assert self._prediction is not None
-        if self.plan is not None and (self.plan.arrival - (now - self._made) < FROZEN or self._says_the_same(now)):
+        if self.plan is not None and (
+            self.plan.arrival - (now - self._made) < FROZEN or self._says_the_same(now)
+        ):
             return self.plan
         self.plan = interceptor.plan(
             self.strategy,
@@ -103,7 +117,8 @@ class Follower:
         return self.plan
 
     def _says_the_same(self, now: float) -> bool:
-        """Whether the newest prediction differs from the planned one by less than is worth a new plan."""
+        """Whether the newest prediction differs from the planned one by less than is worth a new
+        plan."""
         new, old = self._prediction, self._planned
         if new is None or old is None or self.strategy != self._planned_for:
             return False
@@ -111,7 +126,9 @@ class Follower:
         faster = max(abs(a - b) for a, b in zip(new.velocity, old.velocity, strict=True))
         later = abs(new.time_to_go + now - old.time_to_go - self._made)
         surer = old.sigma_y - new.sigma_y
-        return apart < SAME_PLACE and faster < SAME_SPEED and later < SAME_TIME and surer < SAME_SIGMA
+        return (
+            apart < SAME_PLACE and faster < SAME_SPEED and later < SAME_TIME and surer < SAME_SIGMA
+        )
 
     def published(self, now: float) -> dict[str, Any] | None:
         """The plan as plain data: times are seconds from `now`."""

@@ -1,10 +1,13 @@
-"""Where to catch: from a predicted exit over the table's edge to the joint pose that has the cup there in time. Pure.
+"""Where to catch: from a predicted exit over the table's edge to the joint pose that has the cup
+there in time. Pure.
 
-The ball leaves the edge and falls along a parabola. Along its fall candidates are laid out, each a depth below the edge and
-a turn of the hand about the cup's axis (which leaves the cup where it is, but brings other joints to work); all are solved and
-timed at once, on the arm's own branch. The cheapest is taken: in time first, then quickly reached, near the preferred
-depth, mouth open to the ball. The choice of before keeps a bonus, so that small changes of the prediction move the pose a
-little instead of jumping to another candidate. docs/motion.md tells how depths and tilt were chosen.
+The ball leaves the edge and falls along a parabola. Along its fall candidates are laid out, each a
+depth below the edge and a turn of the hand about the cup's axis (which leaves the cup where it is,
+but brings other joints to work); all are solved and timed at once, on the arm's own branch. The
+cheapest is taken: in time first, then quickly reached, near the preferred depth, mouth open to the
+ball. The choice of before keeps a bonus, so that small changes of the prediction move the pose a
+little instead of jumping to another candidate. docs/motion.md tells how depths and tilt were
+chosen.
 """
 
 from __future__ import annotations
@@ -16,24 +19,26 @@ from typing import Final
 
 import numpy as np
 
-from services.motion.kinematics import Branch, Puma
-from services.motion.limits import Guard
-from services.motion.model import Cell, Vector
-from services.motion.trajectory import reach_time
+from petrobot.services.motion.kinematics import Branch, Puma
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import Cell, Vector
+from petrobot.services.motion.trajectory import reach_time
 
 STREAM_LENGTH: Final = 9
 """Values of a set point of `catch_point`: time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t."""
 
 
 LARGEST: Final = 1000.0
-"""s, m or m/s beyond which a number is no catch point of any laboratory (nor is one that is not finite)."""
+"""s, m or m/s beyond which a number is no catch point of any laboratory (nor is one that is not
+finite)."""
 SLOWEST: Final = 1e-3
 """m/s towards the arm, below which a ball does not come."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where (m), when (s from now) and how fast (m/s) the ball's centre leaves the table's near edge; base frame."""
+    """Where (m), when (s from now) and how fast (m/s) the ball's centre leaves the table's near
+    edge; base frame."""
 
     time_to_go: float
     point: tuple[float, float, float]
@@ -43,18 +48,24 @@ class Prediction:
 
     @classmethod
     def parse(cls, values: Sequence[float], age: float = 0.0) -> Prediction:
-        """A set point that arrived `age` seconds ago. Raises ValueError if it is none, or moves away from the arm."""
+        """A set point that arrived `age` seconds ago. Raises ValueError if it is none, or moves
+        away from the arm."""
         if len(values) != STREAM_LENGTH or not all(abs(value) <= LARGEST for value in values):
-            raise ValueError(f"a catch point has {STREAM_LENGTH} numbers of at most {LARGEST:g}, not {list(values)}")
+            raise ValueError(
+                f"a catch point has {STREAM_LENGTH} numbers of at most {LARGEST:g}, not "
+                f"{list(values)}"
+            )
         go, x, y, z, vx, vy, vz, sigma_y, sigma_t = (float(value) for value in values)
         if vx > -SLOWEST or sigma_y < 0.0 or sigma_t < 0.0:
             raise ValueError(
-                f"a catch point has vx <= -{SLOWEST:g} m/s and sigmas >= 0, not vx = {vx}, sigmas {sigma_y}, {sigma_t}"
+                f"a catch point has vx <= -{SLOWEST:g} m/s and sigmas >= 0, not vx = {vx}, "
+                f"sigmas {sigma_y}, {sigma_t}"
             )
         return cls(go - age, (x, y, z), (vx, vy, vz), sigma_y, sigma_t)
 
     def shrunk(self, spread: float) -> Prediction:
-        """Weighed against a prior of y = 0 +- `spread` (m): a coarse prediction moves the arm only a part of the way."""
+        """Weighed against a prior of y = 0 +- `spread` (m): a coarse prediction moves the arm only
+        a part of the way."""
         weight = spread * spread / (spread * spread + self.sigma_y * self.sigma_y)
         x, y, z = self.point
         vx, vy, vz = self.velocity
@@ -63,8 +74,9 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """How to hold the cup: tilt of its axis from the vertical against the ball (rad), depths below the exit at which to
-    catch (m), the preferred one, and the least cosine between the cup's axis and the ball's way that counts as open."""
+    """How to hold the cup: tilt of its axis from the vertical against the ball (rad), depths below
+    the exit at which to catch (m), the preferred one, and the least cosine between the cup's axis
+    and the ball's way that counts as open."""
 
     tilt: float
     depths: tuple[float, ...]
@@ -76,10 +88,13 @@ class Strategy:
 
 
 STRATEGIES: Final = {
-    "tilted": Strategy(math.radians(30.0), (0.045, 0.055, 0.065, 0.08, 0.10, 0.13, 0.17, 0.21), 0.055, 0.70),
+    "tilted": Strategy(
+        math.radians(30.0), (0.045, 0.055, 0.065, 0.08, 0.10, 0.13, 0.17, 0.21), 0.055, 0.70
+    ),
     "upright": Strategy(0.0, (0.08, 0.11, 0.14, 0.17, 0.20, 0.24, 0.28), 0.11, 0.72),
 }
-"""By name: `tilted` receives the ball head-on just below the edge, `upright` lets it fall into a level cup further down."""
+"""By name: `tilted` receives the ball head-on just below the edge, `upright` lets it fall into a
+level cup further down."""
 
 PRIOR_SPREAD: Final = 0.17
 """m, standard deviation of where balls leave: uniform within +-0.30 m."""
@@ -92,7 +107,8 @@ ROOM: Final = 0.075
 EDGE_COST: Final = 8.0
 """s per m closer to the edge than that."""
 RETREAT: Final = 0.08
-"""m from a catching pose back to the pose from which it is approached where the straight way is not clear."""
+"""m from a catching pose back to the pose from which it is approached where the straight way is not
+clear."""
 LATE_COST: Final = 20.0
 """Weight of each second too late."""
 EARLY: Final = 0.05
@@ -105,7 +121,8 @@ KEEP: Final = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A catching pose. Times are seconds from when the plan was made; `slack` is the time left over, negative if late."""
+    """A catching pose. Times are seconds from when the plan was made; `slack` is the time left
+    over, negative if late."""
 
     q: tuple[float, ...]
     point: tuple[float, float, float]
@@ -117,9 +134,12 @@ class Plan:
 
 
 class Interceptor:
-    """Chooses catching poses for one arm and cup. One `plan` costs about as much as ten servo cycles: make one a prediction."""
+    """Chooses catching poses for one arm and cup. One `plan` costs about as much as ten servo
+    cycles: make one a prediction."""
 
-    def __init__(self, puma: Puma, cell: Cell, guard: Guard, home: Sequence[float], branch: Branch) -> None:
+    def __init__(
+        self, puma: Puma, cell: Cell, guard: Guard, home: Sequence[float], branch: Branch
+    ) -> None:
         self._puma = puma
         self._cell = cell
         self._guard = guard
@@ -131,7 +151,8 @@ class Interceptor:
         outward = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
         if np.linalg.norm(outward) < 0.1:
             raise ValueError(
-                "cell.toml: cup: axis must not lie along the flange's axis: turning the hand would do nothing"
+                "cell.toml: cup: axis must not lie along the flange's axis: turning the hand "
+                "would do nothing"
             )
         outward /= np.linalg.norm(outward)
         self._mount = np.column_stack([axis, outward, np.cross(axis, outward)])
@@ -146,16 +167,19 @@ class Interceptor:
         acceleration: Sequence[float],
         before: Plan | None = None,
     ) -> Plan | None:
-        """The best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None if no candidate can be reached."""
+        """The best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None if no
+        candidate can be reached."""
         prediction = prediction.shrunk(PRIOR_SPREAD)
         layout = self._layout(strategy)
         axis = _against(prediction.velocity, strategy.tilt)
         fall = np.array(self._fall(strategy, prediction, axis))
         points = fall[:, :3]
-        solved = self._puma.inverse(self._poses(points, axis, layout), (self._branch,), near=self._home)[:, 0]
-        times = reach_time(solved - np.asarray(q), np.asarray(qd), np.asarray(speed), np.asarray(acceleration)).max(
-            axis=1
-        )
+        solved = self._puma.inverse(
+            self._poses(points, axis, layout), (self._branch,), near=self._home
+        )[:, 0]
+        times = reach_time(
+            solved - np.asarray(q), np.asarray(qd), np.asarray(speed), np.asarray(acceleration)
+        ).max(axis=1)
         hands = layout.hands
         arrival = prediction.time_to_go + np.repeat(fall[:, 3], hands)
         haste = np.minimum(times / HASTE, 1.0)  # a cup that is in place already needs no margin
@@ -177,10 +201,13 @@ class Interceptor:
         return None
 
     def retreat(self, q: Sequence[float]) -> tuple[float, ...] | None:
-        """The pose that holds the cup as in a joint pose but further from the table; None if there is none that is clear."""
+        """The pose that holds the cup as in a joint pose but further from the table; None if there
+        is none that is clear."""
         pose = self._puma.forward(np.asarray(q))
         pose[0, 3] -= RETREAT
-        back: list[float] = self._puma.inverse(pose, (self._branch,), near=np.asarray(q))[0].tolist()
+        back: list[float] = self._puma.inverse(pose, (self._branch,), near=np.asarray(q))[
+            0
+        ].tolist()
         return tuple(back) if math.isfinite(back[0]) and not self._guard.violation(back) else None
 
     def _layout(self, strategy: Strategy) -> _Layout:
@@ -188,9 +215,12 @@ class Interceptor:
             self._layouts = {strategy: _Layout(strategy)}  # one at a time is in use
         return self._layouts[strategy]
 
-    def _fall(self, strategy: Strategy, prediction: Prediction, axis: Vector) -> list[tuple[float, ...]]:
-        """Of each depth of the strategy: the parabola's point there (x, y, z; m), when the ball is there (s after the edge),
-        and the cosine between the cup's axis and the way that it comes from."""
+    def _fall(
+        self, strategy: Strategy, prediction: Prediction, axis: Vector
+    ) -> list[tuple[float, ...]]:
+        """Of each depth of the strategy: the parabola's point there (x, y, z; m), when the ball is
+        there (s after the edge), and the cosine between the cup's axis and the way that it comes
+        from."""
         gravity, (x, y, z), (vx, vy, vz) = self._cell.gravity, prediction.point, prediction.velocity
         ax, ay, az = axis.tolist()
         fall: list[tuple[float, ...]] = []
@@ -202,11 +232,14 @@ class Interceptor:
         return fall
 
     def _poses(self, points: Vector, axis: Vector, layout: _Layout) -> Vector:
-        """Poses (n * hands, 4, 4) of frame 6 with the cup's mouth at the points, its axis as given, in all turns of the hand."""
+        """Poses (n * hands, 4, 4) of frame 6 with the cup's mouth at the points, its axis as given,
+        in all turns of the hand."""
         ahead = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
         ahead /= math.sqrt(float(ahead @ ahead))
         x, y, z = axis.tolist()
-        side = np.array([y * ahead[2] - z * ahead[1], z * ahead[0] - x * ahead[2], x * ahead[1] - y * ahead[0]])
+        side = np.array(
+            [y * ahead[2] - z * ahead[1], z * ahead[0] - x * ahead[2], x * ahead[1] - y * ahead[0]]
+        )
         frames = layout.frames
         frames[:, :, 0] = axis
         frames[:, :, 1] = layout.cosine * ahead + layout.sine * side
@@ -219,13 +252,16 @@ class Interceptor:
 
 
 class _Layout:
-    """Arrays of a strategy's candidates that do not depend on the prediction, and room for those that do."""
+    """Arrays of a strategy's candidates that do not depend on the prediction, and room for those
+    that do."""
 
     def __init__(self, strategy: Strategy) -> None:
         turns = np.asarray(strategy.hands)
         self.hands = len(turns)
         self.cosine, self.sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
-        self.off_depth = np.repeat(DEPTH_COST * np.abs(np.asarray(strategy.depths) - strategy.preferred), self.hands)
+        self.off_depth = np.repeat(
+            DEPTH_COST * np.abs(np.asarray(strategy.depths) - strategy.preferred), self.hands
+        )
         self.frames = np.empty((self.hands, 3, 3))
         self.poses = np.zeros((len(strategy.depths), self.hands, 4, 4))
         self.poses[..., 3, 3] = 1.0

@@ -1,8 +1,10 @@
-"""Forward and inverse kinematics of the PUMA 560 in closed form, and its geometric Jacobian; whole batches at once.
+"""Forward and inverse kinematics of the PUMA 560 in closed form, and its geometric Jacobian; whole
+batches at once.
 
-Standard Denavit-Hartenberg convention with the signs of Paul and Zhang, "Computationally efficient kinematics for
-manipulators with spherical wrists" (Int. J. Robotics Research 5(2), 1986). Frame 6 lies at the wrist's centre.
-A joint pose is an array (..., 6) in radians, a pose a homogeneous matrix (..., 4, 4) in metres.
+Standard Denavit-Hartenberg convention with the signs of Paul and Zhang, "Computationally efficient
+kinematics for manipulators with spherical wrists" (Int. J. Robotics Research 5(2), 1986). Frame 6
+lies at the wrist's centre. A joint pose is an array (..., 6) in radians, a pose a homogeneous
+matrix (..., 4, 4) in metres.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from services.motion.model import ArmModel, Vector
+from petrobot.services.motion.model import ArmModel, Vector
 
 SINGULAR = 1e-10
 """Sine of q5 below which the axes of joints 4 and 6 count as one line."""
@@ -24,7 +26,8 @@ class Branch(NamedTuple):
     """One of the eight ways to reach a pose, each +1 or -1."""
 
     shoulder: int
-    """+1: the wrist lies before the shoulder (in the direction that q1 points to); -1: over the shoulder."""
+    """+1: the wrist lies before the shoulder (in the direction that q1 points to); -1: over the
+    shoulder."""
     elbow: int
     """+1: elbow above the line from shoulder to wrist; -1: below."""
     wrist: int
@@ -42,7 +45,8 @@ BRANCHES = tuple(Branch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, 
 
 @dataclass(frozen=True)
 class Puma:
-    """The arm's geometry, ready to be computed with. `limits` are (lower, upper) in radians, (6,) each."""
+    """The arm's geometry, ready to be computed with. `limits` are (lower, upper) in radians, (6,)
+    each."""
 
     d1: float
     a2: float
@@ -54,12 +58,14 @@ class Puma:
 
     @classmethod
     def of(cls, model: ArmModel) -> Puma:
-        """The geometry of a model; raises ValueError if it is not a PUMA's (twists, zero lengths)."""
+        """The geometry of a model; raises ValueError if it is not a PUMA's (twists, zero
+        lengths)."""
         twists = np.round(np.degrees(model.alpha), 9).tolist()
         zero = [*model.d[[1, 4, 5]], *model.a[[0, 3, 4, 5]]]
         if twists != [90.0, 0.0, -90.0, 90.0, -90.0, 0.0] or any(zero):
             raise ValueError(
-                "closed-form kinematics needs a PUMA's twists (90, 0, -90, 90, -90, 0 degrees) and zero d2 d5 d6 a1 a4 a5 a6"
+                "closed-form kinematics needs a PUMA's twists (90, 0, -90, 90, -90, 0 "
+                "degrees) and zero d2 d5 d6 a1 a4 a5 a6"
             )
         return cls(
             float(model.d[0]),
@@ -110,11 +116,14 @@ class Puma:
         pose[..., 3, 3] = 1.0
         return pose
 
-    def inverse(self, pose: Vector, branches: tuple[Branch, ...] = BRANCHES, near: Vector | None = None) -> Vector:
+    def inverse(
+        self, pose: Vector, branches: tuple[Branch, ...] = BRANCHES, near: Vector | None = None
+    ) -> Vector:
         """Joint poses (..., len(branches), 6) of poses (..., 4, 4), in the order of `branches`.
 
-        A solution that does not exist or breaks a joint limit is NaN. Where several turns of a joint fit its limits, the
-        one closest to `near` (6,; default: the middle of the limits) is given. Where q5 is 0, q4 is that of `near`.
+        A solution that does not exist or breaks a joint limit is NaN. Where several turns of a
+        joint fit its limits, the one closest to `near` (6,; default: the middle of the limits) is
+        given. Where q5 is 0, q4 is that of `near`.
         """
         pose = np.asarray(pose, dtype=float)
         near = 0.5 * (self.lower + self.upper) if near is None else np.asarray(near, dtype=float)
@@ -131,22 +140,31 @@ class Puma:
         reach = shoulder * np.sqrt(x * x + y * y - self.d3 * self.d3)
         q[..., 0] = np.arctan2(y, x) + np.arctan2(self.d3, reach)
         length = self.forearm
-        cosine = (reach * reach + h * h - self.a2 * self.a2 - length * length) / (2.0 * self.a2 * length)
+        cosine = (reach * reach + h * h - self.a2 * self.a2 - length * length) / (
+            2.0 * self.a2 * length
+        )
         bend = -elbow * shoulder * np.arccos(cosine)
         q[..., 2] = bend - math.atan2(self.d4, self.a3)
-        q[..., 1] = np.arctan2(h, reach) - np.arctan2(length * np.sin(bend), self.a2 + length * np.cos(bend))
+        q[..., 1] = np.arctan2(h, reach) - np.arctan2(
+            length * np.sin(bend), self.a2 + length * np.cos(bend)
+        )
 
     def _solve_wrist(self, r: Vector, wrist: Vector, q4_if_singular: float, q: Vector) -> None:
         """The last three joints from the orientation (..., 1, 3, 3) and the first three."""
         c1, s1 = np.cos(q[..., 0, None]), np.sin(q[..., 0, None])
-        c23, s23 = np.cos(q[..., 1] + q[..., 2])[..., None], np.sin(q[..., 1] + q[..., 2])[..., None]
+        c23, s23 = (
+            np.cos(q[..., 1] + q[..., 2])[..., None],
+            np.sin(q[..., 1] + q[..., 2])[..., None],
+        )
         forward = c1 * r[..., 0, :] + s1 * r[..., 1, :]
         m1 = c23 * forward + s23 * r[..., 2, :]
         m2 = c1 * r[..., 1, :] - s1 * r[..., 0, :]
         m3 = c23 * r[..., 2, :] - s23 * forward
         sine = wrist * np.hypot(m1[..., 2], m2[..., 2])
         singular = np.abs(sine) < SINGULAR
-        q4 = np.where(singular, q4_if_singular, np.arctan2(-m2[..., 2] * wrist, -m1[..., 2] * wrist))
+        q4 = np.where(
+            singular, q4_if_singular, np.arctan2(-m2[..., 2] * wrist, -m1[..., 2] * wrist)
+        )
         c4, s4 = np.cos(q4), np.sin(q4)
         q[..., 3] = q4
         q[..., 4] = np.arctan2(sine, m3[..., 2])
@@ -154,7 +172,8 @@ class Puma:
         q[..., 5] = np.arctan2(c4 * m2[..., 0] - s4 * m1[..., 0], c4 * m2[..., 1] - s4 * m1[..., 1])
 
     def _within(self, q: Vector, near: Vector) -> Vector:
-        """Turns of 2 pi such that each joint is within its limits, closest to `near`; NaN rows where there are none."""
+        """Turns of 2 pi such that each joint is within its limits, closest to `near`; NaN rows
+        where there are none."""
         turn = 2.0 * math.pi
         q += turn * np.round((near - q) / turn)
         q += turn * (q < self.lower - LIMIT_SLACK)
@@ -164,7 +183,8 @@ class Puma:
         return q
 
     def jacobian(self, q: Vector) -> Vector:
-        """Geometric Jacobian (6, 6) of frame 6's origin in the base frame for one joint pose (6,): rows v (m/s), omega (rad/s)."""
+        """Geometric Jacobian (6, 6) of frame 6's origin in the base frame for one joint pose (6,):
+        rows v (m/s), omega (rad/s)."""
         axes, origins = self._axes(np.asarray(q, dtype=float))
         return np.vstack([np.cross(axes, origins[6] - origins[:6]).T, axes.T])
 
@@ -174,7 +194,11 @@ class Puma:
         c2, s2 = math.cos(q[1]), math.sin(q[1])
         c23, s23 = math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
         c4, s4, c5, s5 = math.cos(q[3]), math.sin(q[3]), math.cos(q[4]), math.sin(q[4])
-        ahead, side, up = np.array([c1, s1, 0.0]), np.array([s1, -c1, 0.0]), np.array([0.0, 0.0, 1.0])
+        ahead, side, up = (
+            np.array([c1, s1, 0.0]),
+            np.array([s1, -c1, 0.0]),
+            np.array([0.0, 0.0, 1.0]),
+        )
         x3, z3 = c23 * ahead + s23 * up, -s23 * ahead + c23 * up
         z4 = s4 * x3 + c4 * side
         z5 = -c4 * s5 * x3 + s4 * s5 * side + c5 * z3
@@ -182,7 +206,9 @@ class Puma:
         elbow = shoulder + self.a2 * (c2 * ahead + s2 * up)
         bend = elbow + self.d3 * side + self.a3 * x3
         wrist = bend + self.d4 * z3
-        return np.array([up, side, side, z3, z4, z5]), np.array([0.0 * up, shoulder, elbow, bend, wrist, wrist, wrist])
+        return np.array([up, side, side, z3, z4, z5]), np.array(
+            [0.0 * up, shoulder, elbow, bend, wrist, wrist, wrist]
+        )
 
 
 LIMIT_SLACK = 1e-9

@@ -1,4 +1,5 @@
-"""The PUMA 560 and its cup as numbers: read from `puma560.toml` and `cell.toml`, in SI units and radians."""
+"""The PUMA 560 and its cup as numbers: read from `puma560.toml` and `cell.toml`, in SI units and
+radians."""
 
 from __future__ import annotations
 
@@ -19,12 +20,14 @@ JOINTS = 6
 
 
 class ModelError(ValueError):
-    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key and remedy."""
+    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key
+    and remedy."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """A link moved by the joint of the same place: mass (kg), centre of mass (m) and inertia about it (kg m^2) in its DH frame."""
+    """A link moved by the joint of the same place: mass (kg), centre of mass (m) and inertia about
+    it (kg m^2) in its DH frame."""
 
     mass: float
     centre: tuple[float, float, float]
@@ -43,7 +46,8 @@ class Body:
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Geometry and limits of the arm. Arrays have one entry a joint, base to flange; SI units, radians."""
+    """Geometry and limits of the arm. Arrays have one entry a joint, base to flange; SI units,
+    radians."""
 
     d: Vector
     a: Vector
@@ -65,8 +69,9 @@ class ArmModel:
 
 @dataclass(frozen=True)
 class Cup:
-    """The cup and how it sits on the flange: `mouth` (m) is the centre of its opening and `axis` (unit vector) points out of
-    it, both in frame 6; `radius` is the inner one, `wall` its thickness, `depth` that of the inside (m)."""
+    """The cup and how it sits on the flange: `mouth` (m) is the centre of its opening and `axis`
+    (unit vector) points out of it, both in frame 6; `radius` is the inner one, `wall` its
+    thickness, `depth` that of the inside (m)."""
 
     mouth: tuple[float, float, float]
     axis: tuple[float, float, float]
@@ -89,7 +94,11 @@ class Cell:
 
 def _numbers(table: Mapping[str, Any], key: str, where: str, length: int) -> tuple[float, ...]:
     value = table.get(key)
-    if not isinstance(value, list) or len(value) != length or not all(isinstance(v, int | float) for v in value):
+    if (
+        not isinstance(value, list)
+        or len(value) != length
+        or not all(isinstance(v, int | float) for v in value)
+    ):
         raise ModelError(f"{where}: {key} must be {length} numbers, is {value!r}")
     return tuple(float(v) for v in value)
 
@@ -102,17 +111,29 @@ def _number(table: Mapping[str, Any], key: str, where: str) -> float:
 
 
 def _column(joints: Sequence[Mapping[str, Any]], key: str, scale: float = 1.0) -> Vector:
-    return np.array([scale * _number(joint, key, f"puma560.toml: joint {i + 1}") for i, joint in enumerate(joints)])
+    return np.array(
+        [
+            scale * _number(joint, key, f"puma560.toml: joint {i + 1}")
+            for i, joint in enumerate(joints)
+        ]
+    )
 
 
 def read_arm(text: str) -> ArmModel:
-    """The arm of a text in the format that the head of `puma560.toml` describes. Raises ModelError."""
+    """The arm of a text in the format that the head of `puma560.toml` describes. Raises
+    ModelError."""
     table = tomllib.loads(text)
     joints, links = table.get("joint", []), table.get("link", [])
     if len(joints) != JOINTS or len(links) != JOINTS:
-        raise ModelError(f"puma560.toml: needs {JOINTS} [[joint]] and [[link]], has {len(joints)} and {len(links)}")
+        raise ModelError(
+            f"puma560.toml: needs {JOINTS} [[joint]] and [[link]], has {len(joints)} and "
+            f"{len(links)}"
+        )
     limits = np.radians(
-        [_numbers(joint, "limits", f"puma560.toml: joint {i + 1}", 2) for i, joint in enumerate(joints)]
+        [
+            _numbers(joint, "limits", f"puma560.toml: joint {i + 1}", 2)
+            for i, joint in enumerate(joints)
+        ]
     )
     body = table.get("body", {})
     degree = math.pi / 180.0
@@ -130,7 +151,12 @@ def read_arm(text: str) -> ArmModel:
         viscous=_column(joints, "viscous"),
         coulomb=_column(joints, "coulomb"),
         links=tuple(_link(link, f"puma560.toml: link {i + 1}") for i, link in enumerate(links)),
-        body=Body(*(_number(body, key, "puma560.toml: body") for key in ("base", "upper_arm", "forearm", "wrist"))),
+        body=Body(
+            *(
+                _number(body, key, "puma560.toml: body")
+                for key in ("base", "upper_arm", "forearm", "wrist")
+            )
+        ),
         flange=_number(table.get("frame", {}), "flange", "puma560.toml: frame"),
         poses=_poses(table.get("poses", {}), limits),
     )
@@ -138,14 +164,23 @@ def read_arm(text: str) -> ArmModel:
 
 def _link(table: Mapping[str, Any], where: str) -> Link:
     centre, inertia = _numbers(table, "centre", where, 3), _numbers(table, "inertia", where, 3)
-    return Link(_number(table, "mass", where), (centre[0], centre[1], centre[2]), (inertia[0], inertia[1], inertia[2]))
+    return Link(
+        _number(table, "mass", where),
+        (centre[0], centre[1], centre[2]),
+        (inertia[0], inertia[1], inertia[2]),
+    )
 
 
 def _poses(table: Mapping[str, Any], limits: Vector) -> dict[str, tuple[float, ...]]:
-    poses = {name: tuple(np.radians(_numbers(table, name, "puma560.toml: poses", JOINTS)).tolist()) for name in table}
+    poses = {
+        name: tuple(np.radians(_numbers(table, name, "puma560.toml: poses", JOINTS)).tolist())
+        for name in table
+    }
     for name, pose in poses.items():
         if np.any(np.asarray(pose) < limits[:, 0]) or np.any(np.asarray(pose) > limits[:, 1]):
-            raise ModelError(f"puma560.toml: poses: {name} lies outside the joint limits: bring it inside")
+            raise ModelError(
+                f"puma560.toml: poses: {name} lies outside the joint limits: bring it inside"
+            )
     return poses
 
 
@@ -156,7 +191,10 @@ def read_cell(text: str) -> Cell:
         if section not in table:
             raise ModelError(f"cell.toml: lacks [{section}]: see services/cell.toml for its keys")
     cup, desk, ball = table["cup"], table["table"], table["ball"]
-    mouth, axis = _numbers(cup, "mouth", "cell.toml: cup", 3), np.array(_numbers(cup, "axis", "cell.toml: cup", 3))
+    mouth, axis = (
+        _numbers(cup, "mouth", "cell.toml: cup", 3),
+        np.array(_numbers(cup, "axis", "cell.toml: cup", 3)),
+    )
     if abs(float(np.linalg.norm(axis)) - 1.0) > 1e-3:
         raise ModelError(f"cell.toml: cup: axis must be a unit vector, is {axis.tolist()}")
     axis = axis / np.linalg.norm(axis)
@@ -179,10 +217,12 @@ def read_cell(text: str) -> Cell:
 @lru_cache(maxsize=1)
 def nominal_arm() -> ArmModel:
     """The arm of the package's own `services/motion/puma560.toml`."""
-    return read_arm(files("services.motion").joinpath("puma560.toml").read_text(encoding="utf-8"))
+    return read_arm(
+        files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
+    )
 
 
 @lru_cache(maxsize=1)
 def nominal_cell() -> Cell:
     """The cell of the package's own `services/cell.toml`."""
-    return read_cell(files("services").joinpath("cell.toml").read_text(encoding="utf-8"))
+    return read_cell(files("petrobot.services").joinpath("cell.toml").read_text(encoding="utf-8"))

@@ -1,4 +1,5 @@
-"""Steering: from a goal to commanded positions, within limits, past the guard, and round what stands in the way."""
+"""Steering: from a goal to commanded positions, within limits, past the guard, and round what
+stands in the way."""
 
 from __future__ import annotations
 
@@ -7,9 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from services.motion.limits import Guard
-from services.motion.model import Vector
-from services.motion.trajectory import Six, Trajectory, synchronised
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import Vector
+from petrobot.services.motion.trajectory import Six, Trajectory, synchronised
 
 CREEP: Final = 0.1
 """Share of the greatest speeds at which an arm leaves a pose that it should not be in."""
@@ -19,16 +20,23 @@ LOOK: Final = 3
 """Cycles on a way round before the straight way is looked at again."""
 
 Retreat = Callable[[Sequence[float]], tuple[float, ...] | None]
-"""Gives the pose that holds the cup as a joint pose does, but further from the table; None if there is none that is clear."""
+"""Gives the pose that holds the cup as a joint pose does, but further from the table; None if there
+is none that is clear."""
 
 
 class Steering:
-    """Moves a trajectory to goals. `move` goes straight in joint space, all joints arriving together; `chase` goes as fast as
-    each joint can. Both go by way of another pose where the straight way is not clear. Angles in rad, speeds in rad/s.
+    """Moves a trajectory to goals. `move` goes straight in joint space, all joints arriving
+    together; `chase` goes as fast as each joint can. Both go by way of another pose where the
+    straight way is not clear. Angles in rad, speeds in rad/s.
     """
 
     def __init__(
-        self, guard: Guard, retreat: Retreat, home: Sequence[float], period: float, acceleration: Vector
+        self,
+        guard: Guard,
+        retreat: Retreat,
+        home: Sequence[float],
+        period: float,
+        acceleration: Vector,
     ) -> None:
         """`acceleration` (rad/s^2, (6,)) are the joints' greatest; speeds are set by `limit`."""
         self._guard = guard
@@ -54,7 +62,8 @@ class Steering:
         self._choose_limits()
 
     def move(self, goal: Sequence[float], share: float = 1.0) -> None:
-        """Go to a joint pose at a share of the greatest speeds. Raises ValueError if the pose is not clear."""
+        """Go to a joint pose at a share of the greatest speeds. Raises ValueError if the pose is
+        not clear."""
         why = self._guard.violation(goal)
         if why:
             raise ValueError(f"pose refused: {why}")
@@ -95,8 +104,8 @@ class Steering:
             self._go_by(self._way_round(self.goal))
 
     def _guarded(self) -> str:
-        """One step past the guard that the arm's present way to rest satisfies; on a way round the closer one. An arm that was
-        switched on where neither is satisfied may leave, creeping."""
+        """One step past the guard that the arm's present way to rest satisfies; on a way round the
+        closer one. An arm that was switched on where neither is satisfied may leave, creeping."""
         trajectory = self.trajectory
         if self._via is None and not self._creeps and self._guard.stops_clear(trajectory):
             return self._guard.advance(trajectory)
@@ -111,7 +120,8 @@ class Steering:
         return ""
 
     def _look_again(self, goal: Sequence[float]) -> None:
-        """Leave the way round if the straight way is clear; take another one where it has come to its end or is refused."""
+        """Leave the way round if the straight way is clear; take another one where it has come to
+        its end or is refused."""
         if self._guard.path_clear(self._rest(), goal):
             self._given_up = 0
             self._go_by(None)
@@ -138,9 +148,12 @@ class Steering:
         self._choose_limits()
 
     def _choose_limits(self) -> None:
-        """On a move or a way round all joints come to its end together, so that the way is straight; a joint that moves already
-        keeps its whole acceleration, to turn round in time."""
-        speed, acceleration = self._speed * self._share, self._acceleration * (self._share if self._together else 1.0)
+        """On a move or a way round all joints come to its end together, so that the way is
+        straight; a joint that moves already keeps its whole acceleration, to turn round in time."""
+        speed, acceleration = (
+            self._speed * self._share,
+            self._acceleration * (self._share if self._together else 1.0),
+        )
         end = self._via or self.goal
         if end is not None and (self._together or self._via is not None):
             speed, gentle = synchronised(np.subtract(end, self._rest()), speed, acceleration)
@@ -148,10 +161,12 @@ class Steering:
         self.trajectory.limit(speed.tolist(), acceleration.tolist())
 
     def _way_round(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Where to go first when the straight way is not clear: to before the goal, back from the table, or home. Those that
-        were given up before come last."""
+        """Where to go first when the straight way is not clear: to before the goal, back from the
+        table, or home. Those that were given up before come last."""
         rest = self._rest()
-        ways = [way for way in (self._retreat(goal), self._retreat(rest), self._home) if way is not None]
+        ways = [
+            way for way in (self._retreat(goal), self._retreat(rest), self._home) if way is not None
+        ]
         turn = self._given_up % len(ways)
         ways = ways[turn:] + ways[:turn]
         return next((way for way in ways if self._close_guard.path_clear(rest, way)), ways[0])

@@ -1,9 +1,11 @@
-"""Online joint trajectories: velocity- and acceleration-limited, re-targeted at any cycle from any state of motion.
+"""Online joint trajectories: velocity- and acceleration-limited, re-targeted at any cycle from any
+state of motion.
 
-Each joint takes in each cycle the greatest velocity from which it can still come to rest exactly on its target by an even
-ramp of whole cycles; that is the discrete time-optimal law (compare Kroeger, "On-line trajectory generation in robotic
-systems", 2010, type II) and needs no planning, so a new target costs nothing. Positions are the trapezoidal sums of the
-velocities: a drive that interpolates linearly in velocity follows them exactly.
+Each joint takes in each cycle the greatest velocity from which it can still come to rest exactly on
+its target by an even ramp of whole cycles; that is the discrete time-optimal law (compare Kroeger,
+"On-line trajectory generation in robotic systems", 2010, type II) and needs no planning, so a new
+target costs nothing. Positions are the trapezoidal sums of the velocities: a drive that
+interpolates linearly in velocity follows them exactly.
 
 Kernels on plain floats, not arrays: six joints a cycle are too few for numpy to pay.
 """
@@ -15,20 +17,23 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from services.comm.compiled import kernel
-from services.motion.model import Vector
+from petrobot.services.comm.compiled import kernel
+from petrobot.services.motion.model import Vector
 
 Six = tuple[float, float, float, float, float, float]
 """One number a joint, base to flange."""
 
 
 @kernel
-def next_velocity(error: float, velocity: float, period: float, speed: float, acceleration: float) -> float:
+def next_velocity(
+    error: float, velocity: float, period: float, speed: float, acceleration: float
+) -> float:
     """Velocity at the end of the next cycle (rad/s) of a joint that has `error` rad to go.
 
-    The change never exceeds `acceleration * period`, nor the result `speed`, unless the joint is faster already (then it
-    brakes). In units of u = v / (a T) and S = 2 (error - v T / 2) / (a T^2), an even ramp from u to rest in k = ceil(u)
-    cycles covers u (k + 1); this solves u (ceil(u) + 1) <= |S| for the greatest u.
+    The change never exceeds `acceleration * period`, nor the result `speed`, unless the joint is
+    faster already (then it brakes). In units of u = v / (a T) and S = 2 (error - v T / 2) / (a
+    T^2), an even ramp from u to rest in k = ceil(u) cycles covers u (k + 1); this solves u (ceil(u)
+    + 1) <= |S| for the greatest u.
     """
     quantum = acceleration * period
     left = error - 0.5 * velocity * period
@@ -45,14 +50,17 @@ def next_velocity(error: float, velocity: float, period: float, speed: float, ac
 
 
 RESIDUE = 1e-6
-"""Share of one cycle's ramp that counts as arrived, so that rounding leaves no creeping; less than 1e-9 rad."""
+"""Share of one cycle's ramp that counts as arrived, so that rounding leaves no creeping; less than
+1e-9 rad."""
 ROUNDING = 1e-9
-"""Cycles by which rounding may carry a ramp of whole cycles; without it a ramp would restart one cycle longer each time."""
+"""Cycles by which rounding may carry a ramp of whole cycles; without it a ramp would restart one
+cycle longer each time."""
 
 
 @kernel
 def braking_velocity(velocity: float, period: float, acceleration: float) -> float:
-    """Velocity at the end of the next cycle of a joint that comes to rest by an even ramp of whole cycles (rad/s)."""
+    """Velocity at the end of the next cycle of a joint that comes to rest by an even ramp of whole
+    cycles (rad/s)."""
     cycles = braking_cycles(velocity, period, acceleration)
     return velocity * (cycles - 1) / cycles if cycles else 0.0
 
@@ -83,7 +91,9 @@ def _gone(period: float, q: Six, qd: Six, after: Six) -> Six:
 
 
 @kernel
-def toward(period: float, q: Six, qd: Six, target: Six, speed: Six, acceleration: Six) -> tuple[Six, Six]:
+def toward(
+    period: float, q: Six, qd: Six, target: Six, speed: Six, acceleration: Six
+) -> tuple[Six, Six]:
     """Positions and velocities at the end of the next cycle on the way to a target."""
     after = (
         next_velocity(target[0] - q[0], qd[0], period, speed[0], acceleration[0]),
@@ -143,7 +153,8 @@ def _brakes_at(angle: float, velocity: float, now: float, time: float) -> float:
 
 @kernel
 def braked_for(now: float, q: Six, qd: Six, times: Six) -> Six:
-    """Where the joints are `now` seconds after they began to brake from here, ways to rest that take `times`."""
+    """Where the joints are `now` seconds after they began to brake from here, ways to rest that
+    take `times`."""
     return (
         _brakes_at(q[0], qd[0], now, times[0]),
         _brakes_at(q[1], qd[1], now, times[1]),
@@ -155,7 +166,8 @@ def braked_for(now: float, q: Six, qd: Six, times: Six) -> Six:
 
 
 def reach_time(error: Vector, velocity: Vector, speed: Vector, acceleration: Vector) -> Vector:
-    """Least time (s) to come to rest `error` rad away, from `velocity` rad/s, under the limits; any shapes that broadcast.
+    """Least time (s) to come to rest `error` rad away, from `velocity` rad/s, under the limits; any
+    shapes that broadcast.
 
     Continuous time; `Trajectory` needs at most two cycles more.
     """
@@ -170,7 +182,8 @@ def reach_time(error: Vector, velocity: Vector, speed: Vector, acceleration: Vec
 
 
 def synchronised(error: Vector, speed: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
-    """Limits (speed, acceleration), each (6,), under which all joints start and end a move from rest at one time.
+    """Limits (speed, acceleration), each (6,), under which all joints start and end a move from
+    rest at one time.
 
     Slowing a joint's time by 1 / s scales its speed by s and its acceleration by s^2.
     """
@@ -192,14 +205,19 @@ def six(values: Iterable[float]) -> Six:
 
 
 class Trajectory:
-    """The commanded motion of the arm's joints, advanced by one period a call. Angles in rad, speeds in rad/s.
+    """The commanded motion of the arm's joints, advanced by one period a call. Angles in rad,
+    speeds in rad/s.
 
-    `target` None means: come to rest. Limits may be changed at any time; a joint beyond new limits brakes into them. Braking to
-    rest always uses the accelerations given first.
+    `target` None means: come to rest. Limits may be changed at any time; a joint beyond new limits
+    brakes into them. Braking to rest always uses the accelerations given first.
     """
 
     def __init__(
-        self, q: Sequence[float], period: float, speed: Sequence[float], acceleration: Sequence[float]
+        self,
+        q: Sequence[float],
+        period: float,
+        speed: Sequence[float],
+        acceleration: Sequence[float],
     ) -> None:
         self.period = period
         self.q: Six = six(q)
@@ -213,7 +231,9 @@ class Trajectory:
         self.speed: Six = six(speed)
         self.acceleration: Six = six(acceleration)
         if not (min(self.speed) > 0.0 and min(self.acceleration) > 0.0):
-            raise ValueError(f"limits must be positive, are {self.speed} rad/s and {self.acceleration} rad/s^2")
+            raise ValueError(
+                f"limits must be positive, are {self.speed} rad/s and {self.acceleration} rad/s^2"
+            )
 
     def aim(self, target: Sequence[float] | None) -> None:
         """Go to a joint pose, or come to rest."""
@@ -238,7 +258,8 @@ class Trajectory:
         return rest_of(self.period, q, qd, self.brakes)
 
     def stopping(self, q: Six, qd: Six, *shares: float) -> Iterator[Six]:
-        """Where the joints are after shares of the time that braking from here takes, the slowest joint deciding."""
+        """Where the joints are after shares of the time that braking from here takes, the slowest
+        joint deciding."""
         times = braking_times(self.period, qd, self.brakes)
         longest = max(times)
         for share in shares:
@@ -257,4 +278,6 @@ class Trajectory:
         """Whether the commanded motion rests on its target (rad)."""
         if self.target is None:
             return self.still
-        return self.still and all(abs(t - q) <= tolerance for t, q in zip(self.target, self.q, strict=True))
+        return self.still and all(
+            abs(t - q) <= tolerance for t, q in zip(self.target, self.q, strict=True)
+        )

@@ -1,7 +1,9 @@
-"""The camera's primitive actions: locate a rolling ball in five ways, track it and predict where it leaves in three ways.
+"""The camera's primitive actions: locate a rolling ball in five ways, track it and predict where it
+leaves in three ways.
 
-Every locator gives `ball`, plain data with which every tracker goes on: `places` rows [dt, x, y] (s relative to the image
-`sequence`, m, base frame), their accuracy `sigma` (m), and the `age` (s) of that image when the locator ended.
+Every locator gives `ball`, plain data with which every tracker goes on: `places` rows [dt, x, y] (s
+relative to the image `sequence`, m, base frame), their accuracy `sigma` (m), and the `age` (s) of
+that image when the locator ended.
 """
 
 from __future__ import annotations
@@ -9,10 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from services.action import Context, Result
-from services.vision.camera import Camera
-from services.vision.locating import LocateSpecification, locate
-from services.vision.location import (
+from petrobot.services.action import Context, Result
+from petrobot.services.vision.camera import Camera
+from petrobot.services.vision.locating import LocateSpecification, locate
+from petrobot.services.vision.location import (
     BackgroundSubtraction,
     CompensatedSubtraction,
     Detector,
@@ -20,8 +22,14 @@ from services.vision.location import (
     HoughCircles,
     MixtureOfGaussians,
 )
-from services.vision.prediction import ConstantVelocity, Kalman, LeastSquares, Predictor, Surface
-from services.vision.tracking import TrackSpecification, track
+from petrobot.services.vision.prediction import (
+    ConstantVelocity,
+    Kalman,
+    LeastSquares,
+    Predictor,
+    Surface,
+)
+from petrobot.services.vision.tracking import TrackSpecification, track
 
 
 def _background(camera: Camera) -> Detector:
@@ -45,39 +53,45 @@ def _threshold(camera: Camera) -> Detector:
 
 
 async def locate_background(ctx: Context, **options: float) -> Result:
-    """Locate a rolling ball by subtracting the stored picture of the empty table: accurate and cheap in steady light.
+    """Locate a rolling ball by subtracting the stored picture of the empty table: accurate and
+    cheap in steady light.
 
-    Options: those of `LocateSpecification`. SUCCESS and FAILURE (cause `inaccurate` or `late`) give `ball` and `images`;
-    ERROR has cause `no_ball`, `no_image` or `bad_image`.
+    Options: those of `LocateSpecification`. SUCCESS and FAILURE (cause `inaccurate` or `late`) give
+    `ball` and `images`; ERROR has cause `no_ball`, `no_image` or `bad_image`.
     """
     return await locate(ctx, "background", _background, 0.0007, LocateSpecification.of(options))
 
 
 async def locate_mog2(ctx: Context, **options: float) -> Result:
-    """Locate a rolling ball by a mixture-of-Gaussians background (MOG2): follows changing light, costs most. As
-    `locate_background`."""
+    """Locate a rolling ball by a mixture-of-Gaussians background (MOG2): follows changing light,
+    costs most. As `locate_background`."""
     return await locate(ctx, "mog2", _mog2, 0.0022, LocateSpecification.of(options))
 
 
 async def locate_hough(ctx: Context, **options: float) -> Result:
-    """Locate a rolling ball as a moving circle: needs no background, coarse. As `locate_background`."""
+    """Locate a rolling ball as a moving circle: needs no background, coarse. As
+    `locate_background`."""
     return await locate(ctx, "hough", _hough, 0.0028, LocateSpecification.of(options))
 
 
 async def locate_threshold(ctx: Context, **options: float) -> Result:
-    """Locate a rolling ball as what is brighter than one grey level: cheapest, fails in uneven or dim light. As
-    `locate_background`."""
+    """Locate a rolling ball as what is brighter than one grey level: cheapest, fails in uneven or
+    dim light. As `locate_background`."""
     return await locate(ctx, "threshold", _threshold, 0.0015, LocateSpecification.of(options))
 
 
 async def locate_compensated(ctx: Context, **options: float) -> Result:
-    """Locate a rolling ball by subtracting the stored picture, scaled to the light of each image: as accurate, also where the
-    lamps beat or were switched. As `locate_background`."""
+    """Locate a rolling ball by subtracting the stored picture, scaled to the light of each image:
+    as accurate, also where the lamps beat or were switched. As `locate_background`."""
     return await locate(ctx, "compensated", _compensated, 0.0007, LocateSpecification.of(options))
 
 
 async def _predict(
-    ctx: Context, make: Callable[[Surface], Predictor], ball: Mapping[str, Any], stream: str, options: dict[str, float]
+    ctx: Context,
+    make: Callable[[Surface], Predictor],
+    ball: Mapping[str, Any],
+    stream: str,
+    options: dict[str, float],
 ) -> Result:
     return await track(ctx, make, ball, stream, TrackSpecification.of(options))
 
@@ -85,11 +99,13 @@ async def _predict(
 async def predict_least_squares(
     ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
 ) -> Result:
-    """Track the ball and stream its predicted exit by least squares with sliding and rolling deceleration.
+    """Track the ball and stream its predicted exit by least squares with sliding and rolling
+    deceleration.
 
-    Publishes [time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t] (s, m, m/s) at each image until the ball leaves the table.
-    Options: those of `TrackSpecification`. SUCCESS: the predictions agreed in time; FAILURE: `unsteady`, `late`, `side_exit` or
-    `stays`; ERROR: `ball_lost`, `no_image`, `bad_image` or `bad_ball`. Values: `exit`, `images`, `seen`.
+    Publishes [time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t] (s, m, m/s) at each image until
+    the ball leaves the table. Options: those of `TrackSpecification`. SUCCESS: the predictions
+    agreed in time; FAILURE: `unsteady`, `late`, `side_exit` or `stays`; ERROR: `ball_lost`,
+    `no_image`, `bad_image` or `bad_ball`. Values: `exit`, `images`, `seen`.
     """
     return await _predict(ctx, LeastSquares, ball, stream, options)
 
@@ -97,7 +113,8 @@ async def predict_least_squares(
 async def predict_kalman(
     ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
 ) -> Result:
-    """Track the ball and stream its predicted exit by an extended Kalman filter. As `predict_least_squares`."""
+    """Track the ball and stream its predicted exit by an extended Kalman filter. As
+    `predict_least_squares`."""
     return await _predict(ctx, Kalman, ball, stream, options)
 
 

@@ -1,7 +1,9 @@
-"""The calibration command: a folder of board images becomes calibration.toml; images not there yet are taken from a camera.
+"""The calibration command: a folder of board images becomes calibration.toml; images not there yet
+are taken from a camera.
 
-The folder's views.toml lists the board and the images with the known poses (docs/vision.md shows one). `add_arguments`, `run` and
-EXAMPLE serve `petrobot calibrate`; `calibrate_main` is the same without it (python -m services.vision.calibrate).
+The folder's views.toml lists the board and the images with the known poses (docs/vision.md shows
+one). `add_arguments`, `run` and EXAMPLE serve `petrobot calibrate`; `calibrate_main` is the same
+without it (python -m petrobot.services.vision.calibrate).
 """
 
 from __future__ import annotations
@@ -16,11 +18,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.comm.camera import open_images
-from services.comm.image import ImageSource
-from services.comm.whole_file import write_whole
-from services.vision.calibration import Calibration, CalibrationError, calibrate, find_corners
-from services.vision.calibration_file import (
+from petrobot.services.comm.camera import open_images
+from petrobot.services.comm.image import ImageSource
+from petrobot.services.comm.whole_file import write_whole
+from petrobot.services.vision.calibration import (
+    Calibration,
+    CalibrationError,
+    calibrate,
+    find_corners,
+)
+from petrobot.services.vision.calibration_file import (
     CalibrationFileError,
     calibration_text,
     missing_views,
@@ -37,21 +44,43 @@ EXIT_BAD_INPUT = 2
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument(
-        "--views", type=Path, required=True, metavar="DIR", help="folder with views.toml and board images"
+        "--views",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder with views.toml and board images",
     )
-    parser.add_argument("--output", type=Path, default=Path("calibration.toml"), metavar="FILE", help="what to write")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("calibration.toml"),
+        metavar="FILE",
+        help="what to write",
+    )
     parser.add_argument(
         "--source",
         metavar="SOURCE",
         help='camera that takes the images not there yet: "capture:0", "file:PATH" or "sim"',
     )
-    parser.add_argument("--address", default="", metavar="HOST:PORT", help="of the simulated camera, with --source sim")
+    parser.add_argument(
+        "--address",
+        default="",
+        metavar="HOST:PORT",
+        help="of the simulated camera, with --source sim",
+    )
 
 
-def run(options: argparse.Namespace, say: Callable[[str], None] = print, wait: Callable[[str], str] = input) -> int:
+def run(
+    options: argparse.Namespace,
+    say: Callable[[str], None] = print,
+    wait: Callable[[str], str] = input,
+) -> int:
     """Calibrate; gives the exit code. `say` prints, `wait` asks the operator to place the board."""
     if not options.output.parent.is_dir():  # told before the work, not after it
-        print(f"calibrate: {options.output}: there is no folder {options.output.parent}; make it", file=sys.stderr)
+        print(
+            f"calibrate: {options.output}: there is no folder {options.output.parent}; make it",
+            file=sys.stderr,
+        )
         return EXIT_BAD_INPUT
     try:
         if options.source:
@@ -64,7 +93,10 @@ def run(options: argparse.Namespace, say: Callable[[str], None] = print, wait: C
         print(f"calibrate: {fault}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except OSError as fault:
-        text = f"{fault.filename or options.output}: {fault.strerror or fault}; name a file that can be used"
+        text = (
+            f"{fault.filename or options.output}: {fault.strerror or fault}; name a file "
+            "that can be used"
+        )
         print(f"calibrate: {text}", file=sys.stderr)
         return EXIT_BAD_INPUT
     say(report(found, len(views)))
@@ -78,15 +110,20 @@ def report(found: Calibration, views: int) -> str:
     return "\n".join(
         [
             f"board seen whole in {found.views} of {views} images",
-            f"corners within {found.residual_px:.3f} px rms, known places within {found.table_residual * 1e3:.2f} mm rms",
-            f"a point of the table is known to {found.table_sigma * 1e3:.2f} mm (standard deviation)",
+            f"corners within {found.residual_px:.3f} px rms, known places within "
+            f"{found.table_residual * 1e3:.2f} mm rms",
+            f"a point of the table is known to {found.table_sigma * 1e3:.2f} mm (standard "
+            "deviation)",
             f"focal length {found.optics.focal[0]:.1f} px, camera at ({x:.4f}, {y:.4f}, {z:.4f}) m",
         ]
     )
 
 
-def take_missing(folder: Path, source: ImageSource, say: Callable[[str], None], wait: Callable[[str], str]) -> None:
-    """Take each image that views.toml lists and the folder lacks. Raises ConnectionError when the camera is dead."""
+def take_missing(
+    folder: Path, source: ImageSource, say: Callable[[str], None], wait: Callable[[str], str]
+) -> None:
+    """Take each image that views.toml lists and the folder lacks. Raises ConnectionError when the
+    camera is dead."""
     files, board = missing_views(folder)
     if not files:
         return
@@ -121,7 +158,9 @@ def _settled(source: ImageSource) -> Pixels:
 
 def calibrate_main(argv: Sequence[str] | None = None) -> int:
     """Command line of its own; gives the exit code: 0 written, 2 bad input."""
-    parser = argparse.ArgumentParser(prog="calibrate", description=__doc__, epilog=f"example:\n  {EXAMPLE}")
+    parser = argparse.ArgumentParser(
+        prog="calibrate", description=__doc__, epilog=f"example:\n  {EXAMPLE}"
+    )
     add_arguments(parser)
     return run(parser.parse_args(argv))
 

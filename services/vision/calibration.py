@@ -1,9 +1,11 @@
-"""Calibration from images of a chessboard: lens, distortion and the camera's place in the base frame, solved together.
+"""Calibration from images of a chessboard: lens, distortion and the camera's place in the base
+frame, solved together.
 
-Views whose board pose in the base frame is known (laid on the table at measured places) fix the camera to the base; views
-held by hand at any tilt fix the lens. Start: OpenCV's calibrateCamera (Zhang 2000). Then one least-squares problem over all
-unknowns: intrinsics, camera pose, and each view's pose, known ones held to their measured value by a prior of its accuracy
-(bundle adjustment; no hand-eye routine is needed, which OpenCV 5 dropped). Pure: images in, calibration out.
+Views whose board pose in the base frame is known (laid on the table at measured places) fix the
+camera to the base; views held by hand at any tilt fix the lens. Start: OpenCV's calibrateCamera
+(Zhang 2000). Then one least-squares problem over all unknowns: intrinsics, camera pose, and each
+view's pose, known ones held to their measured value by a prior of its accuracy (bundle adjustment;
+no hand-eye routine is needed, which OpenCV 5 dropped). Pure: images in, calibration out.
 """
 
 from __future__ import annotations
@@ -15,14 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.vision.optics import Optics
+from petrobot.services.vision.optics import Optics
 
 Array = NDArray[np.float64]
 
 CORNER_SIGMA_PX = 0.07
 """px, accuracy of a chessboard corner (residual of calibrations at 3 grey levels of noise)."""
 CORNER_WINDOW = 5
-"""px, half width of the window in which a corner is refined; less than half a square's side in any view."""
+"""px, half width of the window in which a corner is refined; less than half a square's side in any
+view."""
 PLACEMENT_SIGMA = 0.0003
 """m, accuracy to which the place of a board on the table is known."""
 PLACEMENT_TURN = 0.0005
@@ -38,8 +41,9 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A chessboard of `columns` x `rows` inner corners, squares of `square` m; its frame has its origin at the first corner,
-    beside the black square that touches the board's printed corner, x along the columns, z out of the board."""
+    """A chessboard of `columns` x `rows` inner corners, squares of `square` m; its frame has its
+    origin at the first corner, beside the black square that touches the board's printed corner, x
+    along the columns, z out of the board."""
 
     columns: int = 9
     rows: int = 6
@@ -48,12 +52,16 @@ class Board:
     def points(self) -> Array:
         """Inner corners (rows * columns, 3) in the board's frame (m)."""
         y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(float)
-        return np.stack([x.ravel(), y.ravel(), np.zeros(self.rows * self.columns)], axis=-1) * self.square
+        return (
+            np.stack([x.ravel(), y.ravel(), np.zeros(self.rows * self.columns)], axis=-1)
+            * self.square
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """One image of the board, grey levels (height, width); `pose` (4, 4): board frame to base frame where it is known."""
+    """One image of the board, grey levels (height, width); `pose` (4, 4): board frame to base frame
+    where it is known."""
 
     pixels: NDArray[np.uint8]
     pose: Array | None = None
@@ -68,14 +76,19 @@ class Calibration:
     residual_px: float
     """rms distance of corners from where the calibrated camera expects them."""
     table_residual: float
-    """m, rms distance on the board's plane between corners of the known views and their stated places."""
+    """m, rms distance on the board's plane between corners of the known views and their stated
+    places."""
     table_sigma: float
-    """m, standard deviation (from the fit's covariance) of a point of the table, rms over the image."""
+    """m, standard deviation (from the fit's covariance) of a point of the table, rms over the
+    image."""
 
 
 def find_corners(pixels: NDArray[np.uint8], board: Board) -> Array | None:
-    """Inner corners (n, 2) px in the order of `Board.points`; None when the board is not seen whole."""
-    found, corners = cv2.findChessboardCornersSB(pixels, (board.columns, board.rows), None, cv2.CALIB_CB_ACCURACY)
+    """Inner corners (n, 2) px in the order of `Board.points`; None when the board is not seen
+    whole."""
+    found, corners = cv2.findChessboardCornersSB(
+        pixels, (board.columns, board.rows), None, cv2.CALIB_CB_ACCURACY
+    )
     if not found or corners is None:
         return None
     limit = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.001)
@@ -88,7 +101,8 @@ def find_corners(pixels: NDArray[np.uint8], board: Board) -> Array | None:
 
 
 def _begins_black(pixels: NDArray[np.uint8], corners: Array, board: Board) -> bool:
-    """Whether the inner square at the first corner is black: tells the board from itself turned by 180 degrees."""
+    """Whether the inner square at the first corner is black: tells the board from itself turned by
+    180 degrees."""
     grid = corners.reshape(board.rows, board.columns, 2)
 
     def square(row: int, column: int) -> float:
@@ -100,19 +114,29 @@ def _begins_black(pixels: NDArray[np.uint8], corners: Array, board: Board) -> bo
 
 def calibrate(views: Sequence[BoardView], board: Board) -> Calibration:
     """Calibrate from board images. Raises CalibrationError when they do not suffice."""
-    seen = [(corners, view) for view in views if (corners := find_corners(view.pixels, board)) is not None]
+    seen = [
+        (corners, view)
+        for view in views
+        if (corners := find_corners(view.pixels, board)) is not None
+    ]
     known = sum(view.pose is not None for _, view in seen)
     if len(seen) < FEWEST_VIEWS or known < FEWEST_KNOWN:
         raise CalibrationError(
-            f"the whole board is seen in {len(seen)} of {len(views)} images, {known} of them with a known pose; "
+            f"the whole board is seen in {len(seen)} of {len(views)} images, {known} of them "
+            "with a known pose; "
             f"take at least {FEWEST_VIEWS}, {FEWEST_KNOWN} of them at known places of the table"
         )
     height, width = seen[0][1].pixels.shape
-    return adjust([corners for corners, _ in seen], [view.pose for _, view in seen], board, (width, height))
+    return adjust(
+        [corners for corners, _ in seen], [view.pose for _, view in seen], board, (width, height)
+    )
 
 
-def adjust(corners: Sequence[Array], poses: Sequence[Array | None], board: Board, size: tuple[int, int]) -> Calibration:
-    """Calibrate from the corners (n, 2) px of each view, its pose (4, 4) or None, and the image's width and height.
+def adjust(
+    corners: Sequence[Array], poses: Sequence[Array | None], board: Board, size: tuple[int, int]
+) -> Calibration:
+    """Calibrate from the corners (n, 2) px of each view, its pose (4, 4) or None, and the image's
+    width and height.
 
     Raises CalibrationError when the views do not determine the camera.
     """
@@ -120,11 +144,16 @@ def adjust(corners: Sequence[Array], poses: Sequence[Array | None], board: Board
 
 
 class _Adjustment:
-    """The least-squares problem. Unknowns: lens (8), camera pose (6: turn and shift), one pose (6) a view: of a known view its
-    deviation from the stated pose in the board's frame, of any other the board in the camera's frame."""
+    """The least-squares problem. Unknowns: lens (8), camera pose (6: turn and shift), one pose (6)
+    a view: of a known view its deviation from the stated pose in the board's frame, of any other
+    the board in the camera's frame."""
 
     def __init__(
-        self, board: Board, corners: Sequence[Array], poses: Sequence[Array | None], size: tuple[int, int]
+        self,
+        board: Board,
+        corners: Sequence[Array],
+        poses: Sequence[Array | None],
+        size: tuple[int, int],
     ) -> None:
         self._points = board.points()
         self._corners = corners
@@ -133,18 +162,27 @@ class _Adjustment:
 
     def solve(self) -> Calibration:
         """Start from calibrateCamera, refine all together, report residuals."""
-        # not above: a node that only reads a calibration would load all of it for nothing, a third of its start
+        # not above: a node that only reads a calibration would load all of it for nothing, a third
+        # of its start
         from scipy.optimize import least_squares
 
         start = self._start()
-        fit = least_squares(self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10)
+        fit = least_squares(
+            self._residuals, start, self._slopes, method="lm", x_scale="jac", xtol=1e-10
+        )
         if not fit.success:
-            raise CalibrationError(f"the calibration does not converge ({fit.message}); take more and sharper images")
+            raise CalibrationError(
+                f"the calibration does not converge ({fit.message}); take more and sharper images"
+            )
         optics = self._optics(fit.x)
         count = 2 * len(self._points) * len(self._corners)
         residual = float(np.sqrt(2.0 * np.mean(fit.fun[:count] ** 2))) * CORNER_SIGMA_PX
         return Calibration(
-            optics, len(self._corners), residual, self._table_residual(optics), self._table_sigma(fit.x, fit.jac)
+            optics,
+            len(self._corners),
+            residual,
+            self._table_residual(optics),
+            self._table_sigma(fit.x, fit.jac),
         )
 
     def _start(self) -> Array:
@@ -158,17 +196,26 @@ class _Adjustment:
             np.zeros(5),
             flags=cv2.CALIB_FIX_K3,
         )
-        placed = [_pose(np.ravel(turn), np.ravel(shift)) for turn, shift in zip(turns, shifts, strict=True)]
+        placed = [
+            _pose(np.ravel(turn), np.ravel(shift))
+            for turn, shift in zip(turns, shifts, strict=True)
+        ]
         first = next(i for i, pose in enumerate(self._poses) if pose is not None)
         base = placed[first] @ np.linalg.inv(np.asarray(self._poses[first]))
-        parts = [[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], np.ravel(distortion)[:4], _vector(base)]
+        parts = [
+            [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]],
+            np.ravel(distortion)[:4],
+            _vector(base),
+        ]
         parts += [
-            np.zeros(6) if known is not None else _vector(p) for known, p in zip(self._poses, placed, strict=True)
+            np.zeros(6) if known is not None else _vector(p)
+            for known, p in zip(self._poses, placed, strict=True)
         ]
         return np.concatenate([np.asarray(part, float) for part in parts])
 
     def _residuals(self, unknown: Array) -> Array:
-        """Corner residuals in units of their accuracy, then the deviations of the known views in units of theirs."""
+        """Corner residuals in units of their accuracy, then the deviations of the known views in
+        units of theirs."""
         fx, fy, cx, cy = unknown[:4]
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
@@ -181,12 +228,15 @@ class _Adjustment:
                 pose = base @ known @ pose
                 priors.append(own / accuracy)
             turn = cv2.Rodrigues(pose[:3, :3])[0]
-            expected = cv2.projectPoints(self._points, turn, pose[:3, 3], matrix, unknown[4:LENS])[0]
+            expected = cv2.projectPoints(self._points, turn, pose[:3, 3], matrix, unknown[4:LENS])[
+                0
+            ]
             parts.append((expected.reshape(-1, 2) - corners).ravel() / CORNER_SIGMA_PX)
         return np.concatenate(parts + priors)
 
     def _slopes(self, unknown: Array) -> Array:
-        """Jacobian by central differences; a view's pose moves its own residuals only, so all views are moved at once."""
+        """Jacobian by central differences; a view's pose moves its own residuals only, so all views
+        are moved at once."""
         rows = 2 * len(self._points)
         views = len(self._corners)
         own_rows = np.arange(views * rows).reshape(views, rows)
@@ -194,7 +244,9 @@ class _Adjustment:
         for k in range(LENS + 6):
             step = np.zeros(len(unknown))
             step[k] = 1e-6 * max(1.0, abs(unknown[k]))
-            slopes[:, k] = (self._residuals(unknown + step) - self._residuals(unknown - step)) / (2.0 * step[k])
+            slopes[:, k] = (self._residuals(unknown + step) - self._residuals(unknown - step)) / (
+                2.0 * step[k]
+            )
         for k in range(6):
             columns = LENS + 6 + 6 * np.arange(views) + k
             step = np.zeros(len(unknown))
@@ -202,7 +254,11 @@ class _Adjustment:
             change = (self._residuals(unknown + step) - self._residuals(unknown - step)) / 2e-6
             for view, column in enumerate(columns):
                 slopes[own_rows[view], column] = change[own_rows[view]]
-            known = [column for column, pose in zip(columns, self._poses, strict=True) if pose is not None]
+            known = [
+                column
+                for column, pose in zip(columns, self._poses, strict=True)
+                if pose is not None
+            ]
             prior_rows = views * rows + 6 * np.arange(len(known)) + k
             slopes[prior_rows, known] = change[prior_rows]
         return slopes
@@ -210,20 +266,28 @@ class _Adjustment:
     def _optics(self, unknown: Array) -> Optics:
         fx, fy, cx, cy, k1, k2, p1, p2 = (float(value) for value in unknown[:LENS])
         base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
-        return Optics((fx, fy), (cx, cy), (k1, k2, p1, p2), base[:3, :3], -base[:3, :3].T @ base[:3, 3])
+        return Optics(
+            (fx, fy), (cx, cy), (k1, k2, p1, p2), base[:3, :3], -base[:3, :3].T @ base[:3, 3]
+        )
 
     def _table_residual(self, optics: Optics) -> float:
         squares = []
         for corners, pose in zip(self._corners, self._poses, strict=True):
             if pose is not None:
                 stated = self._points @ pose[:3, :3].T + pose[:3, 3]
-                squares.append(np.sum((optics.to_plane(corners, float(pose[2, 3])) - stated[:, :2]) ** 2, axis=-1))
+                squares.append(
+                    np.sum(
+                        (optics.to_plane(corners, float(pose[2, 3])) - stated[:, :2]) ** 2, axis=-1
+                    )
+                )
         return float(np.sqrt(np.mean(squares)))
 
     def _table_sigma(self, unknown: Array, jacobian: Array) -> float:
         """Propagate the fit's covariance to the plane of the known views, at a grid of pixels."""
         covariance = np.linalg.pinv(jacobian.T @ jacobian)[: LENS + 6, : LENS + 6]
-        u, v = np.meshgrid(np.linspace(0, self._size[0] - 1, 9), np.linspace(0, self._size[1] - 1, 7))
+        u, v = np.meshgrid(
+            np.linspace(0, self._size[0] - 1, 9), np.linspace(0, self._size[1] - 1, 7)
+        )
         grid = np.stack([u.ravel(), v.ravel()], axis=-1)
         z = float(np.mean([pose[2, 3] for pose in self._poses if pose is not None]))
         middle = self._optics(unknown).to_plane(grid, z).ravel()

@@ -1,4 +1,5 @@
-"""The calibration on disk: calibration.toml in and out, and folders of board images with their poses."""
+"""The calibration on disk: calibration.toml in and out, and folders of board images with their
+poses."""
 
 from __future__ import annotations
 
@@ -11,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.vision.calibration import Board, BoardView, Calibration
-from services.vision.optics import Array, Optics
+from petrobot.services.vision.calibration import Board, BoardView, Calibration
+from petrobot.services.vision.optics import Array, Optics
 
 SCHEMA = 1
 DEFAULT = Path(__file__).with_name("calibration.toml")
@@ -20,7 +21,8 @@ DEFAULT = Path(__file__).with_name("calibration.toml")
 
 
 class CalibrationFileError(ValueError):
-    """A calibration file or a folder of views that cannot be used; the text names file, key and remedy."""
+    """A calibration file or a folder of views that cannot be used; the text names file, key and
+    remedy."""
 
 
 def calibration_text(calibration: Calibration) -> str:
@@ -54,11 +56,14 @@ def _numbers(values: Any) -> str:
 
 
 def parse_calibration(text: str, name: str) -> Calibration:
-    """Read a calibration's TOML; `name` is the file, for the fault's text. Raises CalibrationFileError."""
+    """Read a calibration's TOML; `name` is the file, for the fault's text. Raises
+    CalibrationFileError."""
     try:
         data = tomllib.loads(text)
         if data.get("schema") != SCHEMA:
-            raise CalibrationFileError(f"{name}: schema must be {SCHEMA}; remake it with petrobot calibrate")
+            raise CalibrationFileError(
+                f"{name}: schema must be {SCHEMA}; remake it with petrobot calibrate"
+            )
         lens, pose = data["lens"], data["pose"]
         optics = Optics(
             _tuple(lens["focal_px"], 2),
@@ -70,13 +75,19 @@ def parse_calibration(text: str, name: str) -> Calibration:
         quality = (float(data[key]) for key in ("residual_px", "table_residual", "table_sigma"))
         calibration = Calibration(optics, int(data["views"]), *quality)
     except tomllib.TOMLDecodeError as fault:
-        raise CalibrationFileError(f"{name}: no TOML ({fault}); remake it with petrobot calibrate") from fault
+        raise CalibrationFileError(
+            f"{name}: no TOML ({fault}); remake it with petrobot calibrate"
+        ) from fault
     except KeyError as fault:
-        raise CalibrationFileError(f"{name}: key {fault} is missing; remake it with petrobot calibrate") from fault
+        raise CalibrationFileError(
+            f"{name}: key {fault} is missing; remake it with petrobot calibrate"
+        ) from fault
     except (TypeError, ValueError) as fault:
         raise CalibrationFileError(f"{name}: {fault}; remake it with petrobot calibrate") from fault
     if not np.allclose(optics.rotation @ optics.rotation.T, np.eye(3), atol=1e-6):
-        raise CalibrationFileError(f"{name}: [pose] rotation is no rotation; remake it with petrobot calibrate")
+        raise CalibrationFileError(
+            f"{name}: [pose] rotation is no rotation; remake it with petrobot calibrate"
+        )
     return calibration
 
 
@@ -89,15 +100,17 @@ def _tuple(values: Sequence[float], count: int) -> Any:
 def read_views(folder: Path) -> tuple[list[BoardView], Board]:
     """Board images of a folder, as its views.toml lists them.
 
-    views.toml: `[board] columns, rows, square` and for each image `[[views]] file`, with `pose` (4 rows of 4 numbers, board frame
-    to base frame, m) where the board lay at a known place. Raises CalibrationFileError.
+    views.toml: `[board] columns, rows, square` and for each image `[[views]] file`, with `pose` (4
+    rows of 4 numbers, board frame to base frame, m) where the board lay at a known place. Raises
+    CalibrationFileError.
     """
     board, entries = _listed(folder)
     return [BoardView(_grey(path), pose) for path, pose in entries], board
 
 
 def missing_views(folder: Path) -> tuple[list[tuple[Path, bool]], Board]:
-    """Images that views.toml lists and the folder lacks, each with whether its pose is known, and the board.
+    """Images that views.toml lists and the folder lacks, each with whether its pose is known, and
+    the board.
 
     Raises CalibrationFileError.
     """
@@ -109,14 +122,22 @@ def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
     path = folder / "views.toml"
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-        board = Board(int(data["board"]["columns"]), int(data["board"]["rows"]), float(data["board"]["square"]))
+        board = Board(
+            int(data["board"]["columns"]),
+            int(data["board"]["rows"]),
+            float(data["board"]["square"]),
+        )
         entries = [(folder / str(entry["file"]), _pose(entry, path)) for entry in data["views"]]
     except OSError as fault:
-        raise CalibrationFileError(f"{path}: cannot be read ({fault.strerror}); it lists the board images") from fault
+        raise CalibrationFileError(
+            f"{path}: cannot be read ({fault.strerror}); it lists the board images"
+        ) from fault
     except tomllib.TOMLDecodeError as fault:
         raise CalibrationFileError(f"{path}: no TOML ({fault}); mend that line") from fault
     except KeyError as fault:
-        raise CalibrationFileError(f"{path}: key {fault} is missing; docs/vision.md shows such a file") from fault
+        raise CalibrationFileError(
+            f"{path}: key {fault} is missing; docs/vision.md shows such a file"
+        ) from fault
     return board, entries
 
 
@@ -126,7 +147,9 @@ def _pose(entry: Mapping[str, Any], path: Path) -> Array | None:
     try:
         return np.array(entry["pose"], float).reshape(4, 4)
     except (TypeError, ValueError) as fault:
-        raise CalibrationFileError(f"{path}: pose of {entry['file']} needs 4 rows of 4 numbers") from fault
+        raise CalibrationFileError(
+            f"{path}: pose of {entry['file']} needs 4 rows of 4 numbers"
+        ) from fault
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
@@ -136,5 +159,7 @@ def _grey(path: Path) -> NDArray[np.uint8]:
         )
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
-        raise CalibrationFileError(f"{path}: no image; mend `file` in views.toml or take the image again")
+        raise CalibrationFileError(
+            f"{path}: no image; mend `file` in views.toml or take the image again"
+        )
     return np.asarray(pixels, np.uint8)

@@ -1,4 +1,5 @@
-"""The driver of a camera over the table: starts and stops images, hands them to actions, keeps what was learned between runs."""
+"""The driver of a camera over the table: starts and stops images, hands them to actions, keeps what
+was learned between runs."""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from services.action import Context
-from services.comm.image import Image
-from services.device import Ports, refuse_unknown_keys
-from services.vision.calibration_file import DEFAULT, parse_calibration
-from services.vision.location import Background, Detector
-from services.vision.prediction import Surface
-from services.vision.table import TableView
+from petrobot.services.action import Context
+from petrobot.services.comm.image import Image
+from petrobot.services.device import Ports, refuse_unknown_keys
+from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
+from petrobot.services.vision.location import Background, Detector
+from petrobot.services.vision.prediction import Surface
+from petrobot.services.vision.table import TableView
 
 KEYS = ("calibration", "cell", "rate", "threads")
 """Its own keys in services.toml."""
@@ -39,7 +40,8 @@ class CameraError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What an action saw in an image, for the operator: places in px, shape (n, 2), or `table` places in m for what it predicts."""
+    """What an action saw in an image, for the operator: places in px, shape (n, 2), or `table`
+    places in m for what it predicts."""
 
     label: str
     pixels: Any = ()
@@ -47,10 +49,12 @@ class Mark:
 
 
 class Camera:
-    """A device without cyclic duty. Its keys in services.toml, all optional but those of its source:
+    """A device without cyclic duty. Its keys in services.toml, all optional but those of its
+    source:
 
-    `calibration`: file beside services.toml (default: the simulated camera's); `cell`: the cell's data (default: the shipped one);
-    `rate`: images/s (default: the cell's); `threads`: for OpenCV (default 1: cores are shared with other nodes).
+    `calibration`: file beside services.toml (default: the simulated camera's); `cell`: the cell's
+    data (default: the shipped one); `rate`: images/s (default: the cell's); `threads`: for OpenCV
+    (default 1: cores are shared with other nodes).
     """
 
     period: float | None = None
@@ -85,7 +89,8 @@ class Camera:
         return self._rate
 
     def start(self, rate: float = 0.0) -> bool:
-        """Have images taken at `rate` (1/s; 0: the usual one). False when they went on at that rate already.
+        """Have images taken at `rate` (1/s; 0: the usual one). False when they went on at that rate
+        already.
 
         Raises ConnectionError when the source cannot be opened.
         """
@@ -104,7 +109,8 @@ class Camera:
         self._rate, self._newest = 0.0, None
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
-        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError for one of another size."""
+        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError
+        for one of another size."""
         await ctx.wait(self._arrived, timeout)
         image, self._newest = self._newest, None
         if image is None:
@@ -112,7 +118,8 @@ class Camera:
         if image.pixels.shape != (self.view.height_px, self.view.width_px):
             high, wide = image.pixels.shape
             raise CameraError(
-                f"the camera gives {wide}x{high} images, the cell's are {self.view.width_px}x{self.view.height_px}: "
+                f"the camera gives {wide}x{high} images, the cell's are "
+                f"{self.view.width_px}x{self.view.height_px}: "
                 "change [camera] of the cell and calibrate again"
             )
         self._count += 1
@@ -147,7 +154,11 @@ class Camera:
 
     def state(self) -> Mapping[str, Any]:
         """Plain data for operator and report."""
-        return {"rate": self._rate, "images": self._count, "background_images": self.background.images}
+        return {
+            "rate": self._rate,
+            "images": self._count,
+            "background_images": self.background.images,
+        }
 
     def picture(self) -> Mapping[str, Any]:
         """The image read last with what was seen in it, as a JPEG; empty before the first."""
@@ -169,16 +180,33 @@ class Camera:
         }
 
     def _shapes(self, mark: Mark) -> list[dict[str, Any]]:
-        """A mark in the page's words: circles where something was found, one path along what was predicted."""
+        """A mark in the page's words: circles where something was found, one path along what was
+        predicted."""
         found = [(float(x), float(y)) for x, y in mark.pixels]
         shapes: list[dict[str, Any]] = [
-            {"kind": "circle", "role": "found", "label": mark.label, "x": x, "y": y, "r": SHOWN_RADIUS_PX}
+            {
+                "kind": "circle",
+                "role": "found",
+                "label": mark.label,
+                "x": x,
+                "y": y,
+                "r": SHOWN_RADIUS_PX,
+            }
             for x, y in found[:MOST_SHOWN]
         ]
-        ahead = [[float(v) for v in self.view.to_pixels(np.asarray(point, dtype=float))] for point in mark.table]
+        ahead = [
+            [float(v) for v in self.view.to_pixels(np.asarray(point, dtype=float))]
+            for point in mark.table
+        ]
         if ahead:
             shapes.append({"kind": "path", "role": "predicted", "points": ahead})
-            last = {"kind": "point", "role": "predicted", "label": mark.label, "x": ahead[-1][0], "y": ahead[-1][1]}
+            last = {
+                "kind": "point",
+                "role": "predicted",
+                "label": mark.label,
+                "x": ahead[-1][0],
+                "y": ahead[-1][1],
+            }
             shapes.append(last)
         return shapes
 
@@ -206,7 +234,9 @@ class Camera:
 def _rate(value: Any) -> float:
     """Images/s as configured."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= 1000.0:
-        raise CameraError(f"camera: rate = {value!r} images/s; give a number above 0 and at most 1000, such as 50")
+        raise CameraError(
+            f"camera: rate = {value!r} images/s; give a number above 0 and at most 1000, such as 50"
+        )
     return float(value)
 
 

@@ -1,6 +1,8 @@
-"""Which candidates are a rolling ball: those that, image after image, lie on one straight line at one fitting speed.
+"""Which candidates are a rolling ball: those that, image after image, lie on one straight line at
+one fitting speed.
 
-Stickers, glare and the arm also make candidates; they do not roll towards the near edge. Pure: times (s) and places come in.
+Stickers, glare and the arm also make candidates; they do not roll towards the near edge. Pure:
+times (s) and places come in.
 """
 
 from __future__ import annotations
@@ -16,8 +18,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A ball that was seen to roll: `times` (n,) s, `places` (n, 2) m, `velocity` (2,) m/s and the `residual` (m, rms) of the
-    places about the straight line of even speed through them."""
+    """A ball that was seen to roll: `times` (n,) s, `places` (n, 2) m, `velocity` (2,) m/s and the
+    `residual` (m, rms) of the places about the straight line of even speed through them."""
 
     times: Array
     places: Array
@@ -42,7 +44,8 @@ class Rolling:
 
 
 class Confirmation:
-    """Joins candidates of successive images to tracks, and confirms one that has `count` of them."""
+    """Joins candidates of successive images to tracks, and confirms one that has `count` of
+    them."""
 
     MOST = 40
     MISSED = 3
@@ -55,7 +58,8 @@ class Confirmation:
         self._missed: list[int] = []
 
     def add(self, time: float, places: Sequence[Sequence[float]] | Array) -> Track | None:
-        """Take the candidates (n, 2) m of the image of `time` (s, rising); a track as soon as one is confirmed."""
+        """Take the candidates (n, 2) m of the image of `time` (s, rising); a track as soon as one
+        is confirmed."""
         free = [(time, float(x), float(y)) for x, y in places]
         kept, missed = [], []
         for track, misses in zip(self._tracks, self._missed, strict=True):
@@ -70,7 +74,9 @@ class Confirmation:
         fresh = [[candidate] for candidate in free if candidate not in used]
         self._tracks = (kept + fresh)[-self.MOST :]
         self._missed = (missed + [0] * len(fresh))[-self.MOST :]
-        confirmed = [found for track in self._tracks if (found := self._confirmed(track)) is not None]
+        confirmed = [
+            found for track in self._tracks if (found := self._confirmed(track)) is not None
+        ]
         return min(confirmed, key=lambda found: found.residual) if confirmed else None
 
     def _extension(
@@ -84,13 +90,18 @@ class Confirmation:
                 best, least = candidate, away
         return best
 
-    def _misfit(self, track: list[tuple[float, float, float]], candidate: tuple[float, float, float]) -> float:
+    def _misfit(
+        self, track: list[tuple[float, float, float]], candidate: tuple[float, float, float]
+    ) -> float:
         """How badly a candidate goes on with a track (m); inf when not at all."""
         t, x, y = track[-1]
         step = candidate[0] - t
         vx, vy = (candidate[1] - x) / step, (candidate[2] - y) / step
         speed = float(np.hypot(vx, vy))
-        if not self._rolling.slowest <= speed <= self._rolling.fastest or vx > self._rolling.towards:
+        if (
+            not self._rolling.slowest <= speed <= self._rolling.fastest
+            or vx > self._rolling.towards
+        ):
             return float("inf")
         if len(track) == 1:
             return speed * step
@@ -104,7 +115,9 @@ class Confirmation:
             return None
         rows = np.array(track)
         offset, velocity = _line(rows)
-        residual = float(np.sqrt(np.mean(np.sum((rows[:, 1:] - offset - rows[:, :1] * velocity) ** 2, axis=1))))
+        residual = float(
+            np.sqrt(np.mean(np.sum((rows[:, 1:] - offset - rows[:, :1] * velocity) ** 2, axis=1)))
+        )
         way = float(np.hypot(*(rows[-1, 1:] - rows[0, 1:])))
         if residual > self._rolling.spread or way < self._rolling.shortest:
             return None
@@ -112,7 +125,8 @@ class Confirmation:
 
 
 def _line(rows: Array) -> tuple[Array, Array]:
-    """Place at time 0 (2,) and velocity (2,) of the straight line of even speed through rows t, x, y."""
+    """Place at time 0 (2,) and velocity (2,) of the straight line of even speed through rows t, x,
+    y."""
     middle = rows.mean(axis=0)
     off = rows - middle
     velocity = off[:, 0] @ off[:, 1:] / max(float(off[:, 0] @ off[:, 0]), 1e-12)

@@ -1,16 +1,17 @@
-"""Locating: reads images until candidates of a detector are confirmed as a ball that rolls towards the near edge."""
+"""Locating: reads images until candidates of a detector are confirmed as a ball that rolls towards
+the near edge."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from services.action import Cancelled, Context, Result, error, failure, success
-from services.comm.image import Image
-from services.vision.camera import Camera, CameraError, Mark
-from services.vision.confirmation import Confirmation, Track
-from services.vision.location import Detector, MixtureOfGaussians
-from services.vision.specification import Specification
+from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.comm.image import Image
+from petrobot.services.vision.camera import Camera, CameraError, Mark
+from petrobot.services.vision.confirmation import Confirmation, Track
+from petrobot.services.vision.location import Detector, MixtureOfGaussians
+from petrobot.services.vision.specification import Specification
 
 LEARN_EVERY = 10
 """Images: the stored background takes in every so manieth one."""
@@ -35,9 +36,14 @@ class LocateSpecification(Specification):
 
 
 async def locate(
-    ctx: Context, name: str, make: Callable[[Camera], Detector], sigma: float, specification: LocateSpecification
+    ctx: Context,
+    name: str,
+    make: Callable[[Camera], Detector],
+    sigma: float,
+    specification: LocateSpecification,
 ) -> Result:
-    """Locate with the detector that `make` makes, kept by the camera under `name`; `sigma`: its accuracy (m).
+    """Locate with the detector that `make` makes, kept by the camera under `name`; `sigma`: its
+    accuracy (m).
 
     Images go on after SUCCESS and FAILURE, for the tracker; they end with ERROR.
     """
@@ -58,7 +64,9 @@ async def locate(
 class _Search:
     """One run of a locator."""
 
-    def __init__(self, ctx: Context, camera: Camera, detector: Detector, specification: LocateSpecification) -> None:
+    def __init__(
+        self, ctx: Context, camera: Camera, detector: Detector, specification: LocateSpecification
+    ) -> None:
         self._ctx = ctx
         self._camera = camera
         self._detector = detector
@@ -74,9 +82,13 @@ class _Search:
         over = self._ctx.now + asked.timeout
         silent = self._ctx.now
         while self._ctx.now < over:
-            image = await self._camera.read(self._ctx, min(over, silent + asked.image_timeout) - self._ctx.now)
+            image = await self._camera.read(
+                self._ctx, min(over, silent + asked.image_timeout) - self._ctx.now
+            )
             if image is None and self._ctx.now >= silent + asked.image_timeout:
-                return error("no_image", f"no image for {asked.image_timeout} s", images=self._images)
+                return error(
+                    "no_image", f"no image for {asked.image_timeout} s", images=self._images
+                )
             if image is None:
                 continue
             silent = self._ctx.now
@@ -104,13 +116,21 @@ class _Search:
             "age": self._ctx.now - image.time,
             "sigma": sigma,
             "places": [
-                [float(t - image.time), float(x), float(y)] for t, (x, y) in zip(track.times, track.places, strict=True)
+                [float(t - image.time), float(x), float(y)]
+                for t, (x, y) in zip(track.times, track.places, strict=True)
             ],
         }
         values = {"ball": ball, "images": self._images, "residual": track.residual, "ahead": ahead}
         if ahead < asked.min_ahead:
-            return failure("late", f"confirmed {ahead:.2f} m before the near edge, not {asked.min_ahead} m", **values)
+            return failure(
+                "late",
+                f"confirmed {ahead:.2f} m before the near edge, not {asked.min_ahead} m",
+                **values,
+            )
         if track.residual > asked.max_residual:
-            text = f"places scatter by {track.residual * 1e3:.1f} mm, not {asked.max_residual * 1e3:.1f} mm"
+            text = (
+                f"places scatter by {track.residual * 1e3:.1f} mm, not "
+                f"{asked.max_residual * 1e3:.1f} mm"
+            )
             return failure("inaccurate", text, **values)
         return success(**values)

@@ -1,8 +1,9 @@
-"""Where the ball is in an image: five detectors over the whole table that differ in what they cost and what deceives them,
-and the measurement in a small window with which a known ball is tracked.
+"""Where the ball is in an image: five detectors over the whole table that differ in what they cost
+and what deceives them, and the measurement in a small window with which a known ball is tracked.
 
-Every detector takes an image (height, width) uint8 and gives candidates (n, 2): the ball's centre in pixels. They keep state
-of their own kind; time, cameras and the question which candidate is the ball (`confirmation.py`) are none of theirs.
+Every detector takes an image (height, width) uint8 and gives candidates (n, 2): the ball's centre
+in pixels. They keep state of their own kind; time, cameras and the question which candidate is the
+ball (`confirmation.py`) are none of theirs.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.vision.table import TableView
+from petrobot.services.vision.table import TableView
 
 Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
@@ -25,9 +26,11 @@ _NEIGHBOURS: Pixels = np.ones((3, 3), np.uint8)
 HALF = 2
 """Detectors over the whole table look at images of half the size first."""
 SMALLEST, LARGEST = 0.45, 1.9
-"""Area of a candidate, relative to the area that a ball (with the streak of the fastest one) covers."""
+"""Area of a candidate, relative to the area that a ball (with the streak of the fastest one)
+covers."""
 ROUNDEST_FILL = 0.55
-"""A disc fills pi/4 of its bounding box, a streaked one more; scattered pixels and slanting stripes less."""
+"""A disc fills pi/4 of its bounding box, a streaked one more; scattered pixels and slanting stripes
+less."""
 FASTEST = 3.5
 """m/s, the fastest ball that is looked for."""
 
@@ -42,8 +45,8 @@ class Detector(Protocol):
 class Background:
     """Mean grey levels of the empty table, learned from images and kept between runs.
 
-    The first `first` images count equally, each later one `rate`: slow light is followed, and a ball that
-    passes leaves less than a detector's threshold.
+    The first `first` images count equally, each later one `rate`: slow light is followed, and a
+    ball that passes leaves less than a detector's threshold.
     """
 
     def __init__(self, first: int = 5, rate: float = 0.08) -> None:
@@ -70,13 +73,17 @@ class Background:
 
 
 def ball_blobs(mask: Pixels, radius: float, streak: float) -> Array:
-    """Centroids (n, 2) of the regions of a mask (0 or 255) that have a ball's size and shape; radius and streak in its px."""
+    """Centroids (n, 2) of the regions of a mask (0 or 255) that have a ball's size and shape;
+    radius and streak in its px."""
     if cv2.countNonZero(mask) == 0:  # most often: nothing rolls
         return NOTHING
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count <= 1:
         return NOTHING
-    area, wide, high = (stats[1:, k].astype(float) for k in (cv2.CC_STAT_AREA, cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
+    area, wide, high = (
+        stats[1:, k].astype(float)
+        for k in (cv2.CC_STAT_AREA, cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT)
+    )
     disc = np.pi * radius * radius
     largest = 2.0 * radius * 1.35 + streak + 2.0
     good = (
@@ -90,7 +97,8 @@ def ball_blobs(mask: Pixels, radius: float, streak: float) -> Array:
 
 
 class _WholeTable:
-    """What detectors over the whole table share: the cut-out of the table, at half size, and the way back to pixels."""
+    """What detectors over the whole table share: the cut-out of the table, at half size, and the
+    way back to pixels."""
 
     def __init__(self, view: TableView) -> None:
         self.view = view
@@ -102,7 +110,10 @@ class _WholeTable:
     def half(self, pixels: Pixels) -> Pixels:
         """The table at half the size, each pixel the mean of four."""
         return np.asarray(
-            cv2.resize(pixels[self._rows, self._columns], self._half_size, interpolation=cv2.INTER_AREA), np.uint8
+            cv2.resize(
+                pixels[self._rows, self._columns], self._half_size, interpolation=cv2.INTER_AREA
+            ),
+            np.uint8,
         )
 
     def blobs(self, mask: Pixels) -> Array:
@@ -111,7 +122,8 @@ class _WholeTable:
         return self.on_table(self.from_half(ball_blobs(mask, self.view.radius_px / HALF, streak)))
 
     def from_half(self, centres: Array) -> Array:
-        """Pixels of the image from those of the half-size cut-out (pixel centres at whole numbers in both)."""
+        """Pixels of the image from those of the half-size cut-out (pixel centres at whole numbers
+        in both)."""
         return np.asarray(centres * HALF + (HALF - 1) / 2.0 + self._corner)
 
     def on_table(self, pixels: Array) -> Array:
@@ -120,8 +132,8 @@ class _WholeTable:
 
 
 class BackgroundSubtraction(_WholeTable):
-    """What is brighter than the stored picture of the empty table. Cheap and accurate; blind when the light has changed by
-    more than its threshold since the picture was learned."""
+    """What is brighter than the stored picture of the empty table. Cheap and accurate; blind when
+    the light has changed by more than its threshold since the picture was learned."""
 
     THRESHOLD = 24.0
     """Grey levels: 16 sigma of the half-size noise, a fifth of a ball's contrast in full light."""
@@ -142,7 +154,9 @@ class BackgroundSubtraction(_WholeTable):
             self._halved, self._half_picture = picture, self.half(picture)
         found = []
         for centre in self.blobs(self._mask(self.half(pixels), self._half_picture)):
-            seen = self._window.measure(pixels, picture, centre, streak=self.view.streak_px(FASTEST))
+            seen = self._window.measure(
+                pixels, picture, centre, streak=self.view.streak_px(FASTEST)
+            )
             if seen is not None:
                 found.append(seen.centre)
         return np.array(found) if found else NOTHING
@@ -150,12 +164,15 @@ class BackgroundSubtraction(_WholeTable):
     def _mask(self, half: Pixels, empty: Pixels) -> Pixels:
         """Where an image is brighter than the empty table (0 or 255), both at half size."""
         brighter = cv2.subtract(half, empty)
-        return np.asarray(cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1], np.uint8)
+        return np.asarray(
+            cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1], np.uint8
+        )
 
 
 class CompensatedSubtraction(BackgroundSubtraction):
-    """What is brighter than the stored picture in the light of this very image: the picture is scaled by how much brighter the
-    whole table has become. Stands light that beats, switches or drifts, as long as all of the table is lit alike."""
+    """What is brighter than the stored picture in the light of this very image: the picture is
+    scaled by how much brighter the whole table has become. Stands light that beats, switches or
+    drifts, as long as all of the table is lit alike."""
 
     LEAST_THRESHOLD = 10.0
     """Grey levels: 6 sigma of the half-size noise."""
@@ -168,14 +185,17 @@ class CompensatedSubtraction(BackgroundSubtraction):
 
 
 class MixtureOfGaussians(_WholeTable):
-    """OpenCV's MOG2 (Zivkovic 2004): several grey levels a pixel, each with its own spread, learned all the time. Follows
-    changing light; costs most, and needs some images before it knows the table."""
+    """OpenCV's MOG2 (Zivkovic 2004): several grey levels a pixel, each with its own spread, learned
+    all the time. Follows changing light; costs most, and needs some images before it knows the
+    table."""
 
     WARM_UP = 6
 
     def __init__(self, view: TableView) -> None:
         super().__init__(view)
-        self._model: Any = cv2.createBackgroundSubtractorMOG2(history=60, varThreshold=30.0, detectShadows=True)
+        self._model: Any = cv2.createBackgroundSubtractorMOG2(
+            history=60, varThreshold=30.0, detectShadows=True
+        )
         self._images = 0
 
     def forget(self) -> None:
@@ -194,8 +214,8 @@ class MixtureOfGaussians(_WholeTable):
 
 
 class HoughCircles(_WholeTable):
-    """Circles of the ball's size by OpenCV's gradient Hough transform. Needs no background and no certain light; coarse, and
-    every round thing is a candidate."""
+    """Circles of the ball's size by OpenCV's gradient Hough transform. Needs no background and no
+    certain light; coarse, and every round thing is a candidate."""
 
     EDGE, VOTES = 60.0, 11.0
     MOST = 12
@@ -216,11 +236,14 @@ class HoughCircles(_WholeTable):
         )
         if circles is None:
             return NOTHING
-        return self.on_table(np.asarray(circles, float).reshape(-1, 3)[: self.MOST, :2] + self._corner)
+        return self.on_table(
+            np.asarray(circles, float).reshape(-1, 3)[: self.MOST, :2] + self._corner
+        )
 
 
 class FixedThreshold(_WholeTable):
-    """All that is brighter than one grey level. Cheapest, needs no background; fails where the light is uneven or changes."""
+    """All that is brighter than one grey level. Cheapest, needs no background; fails where the
+    light is uneven or changes."""
 
     def __init__(self, view: TableView, level: float = 160.0) -> None:
         super().__init__(view)
@@ -234,15 +257,17 @@ class FixedThreshold(_WholeTable):
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A ball measured in a window: `centre` (2,) px, `cover`: seen area relative to the expected one."""
+    """A ball measured in a window: `centre` (2,) px, `cover`: seen area relative to the expected
+    one."""
 
     centre: Array
     cover: float
 
 
 class Window:
-    """Measures a ball whose place is about known. The light's change since the background was learned is taken from the
-    window itself; a ball partly hidden by arm or cup, or merged with them, is not measured."""
+    """Measures a ball whose place is about known. The light's change since the background was
+    learned is taken from the window itself; a ball partly hidden by arm or cup, or merged with
+    them, is not measured."""
 
     CONTRAST = 25.0
     """Grey levels that a ball is brighter than the background at least."""
@@ -252,9 +277,15 @@ class Window:
         self.view = view
 
     def measure(
-        self, pixels: Pixels, background: Pixels, expected: Array, streak: float = 0.0, spread: float = 4.0
+        self,
+        pixels: Pixels,
+        background: Pixels,
+        expected: Array,
+        streak: float = 0.0,
+        spread: float = 4.0,
     ) -> Seen | None:
-        """The ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its longest way during the exposure (px).
+        """The ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its longest
+        way during the exposure (px).
 
         None where no ball is seen whole.
         """
@@ -287,13 +318,17 @@ class Window:
     def _box(self, expected: Array, reach: int) -> tuple[slice, slice] | None:
         u, v = round(float(expected[0])), round(float(expected[1]))
         left, top = max(0, u - reach), max(0, v - reach)
-        right, bottom = min(self.view.width_px, u + reach + 1), min(self.view.height_px, v + reach + 1)
+        right, bottom = (
+            min(self.view.width_px, u + reach + 1),
+            min(self.view.height_px, v + reach + 1),
+        )
         if right - left < reach or bottom - top < reach:
             return None
         return slice(top, bottom), slice(left, right)
 
     def _cover(self, region: Pixels, background: Pixels) -> NDArray[np.float32] | None:
-        """How much of each pixel the ball covers: 0 background, 1 ball; from its own grey level where it is brightest."""
+        """How much of each pixel the ball covers: 0 background, 1 ball; from its own grey level
+        where it is brightest."""
         gain = _median(region) / max(_median(background), 1.0)
         empty = background.astype(np.float32) * gain
         brighter = region - empty
@@ -305,7 +340,13 @@ class Window:
         return np.asarray(brighter / np.maximum(level - empty, self.CONTRAST), np.float32)
 
     def _nearest(
-        self, area: NDArray[Any], centres: Array, middle: Array, smallest: float, largest: float, spread: float
+        self,
+        area: NDArray[Any],
+        centres: Array,
+        middle: Array,
+        smallest: float,
+        largest: float,
+        spread: float,
     ) -> int | None:
         """The region of a whole ball's area that is nearest to the expected place."""
         (u, v), best, least = middle.tolist(), None, math.inf
@@ -317,13 +358,18 @@ class Window:
         return best
 
     def _centroid(
-        self, cover: NDArray[np.float32], mine: NDArray[np.bool_], stats: NDArray[Any], box: tuple[slice, slice]
+        self,
+        cover: NDArray[np.float32],
+        mine: NDArray[np.bool_],
+        stats: NDArray[Any],
+        box: tuple[slice, slice],
     ) -> Seen | None:
         left, top, wide, high, area = (int(value) for value in stats)
         if left == 0 or top == 0 or left + wide == cover.shape[1] or top + high == cover.shape[0]:
             return None  # cut by the window or the image's border
         part = slice(top - 1, top + high + 1), slice(left - 1, left + wide + 1)
-        # pixels of the rim count by the part that is covered, all others fully, also on the ball's shaded side
+        # pixels of the rim count by the part that is covered, all others fully, also on the ball's
+        # shaded side
         weight = np.minimum(np.maximum((cover[part] - 0.15) / 0.30, 0.0), 1.0)
         weight *= cv2.dilate(mine[part].view(np.uint8), _NEIGHBOURS)
         total = float(weight.sum())

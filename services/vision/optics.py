@@ -1,7 +1,9 @@
-"""The camera as its calibration knows it: base-frame points to pixels, and pixels back to a plane above the table, exactly.
+"""The camera as its calibration knows it: base-frame points to pixels, and pixels back to a plane
+above the table, exactly.
 
-Pinhole with Brown's distortion in OpenCV's order k1 k2 p1 p2 (D. C. Brown, "Decentering distortion of lenses", 1966).
-Lengths in m, base frame; pixels are (u, v), u to the right, whole numbers at pixel centres.
+Pinhole with Brown's distortion in OpenCV's order k1 k2 p1 p2 (D. C. Brown, "Decentering distortion
+of lenses", 1966). Lengths in m, base frame; pixels are (u, v), u to the right, whole numbers at
+pixel centres.
 """
 
 from __future__ import annotations
@@ -17,13 +19,14 @@ Array = NDArray[np.float64]
 Number = TypeVar("Number", float, Array)
 
 NEWTON_STEPS = 4
-"""Newton's method on the distortion: 4 steps leave less than 1e-9 px inside the image (tests/vision/test_optics.py)."""
+"""Newton's method on the distortion: 4 steps leave less than 1e-9 px inside the image
+(tests/vision/test_optics.py)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A calibrated camera: `focal` and `centre` (px), `distortion` k1 k2 p1 p2, and its pose: a base-frame point p has camera
-    coordinates `rotation @ (p - position)`."""
+    """A calibrated camera: `focal` and `centre` (px), `distortion` k1 k2 p1 p2, and its pose: a
+    base-frame point p has camera coordinates `rotation @ (p - position)`."""
 
     focal: tuple[float, float]
     centre: tuple[float, float]
@@ -60,7 +63,10 @@ class Optics:
         seen = (at - self.position) @ self.rotation.T
         x, y = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
         bent_x, bent_y, *_ = self._bend(x, y)
-        return np.stack([self.focal[0] * bent_x + self.centre[0], self.focal[1] * bent_y + self.centre[1]], axis=-1)
+        return np.stack(
+            [self.focal[0] * bent_x + self.centre[0], self.focal[1] * bent_y + self.centre[1]],
+            axis=-1,
+        )
 
     def _pixel(self, px: float, py: float, pz: float) -> tuple[float, float]:
         """One point, as in tracking: plain floats are much faster than arrays without dimension."""
@@ -68,32 +74,39 @@ class Optics:
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self.rotation.tolist()
         dx, dy, dz = px - ox, py - oy, pz - oz
         depth = dx * zx + dy * zy + dz * zz
-        bent_x, bent_y, *_ = self._bend((dx * xx + dy * xy + dz * xz) / depth, (dx * yx + dy * yy + dz * yz) / depth)
+        bent_x, bent_y, *_ = self._bend(
+            (dx * xx + dy * xy + dz * xz) / depth, (dx * yx + dy * yy + dz * yz) / depth
+        )
         return self.focal[0] * bent_x + self.centre[0], self.focal[1] * bent_y + self.centre[1]
 
     def _place(self, u: float, v: float, z: float) -> tuple[float, float]:
         """One pixel through the plane."""
-        x, y = self._straighten((u - self.centre[0]) / self.focal[0], (v - self.centre[1]) / self.focal[1])
+        x, y = self._straighten(
+            (u - self.centre[0]) / self.focal[0], (v - self.centre[1]) / self.focal[1]
+        )
         ox, oy, oz = self.position.tolist()
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self.rotation.tolist()
         distance = (z - oz) / (x * xz + y * yz + zz)
         return ox + distance * (x * xx + y * yx + zx), oy + distance * (x * xy + y * yy + zy)
 
     def to_plane(self, pixels: ArrayLike, z: float) -> Array:
-        """Points (..., 2), x and y, where pixels (..., 2) look through the horizontal plane at height `z` (m)."""
+        """Points (..., 2), x and y, where pixels (..., 2) look through the horizontal plane at
+        height `z` (m)."""
         at = np.asarray(pixels, float)
         if at.ndim == 1:
             u, v = at.tolist()
             return np.array(self._place(u, v, z))
         x, y = self._straighten(
-            (at[..., 0] - self.centre[0]) / self.focal[0], (at[..., 1] - self.centre[1]) / self.focal[1]
+            (at[..., 0] - self.centre[0]) / self.focal[0],
+            (at[..., 1] - self.centre[1]) / self.focal[1],
         )
         direction = np.stack([x, y, np.ones_like(x)], axis=-1) @ self.rotation
         distance = (z - self.position[2]) / direction[..., 2]
         return np.asarray(self.position[:2] + distance[..., None] * direction[..., :2])
 
     def scale(self, point: ArrayLike) -> float:
-        """Pixels per metre near a point (3,): its size in the image is about so many pixels a metre across."""
+        """Pixels per metre near a point (3,): its size in the image is about so many pixels a metre
+        across."""
         depth = float(self.rotation[2] @ (np.asarray(point, float) - self.position))
         return (self.focal[0] + self.focal[1]) / 2.0 / depth
 
@@ -116,5 +129,8 @@ class Optics:
         for _ in range(NEWTON_STEPS):
             at_x, at_y, xx, xy, yy = self._bend(x, y)
             off_x, off_y, determinant = at_x - bent_x, at_y - bent_y, xx * yy - xy * xy
-            x, y = x - (yy * off_x - xy * off_y) / determinant, y - (xx * off_y - xy * off_x) / determinant
+            x, y = (
+                x - (yy * off_x - xy * off_y) / determinant,
+                y - (xx * off_y - xy * off_x) / determinant,
+            )
         return x, y

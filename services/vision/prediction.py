@@ -1,8 +1,10 @@
-"""Where and when a rolling ball leaves the table, from where it was seen: three predictors of different effort.
+"""Where and when a rolling ball leaves the table, from where it was seen: three predictors of
+different effort.
 
-A ball on a table first slides while its spin is less than that of pure rolling (a hollow ball with spin share s settles at
-(3 + 2 s) / 5 of its speed), then rolls and loses a constant c g of speed a second, on a straight line all the while. The
-coefficient c is known to +-30 % only; sliding ends some tenths of a second after the release. Pure; s, m, base frame.
+A ball on a table first slides while its spin is less than that of pure rolling (a hollow ball with
+spin share s settles at (3 + 2 s) / 5 of its speed), then rolls and loses a constant c g of speed a
+second, on a straight line all the while. The coefficient c is known to +-30 % only; sliding ends
+some tenths of a second after the release. Pure; s, m, base frame.
 """
 
 from __future__ import annotations
@@ -20,10 +22,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SLIDING, SLIDING_SIGMA = 2.5, 1.5
-"""m/s^2, deceleration of a sliding ball before anything is known: friction coefficient 0.25 +- 0.15."""
+"""m/s^2, deceleration of a sliding ball before anything is known: friction coefficient 0.25 +-
+0.15."""
 LARGEST_LOSS, LOSS_SIGMA = 0.12, 0.02
-"""Share of its speed that a ball loses by sliding at most, and how sharp that bound is: a thrown ball has at least 70 % of the
-spin of pure rolling, so it settles at 88 % of its speed or more."""
+"""Share of its speed that a ball loses by sliding at most, and how sharp that bound is: a thrown
+ball has at least 70 % of the spin of pure rolling, so it settles at 88 % of its speed or more."""
 
 
 class Way(StrEnum):
@@ -37,8 +40,9 @@ class Way(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Exit:
-    """Prediction of where the ball's centre passes the edge: `time` on the observations' clock, `point` and `velocity` (2,),
-    standard deviations of the time and of the place along the edge. For `Way.STAYS` time is inf."""
+    """Prediction of where the ball's centre passes the edge: `time` on the observations' clock,
+    `point` and `velocity` (2,), standard deviations of the time and of the place along the edge.
+    For `Way.STAYS` time is inf."""
 
     way: Way
     time: float
@@ -50,8 +54,9 @@ class Exit:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """The table as the ball's centre meets it, and how it slows the ball. `rolling` and `rolling_sigma`: deceleration of a
-    rolling ball and how uncertain it is (m/s^2); `noise`: standard deviation of a seen place (m)."""
+    """The table as the ball's centre meets it, and how it slows the ball. `rolling` and
+    `rolling_sigma`: deceleration of a rolling ball and how uncertain it is (m/s^2); `noise`:
+    standard deviation of a seen place (m)."""
 
     near_edge: float
     half_width: float
@@ -61,13 +66,20 @@ class Surface:
 
     @classmethod
     def of(cls, cell: Mapping[str, Any], spread: float = 0.30) -> Surface:
-        """From the cell's data; `spread`: the rolling resistance lies evenly within +- this part of the nominal."""
+        """From the cell's data; `spread`: the rolling resistance lies evenly within +- this part of
+        the nominal."""
         table, ball = cell["table"], cell["ball"]
         rolling = float(ball["rolling_resistance"]) * float(ball["gravity"])
-        return cls(float(table["near_edge"]), float(table["width"]) / 2.0, rolling, spread / np.sqrt(3.0) * rolling)
+        return cls(
+            float(table["near_edge"]),
+            float(table["width"]) / 2.0,
+            rolling,
+            spread / np.sqrt(3.0) * rolling,
+        )
 
     def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, Way]:
-        """Way along `heading` (2,) from `place` (2,) to the edge that comes first, and which one; inf when none does."""
+        """Way along `heading` (2,) from `place` (2,) to the edge that comes first, and which one;
+        inf when none does."""
         side = np.inf
         if abs(heading[1]) > 1e-9:
             side = (np.copysign(self.half_width, heading[1]) - place[1]) / heading[1]
@@ -84,8 +96,8 @@ class Predictor(Protocol):
     """Observations taken."""
 
     def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
-        """Take the place (m) where the ball was seen at a time (s, rising), with its standard deviation (m; None: the
-        surface's)."""
+        """Take the place (m) where the ball was seen at a time (s, rising), with its standard
+        deviation (m; None: the surface's)."""
 
     def place(self, time: float) -> Array:
         """Where the ball is expected (2,). Needs two observations."""
@@ -95,7 +107,8 @@ class Predictor(Protocol):
 
 
 class ConstantVelocity:
-    """A straight line of even speed through the last places. The cheapest; knows neither sliding nor rolling resistance."""
+    """A straight line of even speed through the last places. The cheapest; knows neither sliding
+    nor rolling resistance."""
 
     def __init__(self, surface: Surface, last: int = 10) -> None:
         self._surface = surface
@@ -160,18 +173,21 @@ class _Solution(NamedTuple):
 
 
 class LeastSquares:
-    """Least squares over all places since the ball was first seen: a straight line in space; along it a start, a speed, the
-    rolling deceleration (known to its prior), and sliding until one of several moments.
+    """Least squares over all places since the ball was first seen: a straight line in space; along
+    it a start, a speed, the rolling deceleration (known to its prior), and sliding until one of
+    several moments.
 
-    Each moment is a linear model with its own normal equations, kept up by addition; models are weighed by their evidence
-    (Bayesian model averaging), so no moment has to be guessed and the effort for a place never grows.
+    Each moment is a linear model with its own normal equations, kept up by addition; models are
+    weighed by their evidence (Bayesian model averaging), so no moment has to be guessed and the
+    effort for a place never grows.
     """
 
     MOMENTS = np.array([0.0, 0.02, 0.04, 0.06, 0.08, 0.10, 0.13, 0.16, 0.20, 0.26])
     """s after the first place: sliding ends there."""
 
     def __init__(self, surface: Surface, rolling_sigma: float | None = None) -> None:
-        """`rolling_sigma`: 0 takes the surface's rolling deceleration for known; None takes its uncertainty."""
+        """`rolling_sigma`: 0 takes the surface's rolling deceleration for known; None takes its
+        uncertainty."""
         self._surface = surface
         sigma = max(surface.rolling_sigma if rolling_sigma is None else rolling_sigma, 1e-6)
         self._prior = np.array([0.0, 0.0, sigma**-2.0, SLIDING_SIGMA**-2.0])
@@ -184,7 +200,8 @@ class LeastSquares:
         self.count = 0
 
     def _basis(self, t: float | Array) -> Array:
-        """(models, 4) at one time or at each model's own: start, speed, rolling and sliding deceleration."""
+        """(models, 4) at one time or at each model's own: start, speed, rolling and sliding
+        deceleration."""
         basis = np.empty((len(self.MOMENTS), 4))
         self._fill(basis, t)
         return basis
@@ -216,7 +233,8 @@ class LeastSquares:
         return xx - x * x / weight, xy - x * y / weight, yy - y * y / weight
 
     def _heading(self) -> tuple[float, float]:
-        """Direction of the ball's straight way: principal axis of the places, turned the way the ball goes."""
+        """Direction of the ball's straight way: principal axis of the places, turned the way the
+        ball goes."""
         xx, xy, yy = self._scatter()
         turn = 0.5 * math.atan2(2.0 * xy, xx - yy)
         hx, hy = math.cos(turn), math.sin(turn)
@@ -232,7 +250,8 @@ class LeastSquares:
             b = (self._sums[:, :4, 4:] @ heading) * precision + self._drawn
             covariance = np.linalg.inv(P)
             solution = (covariance @ b[:, :, None])[:, :, 0]
-            # evidence of a linear model with Gaussian prior; the terms that all models share are left out
+            # evidence of a linear model with Gaussian prior; the terms that all models share are
+            # left out
             evidence = 0.5 * ((solution * b).sum(axis=1) - np.linalg.slogdet(P)[1])
             lost = solution[:, 3] * self.MOMENTS / np.maximum(solution[:, 1], 0.05)
             evidence -= 0.5 * np.square(np.maximum(lost - LARGEST_LOSS, 0.0) / LOSS_SIGMA)
@@ -276,29 +295,41 @@ class LeastSquares:
             self._place_sigma(heading, gap) / facing,
         )
 
-    def _arrivals(self, along: float, solution: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Time, speed and variance of the time at which each model's ball has gone `along` m; inf where it stops before."""
+    def _arrivals(
+        self, along: float, solution: Array, covariance: Array
+    ) -> tuple[Array, Array, Array]:
+        """Time, speed and variance of the time at which each model's ball has gone `along` m; inf
+        where it stops before."""
         start, speed, rolling, _ = solution.T
         under = speed * speed - 2.0 * rolling * (along - start)
         last = np.sqrt(np.maximum(under, 1e-6))
-        ahead = np.where((under > 0.0) & (speed > 0.0), 2.0 * (along - start) / np.maximum(speed + last, 1e-6), np.inf)
+        ahead = np.where(
+            (under > 0.0) & (speed > 0.0),
+            2.0 * (along - start) / np.maximum(speed + last, 1e-6),
+            np.inf,
+        )
         t = np.where(np.isfinite(ahead), ahead, 0.0)
         slope = self._basis(t)
         variance = ((covariance @ slope[:, :, None])[:, :, 0] * slope).sum(axis=1)
         return ahead, last, variance / last**2
 
     def _place_sigma(self, heading: tuple[float, float], gap: float) -> float:
-        """Standard deviation, across the way, of the point `gap` m beyond the middle of the places."""
+        """Standard deviation, across the way, of the point `gap` m beyond the middle of the
+        places."""
         (hx, hy), (xx, xy, yy) = heading, self._scatter()
         scatter = xx * hx * hx + 2.0 * xy * hx * hy + yy * hy * hy
-        return self._surface.noise * math.sqrt(1.0 / float(self._sums[0, 0, 0]) + gap * gap / max(scatter, 1e-9))
+        return self._surface.noise * math.sqrt(
+            1.0 / float(self._sums[0, 0, 0]) + gap * gap / max(scatter, 1e-9)
+        )
 
 
 class Kalman:
-    """Extended Kalman filter over place, velocity, rolling deceleration and what sliding adds to it, which dies away.
+    """Extended Kalman filter over place, velocity, rolling deceleration and what sliding adds to
+    it, which dies away.
 
-    State: x, y, vx, vy, rolling, sliding. Sliding ends at a moment that the filter does not know; it is taken to decay with
-    `FADE` seconds while its noise lets the filter follow the true, sudden end.
+    State: x, y, vx, vy, rolling, sliding. Sliding ends at a moment that the filter does not know;
+    it is taken to decay with `FADE` seconds while its noise lets the filter follow the true, sudden
+    end.
     """
 
     FADE = 0.10
@@ -322,7 +353,9 @@ class Kalman:
         if self.count == 0:
             self._x = np.array([x, y, 0.0, 0.0, self._surface.rolling, 0.5 * SLIDING])
             place = np.sqrt(variance)
-            self._P = np.diag(np.square([place, place, 4.0, 4.0, self._surface.rolling_sigma, SLIDING]))
+            self._P = np.diag(
+                np.square([place, place, 4.0, 4.0, self._surface.rolling_sigma, SLIDING])
+            )
             self._first = time
         else:
             self._x, self._P = self._ahead(time - self._time)
@@ -331,7 +364,9 @@ class Kalman:
             K = self._P[:, :2] @ np.linalg.inv(S)
             self._x = self._x + K @ (np.array([x, y]) - self._x[:2])
             rest = np.eye(6) - K @ H
-            self._P = rest @ self._P @ rest.T + variance * (K @ K.T)  # Joseph's form keeps it symmetric and positive
+            self._P = rest @ self._P @ rest.T + variance * (
+                K @ K.T
+            )  # Joseph's form keeps it symmetric and positive
         self._time = time
         self.count += 1
 

@@ -1,4 +1,5 @@
-"""Options of an action as a checked record: every field a number, an unknown or bad one refused with its name."""
+"""Options of an action as a checked record: every field a number, an unknown or bad one refused
+with its name."""
 
 from __future__ import annotations
 
@@ -19,6 +20,11 @@ class Specification:
         for name, value in options.items():
             if name not in known:
                 raise ValueError(f"no option {name!r}; there are {', '.join(known)}")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, int | float)
+                or not math.isfinite(value)
+                or value < 0
+            ):
                 raise ValueError(f"option {name} = {value!r}: a number not below 0 is needed")
         return cls(**options)

@@ -1,4 +1,5 @@
-"""The table as the calibrated camera sees it: where a rolling ball can be, in metres and in pixels."""
+"""The table as the calibrated camera sees it: where a rolling ball can be, in metres and in
+pixels."""
 
 from __future__ import annotations
 
@@ -10,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from services.vision.optics import Array, Optics
+from petrobot.services.vision.optics import Array, Optics
 
 
 @dataclass(frozen=True)
 class TableView:
-    """Table and ball (m, base frame) before a calibrated camera. `height` is that of a rolling ball's centre."""
+    """Table and ball (m, base frame) before a calibrated camera. `height` is that of a rolling
+    ball's centre."""
 
     optics: Optics
     width_px: int
@@ -53,7 +55,9 @@ class TableView:
         at = np.asarray(places, float)
         if at.ndim == 1:
             return self.optics.project((*at.tolist(), self.height))
-        return self.optics.project(np.concatenate([at, np.full((*at.shape[:-1], 1), self.height)], axis=-1))
+        return self.optics.project(
+            np.concatenate([at, np.full((*at.shape[:-1], 1), self.height)], axis=-1)
+        )
 
     def on_table(self, places: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
         """Which places (..., 2) lie on the table, or at most `margin` m beside it."""
@@ -67,7 +71,8 @@ class TableView:
 
     @cached_property
     def radius_px(self) -> float:
-        """The ball's radius (px) in the middle of the table; it varies by a few per cent over the table."""
+        """The ball's radius (px) in the middle of the table; it varies by a few per cent over the
+        table."""
         middle = (self.near_edge + self.length / 2.0, 0.0, self.height)
         return self.radius * self.optics.scale(middle)
 
@@ -83,5 +88,11 @@ class TableView:
         rim = [(x, y) for x in (near, middle, far) for y in (-side, 0.0, side)]
         pixels = self.to_pixels(rim)
         low = np.maximum(pixels.min(axis=0) - self.radius_px, 0).astype(int) // 2 * 2
-        high = np.minimum(pixels.max(axis=0) + self.radius_px, (self.width_px, self.height_px)).astype(int) // 2 * 2
+        high = (
+            np.minimum(pixels.max(axis=0) + self.radius_px, (self.width_px, self.height_px)).astype(
+                int
+            )
+            // 2
+            * 2
+        )
         return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))

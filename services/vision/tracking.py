@@ -1,4 +1,5 @@
-"""Tracking: follows a located ball in a small window of each image and streams where and when it will leave the table."""
+"""Tracking: follows a located ball in a small window of each image and streams where and when it
+will leave the table."""
 
 from __future__ import annotations
 
@@ -8,17 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from services.action import Cancelled, Context, Result, error, failure, success
-from services.comm.image import Image
-from services.vision.camera import Camera, CameraError, Mark
-from services.vision.location import Window
-from services.vision.prediction import Exit, Predictor, Surface, Way
-from services.vision.specification import Specification
+from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.comm.image import Image
+from petrobot.services.vision.camera import Camera, CameraError, Mark
+from petrobot.services.vision.location import Window
+from petrobot.services.vision.prediction import Exit, Predictor, Surface, Way
+from petrobot.services.vision.specification import Specification
 
 HIDDEN = 0.20
 """m before the near edge in which arm and cup may hide the ball."""
 SPREAD_PX = 5.0
-"""px around the expected place in which the ball is looked for; grows with each image in which it was not seen."""
+"""px around the expected place in which the ball is looked for; grows with each image in which it
+was not seen."""
 GROWTH_PX = 4.0
 OTHERWISE = 5
 """Images in a row that predict another way out than the near edge before the ball is given up."""
@@ -49,7 +51,8 @@ async def track(
     stream: str,
     specification: TrackSpecification,
 ) -> Result:
-    """Track `ball` (as a locator gave it) with the predictor that `make` makes; images end with the run."""
+    """Track `ball` (as a locator gave it) with the predictor that `make` makes; images end with the
+    run."""
     camera: Camera = ctx.device
     chase = _Chase(ctx, camera, make(camera.surface), stream, specification)
     try:
@@ -75,7 +78,12 @@ class _Chase:
     """One run of a tracker."""
 
     def __init__(
-        self, ctx: Context, camera: Camera, predictor: Predictor, stream: str, specification: TrackSpecification
+        self,
+        ctx: Context,
+        camera: Camera,
+        predictor: Predictor,
+        stream: str,
+        specification: TrackSpecification,
     ) -> None:
         self._ctx = ctx
         self._camera = camera
@@ -123,7 +131,11 @@ class _Chase:
             self._publish()
 
     def _left(self) -> bool:
-        return self._exit is not None and self._exit.way is Way.NEAR_EDGE and self._exit.time <= self._ctx.now
+        return (
+            self._exit is not None
+            and self._exit.way is Way.NEAR_EDGE
+            and self._exit.time <= self._ctx.now
+        )
 
     def _look(self, image: Image) -> Result | None:
         """Measure the ball where it is expected; a result when the chase ends with this image."""
@@ -147,7 +159,8 @@ class _Chase:
         return ended
 
     def _mark(self, centres: tuple[Any, ...], place: tuple[float, float]) -> None:
-        """For the operator: where the ball is seen, and the way to where it is predicted to leave."""
+        """For the operator: where the ball is seen, and the way to where it is predicted to
+        leave."""
         exit_ = self._exit
         ahead = () if exit_ is None else (place, (float(exit_.point[0]), float(exit_.point[1])))
         self._camera.marks = (Mark("ball", pixels=centres), Mark("predicted exit", table=ahead))
@@ -156,13 +169,20 @@ class _Chase:
         self._misses += 1
         self._mark((), (float(expected[0]), float(expected[1])))
         edge = self._camera.view.near_edge
-        if float(expected[0]) < edge + HIDDEN or time - self._seen_at < self._specification.lost_after:
+        if (
+            float(expected[0]) < edge + HIDDEN
+            or time - self._seen_at < self._specification.lost_after
+        ):
             return None
-        text = f"not seen for {time - self._seen_at:.2f} s, expected at ({expected[0]:.3f}, {expected[1]:.3f}) m"
+        text = (
+            f"not seen for {time - self._seen_at:.2f} s, expected at ({expected[0]:.3f}, "
+            f"{expected[1]:.3f}) m"
+        )
         return error("ball_lost", text, **self._values())
 
     def _predicted(self, time: float) -> Result | None:
-        """Take a fresh prediction; a result when the ball will surely not come over the near edge."""
+        """Take a fresh prediction; a result when the ball will surely not come over the near
+        edge."""
         exit_ = self._predictor.exit()
         if exit_ is None or exit_.way is Way.NEAR_EDGE:
             self._otherwise = 0
@@ -178,7 +198,9 @@ class _Chase:
         where = f"({exit_.point[0]:.3f}, {exit_.point[1]:.3f}) m"
         if exit_.way is Way.SIDE:
             return failure("side_exit", f"the ball leaves by the side at {where}", **self._values())
-        return failure("stays", f"the ball stops on the table or turns away at {where}", **self._values())
+        return failure(
+            "stays", f"the ball stops on the table or turns away at {where}", **self._values()
+        )
 
     def _publish(self) -> None:
         """Stream the newest prediction; its time to go is right now, however old the image was."""
@@ -189,7 +211,9 @@ class _Chase:
         to_go = exit_.time - self._ctx.now
         vx, vy = (float(v) for v in exit_.velocity)
         point = (view.near_edge, float(exit_.point[1]), view.height)
-        self._ctx.publish(self._stream, [to_go, *point, vx, vy, 0.0, exit_.sigma_place, exit_.sigma_time])
+        self._ctx.publish(
+            self._stream, [to_go, *point, vx, vy, 0.0, exit_.sigma_place, exit_.sigma_time]
+        )
 
     def _judge(self) -> Result:
         """The ball has left: did the predictions of the last moments agree with the last one?"""
@@ -208,7 +232,9 @@ class _Chase:
         place_spread = max(abs(y - place) for _, y in judged)
         values = {**self._values(), "time_spread": time_spread, "place_spread": place_spread}
         if time_spread > asked.max_time_spread or place_spread > asked.max_place_spread:
-            text = f"predictions moved by {time_spread * 1e3:.0f} ms and {place_spread * 1e3:.0f} mm"
+            text = (
+                f"predictions moved by {time_spread * 1e3:.0f} ms and {place_spread * 1e3:.0f} mm"
+            )
             return failure("unsteady", text, **values)
         return success(**values)
 
@@ -222,7 +248,11 @@ class _Chase:
             values["exit"] = {
                 "way": str(self._exit.way),
                 "in": self._exit.time - self._ctx.now,
-                "point": [float(self._exit.point[0]), float(self._exit.point[1]), self._camera.view.height],
+                "point": [
+                    float(self._exit.point[0]),
+                    float(self._exit.point[1]),
+                    self._camera.view.height,
+                ],
                 "velocity": [float(v) for v in self._exit.velocity],
             }
         return values

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from coordinator.analysis.report import Analysis, analyse
-from coordinator.analysis.space import Limits
-from coordinator.cli.witnesses import picture, refused
-from coordinator.task import End, Kind, Task, Transition
-from coordinator.taskfile import load
+from petrobot.coordinator.analysis.report import Analysis, analyse
+from petrobot.coordinator.analysis.space import Limits
+from petrobot.coordinator.cli.witnesses import picture, refused
+from petrobot.coordinator.task import End, Kind, Task, Transition
+from petrobot.coordinator.taskfile import load
 
 TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
 LIMITS = Limits(states=20_000)
@@ -26,7 +26,11 @@ def _with(task: Task, transition: Transition) -> Task:
 
 def error_exits(task: Task) -> list[Transition]:
     """Transitions that take a run which ended with ERROR, in the file's order."""
-    return [t for t in task.transitions.values() if any(a.end is End.ERROR for a in t.inputs) and t.outputs]
+    return [
+        t
+        for t in task.transitions.values()
+        if any(a.end is End.ERROR for a in t.inputs) and t.outputs
+    ]
 
 
 def missing_recovery(task: Task) -> Task:
@@ -37,7 +41,9 @@ def missing_recovery(task: Task) -> Task:
 def double_resource(task: Task) -> Task:
     """Every resource is there twice, so that two runs may want one device at a time."""
     places = {
-        name: replace(p, tokens=2, capacity=None) if p.kind is Kind.RESOURCE and p.tokens == 1 else p
+        name: replace(p, tokens=2, capacity=None)
+        if p.kind is Kind.RESOURCE and p.tokens == 1
+        else p
         for name, p in task.places.items()
     }
     return replace(task, places=places)
@@ -50,7 +56,9 @@ def leaking_token(task: Task) -> Task:
     assert resource is not None
     outputs = tuple(replace(o, weight=2) if o.place == resource else o for o in exit_.outputs)
     place = replace(task.places[resource], capacity=None)
-    return replace(_with(task, replace(exit_, outputs=outputs)), places={**task.places, resource: place})
+    return replace(
+        _with(task, replace(exit_, outputs=outputs)), places={**task.places, resource: place}
+    )
 
 
 def _resource(task: Task, t: Transition) -> str | None:
@@ -65,16 +73,25 @@ VARIANTS: dict[str, Callable[[Task], Task]] = {
 
 
 def damaged(task: Task) -> Iterator[tuple[str, Task]]:
-    """Damage of all kinds that a hand does to a task file: arcs lost, doubled, led elsewhere or added, tokens changed."""
+    """Damage of all kinds that a hand does to a task file: arcs lost, doubled, led elsewhere or
+    added, tokens changed."""
     for t in task.transitions.values():
         for i, o in enumerate(t.outputs):
             others = (*t.outputs[:i], *t.outputs[i + 1 :])
             yield f"{t.name} no longer gives {o.place}", _with(task, replace(t, outputs=others))
-            yield f"{t.name} gives {o.place} twice", _with(task, replace(t, outputs=(*others, replace(o, weight=2))))
+            yield (
+                f"{t.name} gives {o.place} twice",
+                _with(task, replace(t, outputs=(*others, replace(o, weight=2)))),
+            )
             for p in task.places.values():
-                if p.kind is task.places[o.place].kind and p.name not in {x.place for x in t.outputs}:
+                if p.kind is task.places[o.place].kind and p.name not in {
+                    x.place for x in t.outputs
+                }:
                     outputs = (*others, replace(o, place=p.name))
-                    yield f"{t.name} gives {p.name} for {o.place}", _with(task, replace(t, outputs=outputs))
+                    yield (
+                        f"{t.name} gives {p.name} for {o.place}",
+                        _with(task, replace(t, outputs=outputs)),
+                    )
         for i, a in enumerate(t.inputs):
             rest = (*t.inputs[:i], *t.inputs[i + 1 :])
             yield f"{t.name} no longer takes {a.place}", _with(task, replace(t, inputs=rest))

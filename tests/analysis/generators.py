@@ -1,14 +1,16 @@
-"""Nets that tests and benchmarks share: generated families of the literature and random small nets."""
+"""Nets that tests and benchmarks share: generated families of the literature and random small
+nets."""
 
 from __future__ import annotations
 
-from coordinator.net import Net
+from petrobot.coordinator.net import Net
 
 Weights = dict[str, int]
 
 
 def kanban(n: int) -> Net:
-    """Kanban system with n cards in each of four cells: 16 places, 16 transitions (Ciardo & Tilgner 1996)."""
+    """Kanban system with n cards in each of four cells: 16 places, 16 transitions (Ciardo & Tilgner
+    1996)."""
     places: Weights = {}
     arcs: dict[str, tuple[Weights, Weights]] = {}
     for i in range(1, 5):
@@ -39,7 +41,8 @@ KANBAN_RATES = {
 
 
 def philosophers(n: int) -> Net:
-    """n philosophers who take the left fork, then the right one: 5 n places, 5 n transitions; can deadlock."""
+    """n philosophers who take the left fork, then the right one: 5 n places, 5 n transitions; can
+    deadlock."""
     places: Weights = {}
     arcs: dict[str, tuple[Weights, Weights]] = {}
     for i in range(n):
@@ -54,7 +57,8 @@ def philosophers(n: int) -> Net:
 
 
 def queue(capacity: int) -> Net:
-    """A queue with room for `capacity` customers; arrivals are blocked when it is full (M/M/c/K by its rates)."""
+    """A queue with room for `capacity` customers; arrivals are blocked when it is full (M/M/c/K by
+    its rates)."""
     return Net.build(
         {"free": capacity, "waiting": 0},
         {"arrive": ({"free": 1}, {"waiting": 1}), "serve": ({"waiting": 1}, {"free": 1})},
@@ -62,9 +66,11 @@ def queue(capacity: int) -> Net:
 
 
 def repairman(machines: int) -> Net:
-    """Machines that fail and are repaired by one person (or several, by the servers of `repair`)."""
+    """Machines that fail and are repaired by one person (or several, by the servers of
+    `repair`)."""
     return Net.build(
-        {"up": machines, "down": 0}, {"fail": ({"up": 1}, {"down": 1}), "repair": ({"down": 1}, {"up": 1})}
+        {"up": machines, "down": 0},
+        {"fail": ({"up": 1}, {"down": 1}), "repair": ({"down": 1}, {"up": 1})},
     )
 
 
@@ -75,12 +81,15 @@ def stages(k: int) -> Net:
 
 
 def fms(n: int) -> Net:
-    """Flexible manufacturing system, n parts of each of three kinds: 22 places, 20 transitions (Ciardo & Trivedi 1993)."""
+    """Flexible manufacturing system, n parts of each of three kinds: 22 places, 20 transitions
+    (Ciardo & Trivedi 1993)."""
     places: Weights = {"M1": 3, "M2": 1, "M3": 2, "P3": n, "P3M2": 0, "P3s": 0}
     places |= dict.fromkeys(("P12", "P12wM3", "P12M3", "P12s"), 0)
     arcs: dict[str, tuple[Weights, Weights]] = {}
     for kind, machine, partner in (("P1", "M1", "P2"), ("P2", "M2", "P1")):
-        waits, works, done, stored, joins = (f"{kind}{s}" for s in (f"w{machine}", machine, "d", "s", f"w{partner}"))
+        waits, works, done, stored, joins = (
+            f"{kind}{s}" for s in (f"w{machine}", machine, "d", "s", f"w{partner}")
+        )
         places |= {kind: n} | dict.fromkeys((waits, works, done, stored, joins), 0)
         arcs[f"arrive{kind}"] = ({kind: 1}, {waits: 1})
         arcs[f"begin{kind}"] = ({waits: 1, machine: 1}, {works: 1})
@@ -100,9 +109,11 @@ def fms(n: int) -> Net:
 
 
 def shared_memory(n: int) -> Net:
-    """n processors, each with a memory that the others reach over one bus: n (n + 3) + 1 places, n (2 n + 1) transitions.
+    """n processors, each with a memory that the others reach over one bus: n (n + 3) + 1 places, n
+    (2 n + 1) transitions.
 
-    Of the Model Checking Contest: 3^n + n (n - 1) 3^(n - 1) markings, 1,863 for n = 5 and 1,830,519 for n = 10.
+    Of the Model Checking Contest: 3^n + n (n - 1) 3^(n - 1) markings, 1,863 for n = 5 and 1,830,519
+    for n = 10.
     """
     places: Weights = {"bus": 1}
     arcs: dict[str, tuple[Weights, Weights]] = {}
@@ -121,10 +132,12 @@ def shared_memory(n: int) -> Net:
 
 
 def robot_cell(stations: int, parts: int, robots: int = 2) -> Net:
-    """A production cell: robots carry parts from a stock through machines that fail and are mended, and back on pallets.
+    """A production cell: robots carry parts from a stock through machines that fail and are mended,
+    and back on pallets.
 
-    6 stations + 4 places, 8 stations + 1 transitions. A robot that waits with a part before a machine that has broken down
-    puts it back (the error branch); who mends also needs a robot to hold the part.
+    6 stations + 4 places, 8 stations + 1 transitions. A robot that waits with a part before a
+    machine that has broken down puts it back (the error branch); who mends also needs a robot to
+    hold the part.
     """
     places: Weights = {"stock": parts, "robots": robots, "fitter": 1, "finished": 0}
     arcs: dict[str, tuple[Weights, Weights]] = {"restock": ({"finished": 1}, {"stock": 1})}
@@ -138,7 +151,10 @@ def robot_cell(stations: int, parts: int, robots: int = 2) -> Net:
         arcs[f"put_back{i}"] = ({fetched: 1, broken: 1}, {broken: 1, "stock": 1, "robots": 1})
         arcs[f"finish{i}"] = ({working: 1}, {done: 1})
         arcs[f"fail{i}"] = ({working: 1}, {broken: 1, "stock": 1})
-        arcs[f"mend{i}"] = ({broken: 1, "fitter": 1, "robots": 1}, {idle: 1, "fitter": 1, "robots": 1})
+        arcs[f"mend{i}"] = (
+            {broken: 1, "fitter": 1, "robots": 1},
+            {idle: 1, "fitter": 1, "robots": 1},
+        )
         arcs[f"unload{i}"] = ({done: 1, "robots": 1}, {carried: 1, idle: 1})
         arcs[f"deliver{i}"] = ({carried: 1}, {"finished": 1, "robots": 1})
     return Net.build(places, arcs)

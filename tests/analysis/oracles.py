@@ -1,4 +1,5 @@
-"""Other tools as judges of ours (`pip install petrobot[oracle]`): SNAKES, pm4py and Storm count and solve the same nets."""
+"""Other tools as judges of ours (`pip install petrobot[oracle]`): SNAKES, pm4py and Storm count and
+solve the same nets."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from coordinator.net import Net
+from petrobot.coordinator.net import Net
 
 
 def snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None:
@@ -73,11 +74,15 @@ def pm4py_markings(text: str, net: Net) -> set[tuple[int, ...]]:
                 seen.add(after)
                 queue.append(after)
     by_name = {place.name: place for place in model.places}
-    return {tuple(marking[by_name[place]] if place in by_name else 0 for place in net.places) for marking in seen}
+    return {
+        tuple(marking[by_name[place]] if place in by_name else 0 for place in net.places)
+        for marking in seen
+    }
 
 
 def storm_share(text: str, label: str) -> float:
-    """The long-run share of time in states with a label, by Storm, of a chain in its explicit format (.drn)."""
+    """The long-run share of time in states with a label, by Storm, of a chain in its explicit
+    format (.drn)."""
     import stormpy  # type: ignore[import-not-found]
 
     with tempfile.TemporaryDirectory() as folder:
@@ -89,7 +94,8 @@ def storm_share(text: str, label: str) -> float:
 
 
 def storm_time(text: str, label: str) -> float:
-    """Mean time (s) until a state with a label, by Storm, of a chain in its explicit format (.drn)."""
+    """Mean time (s) until a state with a label, by Storm, of a chain in its explicit format
+    (.drn)."""
     import stormpy
 
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,5 @@
-"""Random small nets with everything the firing rule knows, and the slowest possible state space to judge others by."""
+"""Random small nets with everything the firing rule knows, and the slowest possible state space to
+judge others by."""
 
 from __future__ import annotations
 
@@ -6,8 +7,8 @@ from collections import deque
 
 from hypothesis import strategies as st
 
-from coordinator.analysis.gspn import Gspn
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.net import Marking, Net
 
 Weights = dict[str, int]
 
@@ -24,7 +25,8 @@ def nets(
     weights: int = 3,
     tokens: int = 3,
 ) -> Net:
-    """A net of at most the given size; arcs are sparse so that many draws are bounded and alive for a while."""
+    """A net of at most the given size; arcs are sparse so that many draws are bounded and alive for
+    a while."""
     names = [f"p{i}" for i in range(draw(st.integers(1, places)))]
     labels = [f"t{i}" for i in range(draw(st.integers(1, transitions)))]
     arcs = st.dictionaries(st.sampled_from(names), st.integers(1, weights), max_size=3)
@@ -37,23 +39,30 @@ def nets(
         capacity={p: draw(st.integers(n, n + 3)) for p, n in initial.items() if draw(st.booleans())}
         if capacities and draw(st.booleans())
         else None,
-        priority={t: draw(st.integers(0, 2)) for t in labels} if priorities and draw(st.booleans()) else None,
+        priority={t: draw(st.integers(0, 2)) for t in labels}
+        if priorities and draw(st.booleans())
+        else None,
     )
 
 
 @st.composite
-def state_machines(draw: st.DrawFn, *, places: int = 5, transitions: int = 8, tokens: int = 3) -> Net:
-    """A net whose transitions move one token each: always bounded, often with loops, sinks and deadlocks."""
+def state_machines(
+    draw: st.DrawFn, *, places: int = 5, transitions: int = 8, tokens: int = 3
+) -> Net:
+    """A net whose transitions move one token each: always bounded, often with loops, sinks and
+    deadlocks."""
     names = [f"p{i}" for i in range(draw(st.integers(2, places)))]
     moves = [
-        (draw(st.sampled_from(names)), draw(st.sampled_from(names))) for _ in range(draw(st.integers(1, transitions)))
+        (draw(st.sampled_from(names)), draw(st.sampled_from(names)))
+        for _ in range(draw(st.integers(1, transitions)))
     ]
     initial = dict.fromkeys(names, 0) | {names[0]: draw(st.integers(1, tokens))}
     return Net.build(initial, {f"t{i}": ({a: 1}, {b: 1}) for i, (a, b) in enumerate(moves)})
 
 
 def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, int, int]]] | None:
-    """Markings and edges (source, transition, target) in breadth-first order; None if there are more than `limit`."""
+    """Markings and edges (source, transition, target) in breadth-first order; None if there are
+    more than `limit`."""
     order, number, edges, queue = [net.initial], {net.initial: 0}, [], deque([0])
     while queue:
         i = queue.popleft()
@@ -71,7 +80,8 @@ def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, in
 
 @st.composite
 def gspns(draw: st.DrawFn, *, tokens: int = 2) -> Gspn:
-    """A bounded GSPN whose transitions move one token each (some immediate, some with several or unlimited servers).
+    """A bounded GSPN whose transitions move one token each (some immediate, some with several or
+    unlimited servers).
 
     An immediate transition only moves tokens to places of higher number, so time always passes.
     """
@@ -82,7 +92,11 @@ def gspns(draw: st.DrawFn, *, tokens: int = 2) -> Gspn:
     weights: dict[str, float] = {}
     servers: dict[str, int | None] = {}
     for i in range(draw(st.integers(2, 8))):
-        a, b = draw(st.tuples(st.integers(0, places - 1), st.integers(0, places - 1)).filter(lambda ab: ab[0] != ab[1]))
+        a, b = draw(
+            st.tuples(st.integers(0, places - 1), st.integers(0, places - 1)).filter(
+                lambda ab: ab[0] != ab[1]
+            )
+        )
         amount = draw(st.floats(0.25, 4.0))
         name = f"t{i}"
         if draw(st.booleans()) and a < b:

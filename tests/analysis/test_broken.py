@@ -1,4 +1,5 @@
-"""What designers get wrong is caught, with a witness that replays and a picture of it, for every task that ships."""
+"""What designers get wrong is caught, with a witness that replays and a picture of it, for every
+task that ships."""
 
 from __future__ import annotations
 
@@ -9,15 +10,15 @@ from xml.etree import ElementTree
 
 import pytest
 
-from coordinator.analysis.ordinary import OrdinaryView
-from coordinator.analysis.robot import one_run_each
-from coordinator.analysis.space import Limits, explore
-from coordinator.cli import main
-from coordinator.cli.witnesses import draw_witnesses, refused
-from coordinator.drawing import Overlay, draw
-from coordinator.net import Net
-from coordinator.task import Kind, Task
-from coordinator.taskfile import dumps, load
+from petrobot.coordinator.analysis.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.robot import one_run_each
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.witnesses import draw_witnesses, refused
+from petrobot.coordinator.drawing import Overlay, draw
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Kind, Task
+from petrobot.coordinator.taskfile import dumps, load
 from tests.analysis.broken import TASKS, VARIANTS, damaged, judged
 from tests.analysis.random_nets import brute_force
 from tests.waiting import Limit
@@ -33,7 +34,8 @@ EXPECTED = {
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_tasks_are_sound(path: Path) -> None:
-    """Nothing is refused of what ships, as designed and closed by the refill; every error exit comes back."""
+    """Nothing is refused of what ships, as designed and closed by the refill; every error exit
+    comes back."""
     found = judged(load(path))
     verdicts = {name: verdict.holds for name, verdict in found.verdicts().items() if name != "safe"}
     assert all(verdicts.values()), verdicts
@@ -45,7 +47,8 @@ def test_shipped_tasks_are_sound(path: Path) -> None:
 @pytest.mark.parametrize("kind", VARIANTS)
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> None:
-    """Each comes with a witness that the net replays, and with a picture that shows where it leads."""
+    """Each comes with a witness that the net replays, and with a picture that shows where it
+    leads."""
     task = VARIANTS[kind](load(path))
     found = judged(task)
     assert not found.ok
@@ -53,12 +56,18 @@ def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> No
     name = next(name for name in bad if name in EXPECTED[kind])
     verdict = bad[name]
     assert verdict.witness is not None
-    *_, last = task.net.replay(verdict.witness.firings) if verdict.witness.firings else (task.net.initial,)
-    assert {p: n for p, n in zip(task.net.places, last, strict=True) if n} == verdict.witness.marking
+    *_, last = (
+        task.net.replay(verdict.witness.firings) if verdict.witness.firings else (task.net.initial,)
+    )
+    assert {
+        p: n for p, n in zip(task.net.places, last, strict=True) if n
+    } == verdict.witness.marking
     made = {p.stem: p for p in draw_witnesses(found, task, tmp_path)}
     root = ElementTree.fromstring(made[f"{task.name}-{name}"].read_text(encoding="utf-8"))
     texts = [e.text or "" for e in root.iter() if e.get("class") == "turn"]
-    turns = sorted(int(turn) for text in texts for turn in text.replace("…", "").split(",") if turn.strip())
+    turns = sorted(
+        int(turn) for text in texts for turn in text.replace("…", "").split(",") if turn.strip()
+    )
     assert turns and turns[-1] == len(verdict.witness.firings)
 
 
@@ -85,16 +94,21 @@ def faults_by_brute_force(task: Task) -> set[str]:
         good = set().union(*(before[j] for j in good)) - ended
         ended |= good
     out |= {"sound"} if len(ended) < len(order) else set()
-    single = [p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None]
+    single = [
+        p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None
+    ]
     out |= {"one_run_each"} if any(m[names.index(p)] > 1 for m in order for p in single) else set()
     resources = [names.index(p.name) for p in task.flat.places.values() if p.kind is Kind.RESOURCE]
     ends = [m for m in order if view.is_final(m)]
-    return out | ({"returned"} if any(m[p] != order[0][p] for m in ends for p in resources) else set())
+    return out | (
+        {"returned"} if any(m[p] != order[0][p] for m in ends for p in resources) else set()
+    )
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_damage_of_any_kind_is_refused_if_it_hurts(path: Path, tmp_path: Path) -> None:
-    """Every few of all the damage that can be done by hand: the gate refuses what hangs or leaks, and its witness replays."""
+    """Every few of all the damage that can be done by hand: the gate refuses what hangs or leaks,
+    and its witness replays."""
     refused_, harmless = 0, 0
     for what, task in list(damaged(carried(load(path))))[::9]:
         file = tmp_path / "damaged.toml"
@@ -107,20 +121,31 @@ def test_damage_of_any_kind_is_refused_if_it_hurts(path: Path, tmp_path: Path) -
             assert set(found["objections"]) - {"deadlock_free"} == wrong, what
         for verdict in found.get("objections", {}).values():
             *_, last = task.net.replay(verdict["witness"]["firings"])
-            assert {p: n for p, n in zip(task.net.places, last, strict=True) if n} == verdict["witness"]["marking"], (
-                what
-            )
+            assert {p: n for p, n in zip(task.net.places, last, strict=True) if n} == verdict[
+                "witness"
+            ]["marking"], what
         refused_, harmless = refused_ + bool(wrong), harmless + (not wrong)
     assert refused_ >= 5 and harmless >= 1
 
 
-def test_a_task_that_goes_round_and_never_ends_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """No deadlock, no token too many: after the damage the rover's stop can fail for ever, with no way to an end."""
+def test_a_task_that_goes_round_and_never_ends_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """No deadlock, no token too many: after the damage the rover's stop can fail for ever, with no
+    way to an end."""
     task = carried(load(TASKS / "follow_track.toml"))
     lost = task.transitions["stop_failed"]
-    outputs = tuple(replace(o, place="camera_idle") if o.place == "trouble" else o for o in lost.outputs)
+    outputs = tuple(
+        replace(o, place="camera_idle") if o.place == "trouble" else o for o in lost.outputs
+    )
     path = tmp_path / "round.toml"
-    path.write_text(dumps(replace(task, transitions={**task.transitions, lost.name: replace(lost, outputs=outputs)})))
+    path.write_text(
+        dumps(
+            replace(
+                task, transitions={**task.transitions, lost.name: replace(lost, outputs=outputs)}
+            )
+        )
+    )
     assert main(["check", str(path)]) == 2
     told = capsys.readouterr().out
     assert "sound: from" in told and "no designed end can be reached" in told and "by: " in told
@@ -129,7 +154,9 @@ def test_a_task_that_goes_round_and_never_ends_is_refused(capsys: pytest.Capture
 def test_the_gate_refuses_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`petrobot check` refuses a broken file, `petrobot analyse --pictures` shows why."""
     path = tmp_path / "twice.toml"
-    path.write_text(dumps(VARIANTS["double_resource"](load(TASKS / "catch_ball.toml"))), encoding="utf-8")
+    path.write_text(
+        dumps(VARIANTS["double_resource"](load(TASKS / "catch_ball.toml"))), encoding="utf-8"
+    )
     assert main(["check", str(path)]) == 2
     assert "may not run" in capsys.readouterr().out
     assert main(["analyse", str(path), "--pictures", str(tmp_path / "why")]) == 1
@@ -138,8 +165,11 @@ def test_the_gate_refuses_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_a_part_of_the_space_promises_nothing() -> None:
-    """A search that was cut short says that one run at a time is unknown, unless it has seen otherwise."""
-    growing = Net.build({"act": 0, "go": 1}, {"t": ({"go": 1}, {"go": 1, "act": 1}), "u": ({"act": 1}, {})})
+    """A search that was cut short says that one run at a time is unknown, unless it has seen
+    otherwise."""
+    growing = Net.build(
+        {"act": 0, "go": 1}, {"t": ({"go": 1}, {"go": 1, "act": 1}), "u": ({"act": 1}, {})}
+    )
     assert one_run_each(explore(growing, limits=Limits(states=2)), ["act"]).holds is None
     seen = one_run_each(explore(growing, limits=Limits(states=20)), ["act"])
     assert seen.holds is False and seen.witness is not None and seen.witness.firings == ("t", "t")

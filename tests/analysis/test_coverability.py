@@ -1,19 +1,22 @@
-"""Karp-Miller against exhaustive search on bounded nets and against its own witnesses on unbounded ones."""
+"""Karp-Miller against exhaustive search on bounded nets and against its own witnesses on unbounded
+ones."""
 
 from __future__ import annotations
 
 from hypothesis import assume, given, settings
 
-from coordinator.analysis.coverability import coverability
-from coordinator.analysis.space import Limits, explore
-from coordinator.net import Net
+from petrobot.coordinator.analysis.coverability import coverability
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 
 
 def test_a_marking_is_compared_with_its_ancestors_only() -> None:
     """The net on which comparison with all markings gives a false omega."""
-    net = Net.build({"p0": 1, "p1": 0}, {"one": ({"p0": 1}, {"p1": 1}), "two": ({"p0": 1}, {"p1": 2})})
+    net = Net.build(
+        {"p0": 1, "p1": 0}, {"one": ({"p0": 1}, {"p1": 1}), "two": ({"p0": 1}, {"p1": 2})}
+    )
     found = coverability(net)
     assert (found.bounded, found.bounds, found.complete) == (True, (1, 2), True)
 
@@ -72,13 +75,19 @@ def test_known_nets() -> None:
     assert coverability(philosophers(3)).bounds == (1,) * 15
     leak = Net.build({"p": 1, "q": 0}, {"t": ({"p": 1}, {"p": 1, "q": 1})})
     found = coverability(leak)
-    assert found.bounded is False and found.bounds == (1, None) and found.pump == ("t",) and found.grows == ("q",)
+    assert (
+        found.bounded is False
+        and found.bounds == (1, None)
+        and found.pump == ("t",)
+        and found.grows == ("q",)
+    )
 
 
 def test_the_witness_is_about_the_nearest_ancestor_that_is_covered() -> None:
     """Two ancestors are covered at once: the sequence from the nearer one is the pump."""
     net = Net.build(
-        {"p0": 0, "p3": 1}, {"t0": ({"p3": 1}, {"p0": 3}), "t1": ({}, {}), "t3": ({"p0": 3}, {"p0": 3, "p3": 1})}
+        {"p0": 0, "p3": 1},
+        {"t0": ({"p3": 1}, {"p0": 3}), "t1": ({}, {}), "t3": ({"p0": 3}, {"p0": 3, "p3": 1})},
     )
     found = coverability(net, first_omega=True)
     assert found.bounded is False

@@ -1,4 +1,5 @@
-"""Net files of other tools, as the command reads them: odd ids, pages, encodings, final markings, nets that grow for ever."""
+"""Net files of other tools, as the command reads them: odd ids, pages, encodings, final markings,
+nets that grow for ever."""
 
 from __future__ import annotations
 
@@ -8,26 +9,35 @@ from typing import Any
 
 import pytest
 
-from coordinator.analysis.commands import analyse_command, convert_command, simulate_command
-from coordinator.analysis.coverability import coverability
-from coordinator.analysis.formats import read_net
-from coordinator.analysis.netfile import FormatError
-from coordinator.analysis.pumping import find_pump
-from coordinator.analysis.qualitative import examine
-from coordinator.analysis.space import Limits, explore
-from coordinator.cli import main
-from coordinator.net import Net
-from coordinator.taskfile import load
+from petrobot.coordinator.analysis.commands import (
+    analyse_command,
+    convert_command,
+    simulate_command,
+)
+from petrobot.coordinator.analysis.coverability import coverability
+from petrobot.coordinator.analysis.formats import read_net
+from petrobot.coordinator.analysis.netfile import FormatError
+from petrobot.coordinator.analysis.pumping import find_pump
+from petrobot.coordinator.analysis.qualitative import examine
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.taskfile import load
 from tests.analysis.generators import philosophers
 
-HEAD = '<pnml xmlns="http://www.pnml.org/version-2009/grammar/pnml"><net id="n" type="{}">{}</net></pnml>'
+HEAD = (
+    '<pnml xmlns="http://www.pnml.org/version-2009/grammar/pnml"><net id="n" '
+    'type="{}">{}</net></pnml>'
+)
 PTNET = "http://www.pnml.org/version-2009/grammar/ptnet"
 
 
 def pnml(tmp_path: Path, body: str, kind: str = PTNET, encoding: str = "utf-8") -> Path:
     """A file with this net in it."""
     path = tmp_path / "net.pnml"
-    path.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>{HEAD.format(kind, body)}'.encode(encoding))
+    path.write_bytes(
+        f'<?xml version="1.0" encoding="{encoding}"?>{HEAD.format(kind, body)}'.encode(encoding)
+    )
     return path
 
 
@@ -39,7 +49,9 @@ def place(name: str, tokens: int = 0) -> str:
 def arc(source: str, target: str, weight: int = 1, more: str = "") -> str:
     """An arc of the standard."""
     inscription = f"<inscription><text>{weight}</text></inscription>" if weight != 1 else ""
-    return f'<arc id="{source}-{target}" source="{source}" target="{target}">{inscription}{more}</arc>'
+    return (
+        f'<arc id="{source}-{target}" source="{source}" target="{target}">{inscription}{more}</arc>'
+    )
 
 
 def analysed(path: Path, **more: Any) -> dict[str, Any]:
@@ -49,17 +61,33 @@ def analysed(path: Path, **more: Any) -> dict[str, Any]:
     return data
 
 
-LOOP = place("a", 1) + place("b") + '<transition id="t"/><transition id="u"/>' + arc("a", "t") + arc("t", "b")
+LOOP = (
+    place("a", 1)
+    + place("b")
+    + '<transition id="t"/><transition id="u"/>'
+    + arc("a", "t")
+    + arc("t", "b")
+)
 LOOP += arc("b", "u") + arc("u", "a")
 
 
 def test_what_other_tools_keep_inside_a_net_is_no_part_of_it(tmp_path: Path) -> None:
-    """Final markings (pm4py) name places again; tool-specific data may hold whole nets. A round trip keeps both."""
-    final = '<finalmarkings><marking><place idref="a"><text>1</text></place></marking></finalmarkings>'
-    other = '<toolspecific tool="x" version="1"><place id="z"/><arc id="q" source="z" target="t"/></toolspecific>'
+    """Final markings (pm4py) name places again; tool-specific data may hold whole nets. A round
+    trip keeps both."""
+    final = (
+        '<finalmarkings><marking><place idref="a"><text>1</text></place></marking></finalmarkings>'
+    )
+    other = (
+        '<toolspecific tool="x" version="1"><place id="z"/><arc id="q" source="z" '
+        'target="t"/></toolspecific>'
+    )
     path = pnml(tmp_path, LOOP + final + other)
     data = analysed(path)
-    assert data["net"] == {"places": 2, "transitions": 2, "arcs": 4} and data["states"] == 2 and data["live"]
+    assert (
+        data["net"] == {"places": 2, "transitions": 2, "arcs": 4}
+        and data["states"] == 2
+        and data["live"]
+    )
     target = tmp_path / "again.pnml"
     assert convert_command(path, target, load).code == 0
     again = target.read_text(encoding="utf-8")
@@ -95,36 +123,56 @@ def test_rates_that_are_given_bring_the_numbers(tmp_path: Path) -> None:
     bare = analysed(path)
     assert bare["throughput"] is None and bare["mean_tokens"] is None and bare["residual"] is None
     timed = analysed(path, rates=rates)
-    assert timed["throughput"] == pytest.approx({"t": 1.2, "u": 1.2}) and timed["mean_tokens"]["a"] == pytest.approx(
-        0.6
-    )
-    assert timed["residual"] < 1e-12 and analysed(path, rates="unit")["throughput"]["t"] == pytest.approx(0.5)
+    assert timed["throughput"] == pytest.approx({"t": 1.2, "u": 1.2}) and timed["mean_tokens"][
+        "a"
+    ] == pytest.approx(0.6)
+    assert timed["residual"] < 1e-12 and analysed(path, rates="unit")["throughput"][
+        "t"
+    ] == pytest.approx(0.5)
     both = tmp_path / "both.pnml"
     both.write_text(
-        path.read_text(encoding="utf-8").replace('"t"/>', '"t"><rate><value>2.0</value></rate></transition>')
+        path.read_text(encoding="utf-8").replace(
+            '"t"/>', '"t"><rate><value>2.0</value></rate></transition>'
+        )
     )
     assert analysed(both)["throughput"] is not None  # rates found in the file
 
 
 def test_a_rates_file_leaves_the_ordinary_view_alone(tmp_path: Path) -> None:
-    """An immediate transition ranks above timed ones in the stochastic view only: `states` are those of the net."""
+    """An immediate transition ranks above timed ones in the stochastic view only: `states` are
+    those of the net."""
     body = place("a", 1) + place("b", 1) + place("c") + '<transition id="t"/><transition id="u"/>'
     body += arc("a", "t") + arc("t", "c") + arc("b", "u") + arc("u", "c")
     path, rates = pnml(tmp_path, body), tmp_path / "rates.toml"
     rates.write_text("[weights]\nt = 1.0\n", encoding="utf-8")
     data = analysed(path, rates=rates)
     assert data["states"] == 4 and data["deadlock"] is True
-    assert data["throughput"] == {"t": 0.0, "u": 0.0} and data["mean_tokens"]["c"] == pytest.approx(2.0)
+    assert data["throughput"] == {"t": 0.0, "u": 0.0} and data["mean_tokens"]["c"] == pytest.approx(
+        2.0
+    )
 
 
 def test_a_net_that_grows_is_known_soon(tmp_path: Path) -> None:
-    """No sizes that have no end; dead transitions and sources are known from the coverability tree and the arcs."""
-    body = place("a") + place("never") + '<transition id="in"/><transition id="out"/><transition id="dead"/>'
+    """No sizes that have no end; dead transitions and sources are known from the coverability tree
+    and the arcs."""
+    body = (
+        place("a")
+        + place("never")
+        + '<transition id="in"/><transition id="out"/><transition id="dead"/>'
+    )
     body += arc("in", "a") + arc("a", "out") + arc("never", "dead") + arc("dead", "a")
     data = analysed(pnml(tmp_path, body))
     assert data["bounded"] is False and data["states"] is None and data["edges"] is None
-    assert data["max_tokens_per_place"] is None and data["max_tokens_in_marking"] is None and data["complete"] is False
-    assert data["quasi_live"] is False and data["dead_transitions"] == ["dead"] and data["live"] is False
+    assert (
+        data["max_tokens_per_place"] is None
+        and data["max_tokens_in_marking"] is None
+        and data["complete"] is False
+    )
+    assert (
+        data["quasi_live"] is False
+        and data["dead_transitions"] == ["dead"]
+        and data["live"] is False
+    )
     assert data["deadlock"] is False and "no end" in data["reason"]
     witness = data["verdicts"]["bounded"]["witness"]
     net = read_net(tmp_path / "net.pnml").net
@@ -134,27 +182,40 @@ def test_a_net_that_grows_is_known_soon(tmp_path: Path) -> None:
 
 
 def test_a_pump_that_no_inhibitor_looks_at_is_enough() -> None:
-    """p0 is inhibited and grows, but by a transition that does not mind: Karp and Miller's tree may not be used here."""
-    net = Net.build({"p": 0}, {"grow": ({}, {"p": 3}), "use": ({"p": 1}, {})}, inhibitors={"use": {"p": 2}})
+    """p0 is inhibited and grows, but by a transition that does not mind: Karp and Miller's tree may
+    not be used here."""
+    net = Net.build(
+        {"p": 0}, {"grow": ({}, {"p": 3}), "use": ({"p": 1}, {})}, inhibitors={"use": {"p": 2}}
+    )
     assert coverability(net).bounded is None
     found = examine(explore(net, limits=Limits(states=50)))
     assert (
-        found.bounded.holds is False and found.bounded.witness is not None and found.bounded.witness.loop == ("grow",)
+        found.bounded.holds is False
+        and found.bounded.witness is not None
+        and found.bounded.witness.loop == ("grow",)
     )
     barred = Net.build({"p": 0}, {"grow": ({}, {"p": 1})}, inhibitors={"grow": {"p": 5}})
     assert find_pump(explore(barred)) is None
-    # With the second token an urgent transition takes both away: what grows is consumed above the pump.
+    # With the second token an urgent transition takes both away: what grows is consumed above the
+    # pump.
     urgent = Net.build({"p": 0}, {"in": ({}, {"p": 1}), "out": ({"p": 2}, {})}, priority={"out": 1})
     assert explore(urgent).complete and find_pump(explore(urgent)) is None
 
 
 def test_an_upper_bound_is_no_maximum() -> None:
-    """Of a part of the space: invariants bound a place by 2, but nothing shows that it ever holds them."""
+    """Of a part of the space: invariants bound a place by 2, but nothing shows that it ever holds
+    them."""
     net = philosophers(12)
     part = examine(explore(net, limits=Limits(states=100)))
     assert part.bounded.holds is True and part.most == 1  # seen, and no place can hold more
     idle = Net.build(
-        {"a": 2, "b": 0, "gate": 0, **{f"x{i}": 1 for i in range(12)}, **{f"y{i}": 0 for i in range(12)}},
+        {
+            "a": 2,
+            "b": 0,
+            "gate": 0,
+            **{f"x{i}": 1 for i in range(12)},
+            **{f"y{i}": 0 for i in range(12)},
+        },
         {"merge": ({"a": 2}, {"b": 2}), "split": ({"b": 1, "gate": 1}, {"a": 1, "gate": 1})}
         | {f"t{i}": ({f"x{i}": 1}, {f"y{i}": 1}) for i in range(12)},
     )
@@ -173,10 +234,20 @@ def test_more_tokens_than_a_word_counts(tmp_path: Path) -> None:
 
 
 def test_nets_of_nothing(tmp_path: Path) -> None:
-    """No transitions: one marking, dead, its own home; no places: a transition that always fires."""
+    """No transitions: one marking, dead, its own home; no places: a transition that always
+    fires."""
     alone = analysed(pnml(tmp_path, place("a", 2)), rates="unit")
-    assert (alone["states"], alone["deadlock"], alone["home_states"], alone["live"]) == (1, True, 1, True)
-    assert alone["mean_tokens"] == {"a": 2.0} and alone["throughput"] == {} and alone["max_tokens_in_marking"] == 2
+    assert (alone["states"], alone["deadlock"], alone["home_states"], alone["live"]) == (
+        1,
+        True,
+        1,
+        True,
+    )
+    assert (
+        alone["mean_tokens"] == {"a": 2.0}
+        and alone["throughput"] == {}
+        and alone["max_tokens_in_marking"] == 2
+    )
     free = analysed(pnml(tmp_path, '<transition id="t"/>'), rates="unit")
     assert (free["states"], free["edges"], free["deadlock"], free["live"]) == (1, 1, False, True)
     assert free["throughput"] == pytest.approx({"t": 1.0})
@@ -190,8 +261,16 @@ def test_a_simulation_without_time_is_valid_json(tmp_path: Path) -> None:
 
     path, rates = pnml(tmp_path, LOOP), tmp_path / "rates.toml"
     rates.write_text("[weights]\nt = 1\nu = 1\n", encoding="utf-8")
-    seen = simulate_command(path, load, np.random.default_rng(1), rates=rates, replicas=3, horizon=1.0, firings=200)
+    seen = simulate_command(
+        path, load, np.random.default_rng(1), rates=rates, replicas=3, horizon=1.0, firings=200
+    )
     assert seen.code == 1 and seen.data["complete"] is False
-    assert json.loads(json.dumps(seen.data, allow_nan=False))["throughput"]["t"] == [None, None, None]
+    assert json.loads(json.dumps(seen.data, allow_nan=False))["throughput"]["t"] == [
+        None,
+        None,
+        None,
+    ]
     trapped = analysed(path, rates=rates)
-    assert trapped["throughput"] is None and any("time never passes" in note for note in trapped["notes"])
+    assert trapped["throughput"] is None and any(
+        "time never passes" in note for note in trapped["notes"]
+    )

@@ -9,15 +9,15 @@ from xml.etree import ElementTree
 import pytest
 from hypothesis import given, settings
 
-from coordinator.analysis.formats import read_net, written
-from coordinator.analysis.greatspn import parse_pnpro
-from coordinator.analysis.gspn import Chain, Gspn
-from coordinator.analysis.netfile import FormatError, NetFile
-from coordinator.analysis.pnml_reading import parse_pnml
-from coordinator.analysis.pnml_writing import losses, write_pnml
-from coordinator.analysis.space import Limits, explore
-from coordinator.analysis.tina import parse_tina, write_tina
-from coordinator.net import Net
+from petrobot.coordinator.analysis.formats import read_net, written
+from petrobot.coordinator.analysis.greatspn import parse_pnpro
+from petrobot.coordinator.analysis.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.pnml_reading import parse_pnml
+from petrobot.coordinator.analysis.pnml_writing import losses, write_pnml
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.analysis.tina import parse_tina, write_tina
+from petrobot.coordinator.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue
 from tests.analysis.random_nets import gspns, nets
 
@@ -42,7 +42,11 @@ ISO = """<?xml version="1.0"?>
 def test_pages_and_references_are_followed() -> None:
     model = parse_pnml(ISO)
     assert model.net == Net.build({"p": 2, "q": 0}, {"t": ({"p": 2}, {"q": 2})})
-    assert model.labels == {"p": "start"} and model.positions == {"p": (10.0, 20.0)} and model.name == "two pages"
+    assert (
+        model.labels == {"p": "start"}
+        and model.positions == {"p": (10.0, 20.0)}
+        and model.name == "two pages"
+    )
     assert any("added up" in note for note in model.notes)
 
 
@@ -50,7 +54,15 @@ def test_a_round_trip_keeps_pages_graphics_and_what_other_tools_wrote() -> None:
     model = parse_pnml(ISO)
     changed = replace(model, net=replace(model.net, initial=(5, 1)))
     text = write_pnml(changed)
-    for kept in ('tool="paint"', "<colour>red</colour>", 'offset x="3"', "kept", 'id="two"', 'ref="q"', 'x="10"'):
+    for kept in (
+        'tool="paint"',
+        "<colour>red</colour>",
+        'offset x="3"',
+        "kept",
+        'id="two"',
+        'ref="q"',
+        'x="10"',
+    ):
         assert kept in text
     again = parse_pnml(text)
     assert again.net == changed.net and again.labels == model.labels and again.notes == ()
@@ -59,10 +71,17 @@ def test_a_round_trip_keeps_pages_graphics_and_what_other_tools_wrote() -> None:
 def test_removed_and_added_nodes_reach_the_file() -> None:
     model = parse_pnml(ISO)
     other = Net.build(
-        {"q": 1, "fresh": 0}, {"t": ({"q": 1}, {"fresh": 3}), "u": ({"fresh": 1}, {})}, inhibitors={"u": {"q": 2}}
+        {"q": 1, "fresh": 0},
+        {"t": ({"q": 1}, {"fresh": 3}), "u": ({"fresh": 1}, {})},
+        inhibitors={"u": {"q": 2}},
     )
     again = parse_pnml(write_pnml(replace(model, net=other, positions={"fresh": (7.0, 8.0)})))
-    assert (again.net.initial, again.net.consume, again.net.produce, again.net.inhibit) == _in_order(other, again.net)
+    assert (
+        again.net.initial,
+        again.net.consume,
+        again.net.produce,
+        again.net.inhibit,
+    ) == _in_order(other, again.net)
     assert again.positions["fresh"] == (7.0, 8.0)
 
 
@@ -82,7 +101,11 @@ def test_pnml_round_trip_of_any_gspn(gspn: Gspn) -> None:
         gspn.servers,
         gspn.net.priority,
     )
-    assert all(a == b for a, b, r in zip(again.gspn.weight, gspn.weight, gspn.rate, strict=True) if r is None)
+    assert all(
+        a == b
+        for a, b, r in zip(again.gspn.weight, gspn.weight, gspn.rate, strict=True)
+        if r is None
+    )
 
 
 def arc_file(arc: str, extra: str = "") -> str:
@@ -141,7 +164,7 @@ PIPE = """<pnml><net id="Net-One" type="P/T net"><token id="Default" red="0"/>
 <arc id="a" source="P0" target="T0"><inscription><value>Default,1</value></inscription><type value="normal"/></arc>
 <arc id="b" source="T0" target="P1"><inscription><value>1</value></inscription></arc>
 <arc id="c" source="P1" target="T1"><inscription><value></value></inscription></arc>
-<arc id="d" source="T1" target="P0"/></net></pnml>"""  # noqa: E501
+<arc id="d" source="T1" target="P0"/></net></pnml>"""
 
 
 @pytest.mark.parametrize("empty", ["", "Default,0", "0", "Default,0,Red,0", "Default,"])
@@ -149,7 +172,11 @@ def test_what_pipe_writes(empty: str) -> None:
     model = parse_pnml(PIPE.format(empty=empty))
     assert model.gspn is not None
     assert model.net.initial == (2, 0) and model.net.capacity == (None, 3)
-    assert model.gspn.rate == (2.5, None) and model.gspn.weight[1] == 0.5 and model.gspn.servers[0] is None
+    assert (
+        model.gspn.rate == (2.5, None)
+        and model.gspn.weight[1] == 0.5
+        and model.gspn.servers[0] is None
+    )
     again = parse_pnml(write_pnml(replace(model, net=replace(model.net, initial=(1, 0)))))
     assert again.net.initial == (1, 0) and again.gspn is not None and again.gspn.rate == (2.5, None)
 
@@ -158,7 +185,10 @@ def test_coloured_tokens_and_other_net_types_are_refused() -> None:
     with pytest.raises(FormatError, match="colour 'Red'"):
         parse_pnml(PIPE.format(empty="Default,0,Red,1"))
     with pytest.raises(FormatError, match="only P/T nets"):
-        parse_pnml('<pnml><net id="n" type="http://www.pnml.org/version-2009/grammar/symmetricnet"/></pnml>')
+        parse_pnml(
+            '<pnml><net id="n" '
+            'type="http://www.pnml.org/version-2009/grammar/symmetricnet"/></pnml>'
+        )
 
 
 @pytest.mark.parametrize(
@@ -170,9 +200,9 @@ def test_coloured_tokens_and_other_net_types_are_refused() -> None:
         ("<pnml><net id='n'><place/></net></pnml>", "no id"),
         ("<pnml><net id='n'><place id='p'/><place id='p'/></net></pnml>", "stands there twice"),
         ("<pnml><net id='n'><place id='p'/><arc id='a' source='p' target='x'/></net></pnml>", "joins a place and a transition"),
-        ("<pnml><net id='n'><place id='p'><initialMarking><text>two</text></initialMarking></place></net></pnml>", "has no value"),
-        ("<pnml><net id='n'><place id='p'><initialMarking><text>1.5</text></initialMarking></place></net></pnml>", "whole number"),
-        ("<pnml><net id='n'><referencePlace id='a' ref='b'/><referencePlace id='b' ref='a'/><transition id='t'/>"
+        ("<pnml><net id='n'><place " "id='p'><initialMarking><text>two</text></initialMarking></place></net></pnml>", "has no value"),
+        ("<pnml><net id='n'><place " "id='p'><initialMarking><text>1.5</text></initialMarking></place></net></pnml>", "whole number"),
+        ("<pnml><net id='n'><referencePlace id='a' ref='b'/><referencePlace id='b' " "ref='a'/><transition id='t'/>"
          "<arc id='c' source='a' target='t'/></net></pnml>", "circle"),
     ],
 )  # fmt: skip
@@ -196,9 +226,20 @@ PNPRO = """<?xml version="1.0"?><project name="P" version="121"><gspn name="G"><
 def test_greatspn_projects_give_rates_under_the_name_of_delays() -> None:
     model = parse_pnpro(PNPRO)
     assert model.gspn is not None and model.net == model.gspn.net
-    assert model.gspn.rate == (2.5, 0.25, None) and model.gspn.servers[:2] == (None, 1) and model.gspn.weight[2] == 3.0
-    assert model.net.initial == (3, 0) and model.net.consume[0] == ((0, 2),) and model.net.inhibit[2] == ((0, 1),)
-    assert model.net.priority[0] == 0 < model.net.priority[2] and model.positions["idle"] == (1.5, 2.0)
+    assert (
+        model.gspn.rate == (2.5, 0.25, None)
+        and model.gspn.servers[:2] == (None, 1)
+        and model.gspn.weight[2] == 3.0
+    )
+    assert (
+        model.net.initial == (3, 0)
+        and model.net.consume[0] == ((0, 2),)
+        and model.net.inhibit[2] == ((0, 1),)
+    )
+    assert model.net.priority[0] == 0 < model.net.priority[2] and model.positions["idle"] == (
+        1.5,
+        2.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,7 +255,9 @@ def test_greatspn_projects_give_rates_under_the_name_of_delays() -> None:
     ],
 )
 def test_greatspn_features_that_we_lack_are_refused(old: str, new: str, said: str) -> None:
-    text = PNPRO.replace(old, new).replace("</text-box>", "</fluid>" if new == "<fluid" else "</text-box>")
+    text = PNPRO.replace(old, new).replace(
+        "</text-box>", "</fluid>" if new == "<fluid" else "</text-box>"
+    )
     with pytest.raises(FormatError, match=said):
         parse_pnpro(text)
 
@@ -301,7 +344,9 @@ def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:
     for path, said in ((tmp_path / "a.txt", "ending"), (tmp_path / "missing.pnml", "No such file")):
         with pytest.raises(FormatError, match=said):
             read_net(path)
-    with pytest.raises(FormatError, match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml"):
+    with pytest.raises(
+        FormatError, match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml"
+    ):
         written(model, Path("net.xyz"))
     with pytest.raises(FormatError, match="net: file: no writer for a file without ending"):
         written(model, Path("net"))
@@ -318,7 +363,10 @@ def test_losses_are_listed() -> None:
 def test_dot_and_drn() -> None:
     gspn = Gspn.of(kanban(1), KANBAN_RATES)
     dot, _ = written(NetFile(gspn.net, 'a "net"', gspn), Path("net.dot"))
-    assert dot.count("->") == sum(map(len, (*gspn.net.consume, *gspn.net.produce))) and r"\"net\"" in dot
+    assert (
+        dot.count("->") == sum(map(len, (*gspn.net.consume, *gspn.net.produce)))
+        and r"\"net\"" in dot
+    )
     drn, _ = written(NetFile(gspn.net, gspn=gspn), Path("net.drn"))
     assert "@nr_states\n160\n" in drn and drn.count("\taction 0") == 160
     rates = [float(line.split(":")[1]) for line in drn.splitlines() if line.startswith("\t\t")]
@@ -333,7 +381,10 @@ def test_a_net_without_namespace_stays_readable_xml() -> None:
 
 def test_entities_are_refused() -> None:
     """A document that could grow without bound is not even parsed, as text and as bytes."""
-    text = '<!DOCTYPE pnml [<!ENTITY a "aaaa">]><pnml><net id="n"><page id="g"><place id="&a;"/></page></net></pnml>'
+    text = (
+        '<!DOCTYPE pnml [<!ENTITY a "aaaa">]><pnml><net id="n"><page id="g"><place '
+        'id="&a;"/></page></net></pnml>'
+    )
     for form in (text, text.encode()):
         with pytest.raises(FormatError, match="defines entities"):
             parse_pnml(form)

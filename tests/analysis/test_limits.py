@@ -1,4 +1,5 @@
-"""Real processes on nets without end in sight: bounded time and memory, Ctrl-C at any moment, and answers marked as partial."""
+"""Real processes on nets without end in sight: bounded time and memory, Ctrl-C at any moment, and
+answers marked as partial."""
 
 from __future__ import annotations
 
@@ -14,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.analysis.netfile import NetFile
-from coordinator.analysis.pnml_writing import write_pnml
-from coordinator.net import Net
+from petrobot.coordinator.analysis.netfile import NetFile
+from petrobot.coordinator.analysis.pnml_writing import write_pnml
+from petrobot.coordinator.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.waiting import Limit
 
@@ -39,7 +40,7 @@ def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
     path.write_text(write_pnml(NetFile(net)), encoding="utf-8")
     command, *rest = arguments
     return subprocess.Popen(
-        [sys.executable, "-m", "coordinator", command, str(path), *rest],
+        [sys.executable, "-m", "petrobot.coordinator", command, str(path), *rest],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -49,7 +50,8 @@ def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def _limited() -> None:
-    """Little memory, and Ctrl-C heard: a shell that runs the tests in the background has its children ignore it."""
+    """Little memory, and Ctrl-C heard: a shell that runs the tests in the background has its
+    children ignore it."""
     resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
@@ -64,14 +66,27 @@ def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[st
 
 @pytest.mark.parametrize(
     ("net", "deadlock"),
-    [pytest.param(philosophers(60), True, marks=pytest.mark.proof), (kanban(50), False), (ring(300, 20), False)],
+    [
+        pytest.param(philosophers(60), True, marks=pytest.mark.proof),
+        (kanban(50), False),
+        (ring(300, 20), False),
+    ],
     ids=["300 places", "1e16", "ring"],
 )
-def test_what_has_no_end_in_sight_ends_with_an_honest_part(net: Net, deadlock: bool, tmp_path: Path) -> None:
-    """Stubborn sets find the one deadlock; siphons with marked traps rule out any in the other two."""
-    process = started(net, tmp_path, "analyse", "--rates", "unit", "--states", "20000", "--json", "-")
+def test_what_has_no_end_in_sight_ends_with_an_honest_part(
+    net: Net, deadlock: bool, tmp_path: Path
+) -> None:
+    """Stubborn sets find the one deadlock; siphons with marked traps rule out any in the other
+    two."""
+    process = started(
+        net, tmp_path, "analyse", "--rates", "unit", "--states", "20000", "--json", "-"
+    )
     data = answered(process, proven=not deadlock)
-    assert data["complete"] is False and "limit of 20000 states" in data["reason"] and data["bounded"] is True
+    assert (
+        data["complete"] is False
+        and "limit of 20000 states" in data["reason"]
+        and data["bounded"] is True
+    )
     assert data["states"] >= 20_000 and data["home_states"] is None
     assert data["throughput"] is None and data["mean_tokens"] is None and data["residual"] is None
     assert any("simulate instead" in note for note in data["notes"])
@@ -91,19 +106,35 @@ def test_what_cannot_be_solved_can_be_played(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("net", [philosophers(60), kanban(5)], ids=["300 places", "2.5 million markings"])
+@pytest.mark.parametrize(
+    "net", [philosophers(60), kanban(5)], ids=["300 places", "2.5 million markings"]
+)
 @pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.proof)])
 def test_ctrl_c_leaves_what_was_known(net: Net, share: float, tmp_path: Path) -> None:
     """At two moments after the search has begun, told by the processor time that it has taken."""
     process = started(net, tmp_path, "analyse", "--rates", "unit", "--json", "-")
     _interrupt_after(process, 0.8 + share)
     data = answered(process)
-    assert data["complete"] is False and data["reason"] == "interrupted" and any("Ctrl-C" in n for n in data["notes"])
+    assert (
+        data["complete"] is False
+        and data["reason"] == "interrupted"
+        and any("Ctrl-C" in n for n in data["notes"])
+    )
     assert data["states"] >= 1 and data["live"] is not True and data["throughput"] is None
 
 
 def test_ctrl_c_ends_a_simulation_with_its_intervals(tmp_path: Path) -> None:
-    arguments = ("simulate", "--rates", "unit", "--horizon", "1e6", "--replicas", "100", "--json", "-")
+    arguments = (
+        "simulate",
+        "--rates",
+        "unit",
+        "--horizon",
+        "1e6",
+        "--replicas",
+        "100",
+        "--json",
+        "-",
+    )
     process = started(kanban(5), tmp_path, *arguments)
     _interrupt_after(process, 1.2)
     data = answered(process)

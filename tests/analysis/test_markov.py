@@ -1,4 +1,5 @@
-"""Long run, transient, completion and derivatives: closed forms, and dense linear algebra on random GSPNs."""
+"""Long run, transient, completion and derivatives: closed forms, and dense linear algebra on random
+GSPNs."""
 
 from __future__ import annotations
 
@@ -11,17 +12,22 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import erlang
 
-from coordinator.analysis.completion import completion, law
-from coordinator.analysis.forecast import forecast
-from coordinator.analysis.graph import Mask
-from coordinator.analysis.gspn import Chain, Gspn, TimelessTrap, Values
-from coordinator.analysis.linear import stationary
-from coordinator.analysis.markov import Generator, long_run, poisson_weights, transient
-from coordinator.analysis.sensitivity import reliability_slopes, reward_slopes, throughput_slopes, time_slopes
-from coordinator.analysis.space import Limits
-from coordinator.analysis.stochastic import stochastic_view
-from coordinator.net import Net
-from coordinator.taskfile import load
+from petrobot.coordinator.analysis.completion import completion, law
+from petrobot.coordinator.analysis.forecast import forecast
+from petrobot.coordinator.analysis.graph import Mask
+from petrobot.coordinator.analysis.gspn import Chain, Gspn, TimelessTrap, Values
+from petrobot.coordinator.analysis.linear import stationary
+from petrobot.coordinator.analysis.markov import Generator, long_run, poisson_weights, transient
+from petrobot.coordinator.analysis.sensitivity import (
+    reliability_slopes,
+    reward_slopes,
+    throughput_slopes,
+    time_slopes,
+)
+from petrobot.coordinator.analysis.space import Limits
+from petrobot.coordinator.analysis.stochastic import stochastic_view
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.taskfile import load
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, repairman, stages
 from tests.analysis.random_nets import gspns
 
@@ -40,7 +46,10 @@ def test_a_queue_with_one_server() -> None:
 def test_a_queue_with_several_servers(c: int, K: int) -> None:
     a, mu = 1.7, 0.6
     run = long_run(Chain.of(Gspn.of(queue(K), {"arrive": a, "serve": mu}, servers={"serve": c})))
-    weights = [(a / mu) ** n / (factorial(n) if n <= c else factorial(c) * c ** (n - c)) for n in range(K + 1)]
+    weights = [
+        (a / mu) ** n / (factorial(n) if n <= c else factorial(c) * c ** (n - c))
+        for n in range(K + 1)
+    ]
     p = np.array(weights) / sum(weights)
     assert run.throughput["arrive"] == pytest.approx(a * (1 - p[K]), abs=1e-12)
     assert run.mean_tokens["waiting"] == pytest.approx(float(p @ np.arange(K + 1)), abs=1e-12)
@@ -48,8 +57,12 @@ def test_a_queue_with_several_servers(c: int, K: int) -> None:
 
 def test_the_machine_repairman() -> None:
     n, fail, repair = 6, 0.3, 1.1
-    run = long_run(Chain.of(Gspn.of(repairman(n), {"fail": fail, "repair": repair}, servers={"fail": None})))
-    weights = np.array([factorial(n) / factorial(n - k) * (fail / repair) ** k for k in range(n + 1)])
+    run = long_run(
+        Chain.of(Gspn.of(repairman(n), {"fail": fail, "repair": repair}, servers={"fail": None}))
+    )
+    weights = np.array(
+        [factorial(n) / factorial(n - k) * (fail / repair) ** k for k in range(n + 1)]
+    )
     p = weights / weights.sum()
     assert run.mean_tokens["down"] == pytest.approx(float(p @ np.arange(n + 1)), abs=1e-12)
     assert run.throughput["repair"] == pytest.approx(repair * (1 - p[0]), abs=1e-12)
@@ -62,7 +75,9 @@ def test_erlang_completion(k: int) -> None:
     goal = chain.space.tokens(k) > 0
     done = completion(chain, goal)
     assert done.probability == 1.0
-    assert done.mean == pytest.approx(k / rate, rel=1e-12) and done.variance == pytest.approx(k / rate**2, rel=1e-9)
+    assert done.mean == pytest.approx(k / rate, rel=1e-12) and done.variance == pytest.approx(
+        k / rate**2, rel=1e-9
+    )
     shape = law(chain, goal)
     exact = erlang(k, scale=1 / rate)
     for q in (0.05, 0.5, 0.9, 0.99):
@@ -70,7 +85,9 @@ def test_erlang_completion(k: int) -> None:
         assert shape.cdf(float(exact.ppf(q))) == pytest.approx(q, rel=1e-9)
 
 
-@pytest.mark.parametrize(("n", "throughput"), [(1, 0.0925846346333826), (2, 0.173871706178), (3, 0.233071166004)])
+@pytest.mark.parametrize(
+    ("n", "throughput"), [(1, 0.0925846346333826), (2, 0.173871706178), (3, 0.233071166004)]
+)
 def test_kanban_throughput_as_published(n: int, throughput: float) -> None:
     run = long_run(Chain.of(Gspn.of(kanban(n), KANBAN_RATES)))
     assert run.throughput["tin1"] == pytest.approx(throughput, abs=1e-10 if n > 1 else 1e-15)
@@ -85,7 +102,8 @@ def test_kanban_4_throughput_as_published() -> None:
 
 
 def expm(A: Values) -> Values:
-    """exp(A) by scaling and squaring of its Taylor series (scipy 1.17.1 is wrong on triangular ones with equal diagonals)."""
+    """exp(A) by scaling and squaring of its Taylor series (scipy 1.17.1 is wrong on triangular ones
+    with equal diagonals)."""
     halvings = max(0, int(np.ceil(np.log2(max(1e-9, float(np.abs(A).sum(axis=1).max()))))) + 4)
     small, term, total = A / 2.0**halvings, np.eye(len(A)), np.eye(len(A))
     for k in range(1, 16):
@@ -95,7 +113,8 @@ def expm(A: Values) -> Values:
 
 
 def dense(chain: Chain) -> tuple[Values, Values]:
-    """(generator over tangible markings, probabilities of entering them first) by plain matrices."""
+    """(generator over tangible markings, probabilities of entering them first) by plain
+    matrices."""
     P = np.zeros((chain.n, chain.n))
     np.add.at(P, (chain.source, chain.target), chain.amount)
     v, t = np.flatnonzero(chain.vanishing), chain.tangible
@@ -149,12 +168,16 @@ def test_completion_against_dense_matrices(gspn: Gspn, data: st.DataObject) -> N
     whole = p @ h + start[end].sum()
     assert done.probability == pytest.approx(whole, rel=1e-9)
     assert done.mean == pytest.approx(p @ first / whole, rel=1e-8)
-    assert done.variance == pytest.approx(p @ second / whole - (p @ first / whole) ** 2, rel=1e-6, abs=1e-9)
+    assert done.variance == pytest.approx(
+        p @ second / whole - (p @ first / whole) ** 2, rel=1e-6, abs=1e-9
+    )
     assert done.residual < 1e-12
     shape, t = law(chain, goal), 1.3
     frozen = Q.copy()
     frozen[~stay] = 0.0
-    assert shape.cdf(t) == pytest.approx(float((start @ expm(frozen * t))[end].sum()) / whole, abs=1e-8)
+    assert shape.cdf(t) == pytest.approx(
+        float((start @ expm(frozen * t))[end].sum()) / whole, abs=1e-8
+    )
 
 
 def bumped(gspn: Gspn, name: str, factor: float) -> Gspn:
@@ -182,9 +205,15 @@ def test_derivatives_against_differences(gspn: Gspn, data: st.DataObject) -> Non
         return other.probability, other.mean
 
     (h1, t1), (h0, t0) = at(1 + step, goal), at(1 - step, goal)
-    assert by_h[name].elasticity * done.probability == pytest.approx((h1 - h0) / (2 * step), abs=1e-6)
-    assert by_time[name].elasticity * done.mean == pytest.approx((t1 - t0) / (2 * step), rel=1e-4, abs=1e-5)
-    assert by_time[name].derivative * by_time[name].value == pytest.approx(by_time[name].elasticity * done.mean)
+    assert by_h[name].elasticity * done.probability == pytest.approx(
+        (h1 - h0) / (2 * step), abs=1e-6
+    )
+    assert by_time[name].elasticity * done.mean == pytest.approx(
+        (t1 - t0) / (2 * step), rel=1e-4, abs=1e-5
+    )
+    assert by_time[name].derivative * by_time[name].value == pytest.approx(
+        by_time[name].elasticity * done.mean
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -193,10 +222,15 @@ def test_throughput_derivatives_against_differences(gspn: Gspn, data: st.DataObj
     chain = Chain.of(gspn)
     assume(chain.n <= 80 and chain.graph.bottom.sum() == 1)
     run = long_run(chain)
-    name, what = data.draw(st.sampled_from(gspn.net.transitions)), data.draw(st.sampled_from(gspn.net.transitions))
+    name, what = (
+        data.draw(st.sampled_from(gspn.net.transitions)),
+        data.draw(st.sampled_from(gspn.net.transitions)),
+    )
     tokens = chain.space.tokens(0).astype(float)
     step = 1e-5
-    more, less = (long_run(Chain.of(bumped(gspn, name, f), space=chain.space)) for f in (1 + step, 1 - step))
+    more, less = (
+        long_run(Chain.of(bumped(gspn, name, f), space=chain.space)) for f in (1 + step, 1 - step)
+    )
     slope = throughput_slopes(run, what)[name]
     change = (more.throughput[what] - less.throughput[what]) / (2 * step)
     assert slope.derivative * slope.value == pytest.approx(change, rel=1e-4, abs=1e-6)
@@ -221,10 +255,16 @@ def cycle_of_immediates(escape: float) -> Gspn:
 
 def test_cycles_of_immediate_transitions_are_solved_and_timeless_traps_refused() -> None:
     run = long_run(Chain.of(cycle_of_immediates(0.25)))
-    assert run.throughput["out"] == pytest.approx(2.0) and run.throughput["ba"] == pytest.approx(8.0)
+    assert run.throughput["out"] == pytest.approx(2.0) and run.throughput["ba"] == pytest.approx(
+        8.0
+    )
     generator = Generator.of(run.chain)
-    assert generator.matrix.toarray() == pytest.approx(np.ones((1, 1))) and generator.start.tolist() == [1.0]
-    trap = Net.build({"idle": 1, "a": 0}, {"go": ({"idle": 1}, {"a": 1}), "spin": ({"a": 1}, {"a": 1})})
+    assert generator.matrix.toarray() == pytest.approx(
+        np.ones((1, 1))
+    ) and generator.start.tolist() == [1.0]
+    trap = Net.build(
+        {"idle": 1, "a": 0}, {"go": ({"idle": 1}, {"a": 1}), "spin": ({"a": 1}, {"a": 1})}
+    )
     with pytest.raises(TimelessTrap, match="spin"):
         Chain.of(Gspn.of(trap, {"go": 1.0}))
 
@@ -240,7 +280,9 @@ def test_the_long_run_mixes_the_components_that_are_reached() -> None:
         },
     )
     run = long_run(Chain.of(Gspn.of(net, {"l": 1.0, "r": 3.0, "to": 1.0, "fro": 2.0})))
-    assert run.mean_tokens["left"] == pytest.approx(0.25) and run.mean_tokens["back"] == pytest.approx(0.25)
+    assert run.mean_tokens["left"] == pytest.approx(0.25) and run.mean_tokens[
+        "back"
+    ] == pytest.approx(0.25)
     assert run.throughput["to"] == pytest.approx(0.75 * 2 / 3)
     with pytest.raises(ValueError, match="several components"):
         throughput_slopes(run, "to")
@@ -253,8 +295,13 @@ def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
     p /= p.sum()
     assert np.allclose(run.probability, p, atol=1e-12)
     slope = throughput_slopes(run, "serve")["arrive"]
-    more, less = (long_run(Chain.of(Gspn.of(queue(699), {"arrive": a, "serve": 1.0}))) for a in (0.9701, 0.9699))
-    assert slope.derivative == pytest.approx((more.throughput["serve"] - less.throughput["serve"]) / 2e-4, rel=1e-4)
+    more, less = (
+        long_run(Chain.of(Gspn.of(queue(699), {"arrive": a, "serve": 1.0})))
+        for a in (0.9701, 0.9699)
+    )
+    assert slope.derivative == pytest.approx(
+        (more.throughput["serve"] - less.throughput["serve"]) / 2e-4, rel=1e-4
+    )
     rows = np.repeat(np.arange(900), 2)
     columns = np.stack([(np.arange(900) + 1) % 900, (np.arange(900) * 7) % 900], axis=1).ravel()
     nu = stationary(900, rows, columns, np.tile([0.7, 0.3], 900))
@@ -277,9 +324,9 @@ def test_completion_of_a_large_component_by_gauss_seidel() -> None:
 @pytest.mark.parametrize("mean", [0.0, 1e-3, 1.0, 30.0, 5e4])
 def test_poisson_weights(mean: float) -> None:
     low, weight = poisson_weights(mean)
-    assert weight.sum() == pytest.approx(1.0) and (low + np.arange(len(weight))) @ weight == pytest.approx(
-        mean, abs=1e-9
-    )
+    assert weight.sum() == pytest.approx(1.0) and (
+        low + np.arange(len(weight))
+    ) @ weight == pytest.approx(mean, abs=1e-9)
     if mean < 100:
         k = low + len(weight) // 2
         assert weight[k - low] == pytest.approx(exp(-mean) * mean**k / factorial(k), rel=1e-9)
@@ -293,7 +340,10 @@ def test_what_cannot_be_is_refused_with_a_reason() -> None:
     with pytest.raises(ValueError, match="unlimited only"):
         Gspn.of(Net.build({"p": 0}, {"t": ({}, {"p": 1})}), {"t": 1.0}, servers={"t": None})
     with pytest.raises(ValueError, match="simulate instead"):
-        Chain.of(Gspn.of(Net.build({"p": 1}, {"t": ({"p": 1}, {"p": 2})}), {"t": 1.0}), limits=Limits(states=10))
+        Chain.of(
+            Gspn.of(Net.build({"p": 1}, {"t": ({"p": 1}, {"p": 2})}), {"t": 1.0}),
+            limits=Limits(states=10),
+        )
 
 
 def test_what_if() -> None:
@@ -303,7 +353,8 @@ def test_what_if() -> None:
 
 
 def test_the_law_ends_where_rounding_begins() -> None:
-    """Many jumps of a large chain leave more rounding than the share at which the law is cut off; it ends all the same."""
+    """Many jumps of a large chain leave more rounding than the share at which the law is cut off;
+    it ends all the same."""
     task = load(Path(__file__).parents[2] / "coordinator" / "tasks" / "follow_track.toml")
     found = forecast(stochastic_view(task, stages=8, timer_stages=8))
     whole = law(found.chain, found.done.goal, left=1e-14, steps=60_000)

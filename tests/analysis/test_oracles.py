@@ -1,4 +1,5 @@
-"""Three independent tools agree with us on random nets, each where it is installed (`pip install petrobot[oracle]`)."""
+"""Three independent tools agree with us on random nets, each where it is installed (`pip install
+petrobot[oracle]`)."""
 
 from __future__ import annotations
 
@@ -8,14 +9,14 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis.completion import completion
-from coordinator.analysis.formats import written
-from coordinator.analysis.gspn import Chain, Gspn
-from coordinator.analysis.markov import long_run
-from coordinator.analysis.netfile import NetFile
-from coordinator.analysis.pnml_writing import write_pnml
-from coordinator.analysis.space import Limits, explore
-from coordinator.net import Net
+from petrobot.coordinator.analysis.completion import completion
+from petrobot.coordinator.analysis.formats import written
+from petrobot.coordinator.analysis.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.markov import long_run
+from petrobot.coordinator.analysis.netfile import NetFile
+from petrobot.coordinator.analysis.pnml_writing import write_pnml
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.net import Net
 from tests.analysis import oracles
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
@@ -53,7 +54,8 @@ def ours(net: Net) -> tuple[set[tuple[int, ...]], int]:
 @RANDOM
 @given(nets(inhibitors=False, capacities=False, priorities=False))
 def test_snakes_reaches_the_same_markings(snakes: None, net: Net) -> None:
-    """Weighted arcs: the same markings and as many firings between them (SNAKES never fires what consumes nothing)."""
+    """Weighted arcs: the same markings and as many firings between them (SNAKES never fires what
+    consumes nothing)."""
     assume(all(net.consume))
     assume(brute_force(net, MOST) is not None)
     assert oracles.snakes_graph(net, 10 * MOST) == ours(net)
@@ -66,7 +68,9 @@ def test_snakes_with_inhibitors(snakes: None, net: Net, data: st.DataObject) -> 
     arcs = {t: ({net.places[p]: w for p, w in net.consume[i]}, {net.places[p]: w for p, w in net.produce[i]})
             for i, t in enumerate(net.transitions)}  # fmt: skip
     free = {t: [p for p in net.places if p not in arcs[t][0]] for t in net.transitions}
-    inhibitors = {t: {data.draw(st.sampled_from(places)): 1} for t, places in free.items() if places}
+    inhibitors = {
+        t: {data.draw(st.sampled_from(places)): 1} for t, places in free.items() if places
+    }
     barred = Net.build(dict(zip(net.places, net.initial, strict=True)), arcs, inhibitors=inhibitors)
     assert oracles.snakes_graph(barred, 10 * MOST) == ours(barred)
 
@@ -97,7 +101,8 @@ def test_storm_reads_what_we_write_and_agrees(storm: None) -> None:
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(1, 6), st.lists(st.floats(0.2, 5.0), min_size=2, max_size=5))
 def test_storm_agrees_on_times(storm: None, tokens: int, rates: list[float]) -> None:
-    """Mean time until all jobs have gone through a line of machines, solved by Storm, against our completion."""
+    """Mean time until all jobs have gone through a line of machines, solved by Storm, against our
+    completion."""
     names = [f"p{i}" for i in range(len(rates) + 1)]
     arcs = {f"t{i}": ({names[i]: 1}, {names[i + 1]: 1}) for i in range(len(rates))}
     arcs["all"] = ({names[-1]: tokens}, {"done": 1})

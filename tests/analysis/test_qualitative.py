@@ -1,4 +1,5 @@
-"""Verdicts against their definitions, by brute force on random nets, and witnesses against the net itself."""
+"""Verdicts against their definitions, by brute force on random nets, and witnesses against the net
+itself."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis.graph import Graph, _tarjan
-from coordinator.analysis.qualitative import Qualitative, examine
-from coordinator.analysis.space import Limits, explore
-from coordinator.analysis.stubborn import hunt_deadlock
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.graph import Graph, _tarjan
+from petrobot.coordinator.analysis.qualitative import Qualitative, examine
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.analysis.stubborn import hunt_deadlock
+from petrobot.coordinator.net import Marking, Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
 
@@ -42,7 +43,9 @@ def judge(net: Net, found: Reached, final: Callable[[Marking], bool]) -> dict[st
     for i, t, j in edges:
         can[:, t] |= reach[:, i]
         again[t] |= reach[j, i]
-    levels = tuple(4 if can[:, t].all() else 3 if again[t] else 1 if can[0, t] else 0 for t in range(m))
+    levels = tuple(
+        4 if can[:, t].all() else 3 if again[t] else 1 if can[0, t] else 0 for t in range(m)
+    )
     busy = {i for i, _, _ in edges}
     ends = np.array([final(x) for x in markings])
     return {
@@ -73,7 +76,14 @@ def told(result: Qualitative) -> dict[str, object]:
 
 def check_witnesses(net: Net, result: Qualitative) -> None:
     """Every witness replays in the net and ends where it says."""
-    verdicts = [result.bounded, result.safe, result.deadlock_free, result.quasi_live, result.live, result.reversible]
+    verdicts = [
+        result.bounded,
+        result.safe,
+        result.deadlock_free,
+        result.quasi_live,
+        result.live,
+        result.reversible,
+    ]
     shown = [v.witness for v in verdicts if v.witness] + [d.witness for d in result.deadlocks]
     for one in shown:
         last = list(net.replay(one.firings))[-1]
@@ -118,7 +128,11 @@ def test_a_partial_search_never_says_what_the_whole_one_denies(net: Net, states:
     assert found is not None
     whole = told(examine(explore(net), final=lambda _: False))
     assert part.bounded.holds is not False
-    for name, verdict in (("live", part.live), ("quasi_live", part.quasi_live), ("reversible", part.reversible)):
+    for name, verdict in (
+        ("live", part.live),
+        ("quasi_live", part.quasi_live),
+        ("reversible", part.reversible),
+    ):
         assert verdict.holds in (None, whole[name]), name
     assert part.deadlock_free.holds in (None, whole["dead"] == 0)
     assert part.safe.holds in (None, max(whole["bounds"]) <= 1)  # type: ignore[call-overload]
@@ -126,7 +140,9 @@ def test_a_partial_search_never_says_what_the_whole_one_denies(net: Net, states:
 
 @settings(max_examples=120, deadline=None)
 @given(nets(), st.booleans())
-def test_stubborn_sets_find_a_deadlock_exactly_when_there_is_one(net: Net, with_final: bool) -> None:
+def test_stubborn_sets_find_a_deadlock_exactly_when_there_is_one(
+    net: Net, with_final: bool
+) -> None:
     found = brute_force(net, 150)
     assume(found is not None)
     assert found is not None
@@ -142,17 +158,23 @@ def test_stubborn_sets_find_a_deadlock_exactly_when_there_is_one(net: Net, with_
 def test_stubborn_sets_need_few_markings() -> None:
     hunt = hunt_deadlock(philosophers(10))
     assert hunt.firings is not None and hunt.states < 3**10 / 50
-    assert hunt_deadlock(kanban(3)).firings is None and not hunt_deadlock(kanban(3), effort=20).complete
+    assert (
+        hunt_deadlock(kanban(3)).firings is None
+        and not hunt_deadlock(kanban(3), effort=20).complete
+    )
 
 
 def test_deadlocks_of_the_philosophers_are_grouped_with_their_emptied_siphon() -> None:
     result = examine(explore(philosophers(4)))
     assert result.deadlock_free.holds is False and result.dead_markings == 2
     assert {d.marked for d in result.deadlocks} == {
-        tuple(p for p in philosophers(4).places if p.startswith(side)) for side in ("hasleft", "hasright")
+        tuple(p for p in philosophers(4).places if p.startswith(side))
+        for side in ("hasleft", "hasright")
     }
     for d in result.deadlocks:
-        assert len(d.witness.firings) == 4 and {"fork0", "fork1", "fork2", "fork3"} <= set(d.emptied)
+        assert len(d.witness.firings) == 4 and {"fork0", "fork1", "fork2", "fork3"} <= set(
+            d.emptied
+        )
 
 
 def test_kanban_is_live_reversible_and_bounded() -> None:
@@ -160,15 +182,21 @@ def test_kanban_is_live_reversible_and_bounded() -> None:
     assert [v.holds for v in (result.bounded, result.safe, result.live, result.reversible, result.deadlock_free)] == [
         True, False, True, True, True,
     ]  # fmt: skip
-    assert result.home_states == 4600 and set(result.levels) == {4} and result.dead_transitions == ()
+    assert (
+        result.home_states == 4600 and set(result.levels) == {4} and result.dead_transitions == ()
+    )
 
 
 def test_an_unbounded_net_gets_a_pump_and_unknowns() -> None:
-    net = Net.build({"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})})
+    net = Net.build(
+        {"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})}
+    )
     result = examine(explore(net, limits=Limits(states=100)))
     assert result.bounded.holds is False and result.bounded.witness is not None
     assert result.bounded.witness.loop == ("grow",) and result.bounds == (1, None)
-    assert result.live.holds is None and result.home_states is None and result.quasi_live.holds is True
+    assert (
+        result.live.holds is None and result.home_states is None and result.quasi_live.holds is True
+    )
 
 
 def test_a_partial_search_of_a_bounded_net_still_proves_it_bounded() -> None:
@@ -178,7 +206,11 @@ def test_a_partial_search_of_a_bounded_net_still_proves_it_bounded() -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(1, 12), st.lists(st.tuples(st.integers(0, 11), st.integers(0, 11)), max_size=30), st.data())
+@given(
+    st.integers(1, 12),
+    st.lists(st.tuples(st.integers(0, 11), st.integers(0, 11)), max_size=30),
+    st.data(),
+)
 def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObject) -> None:
     pairs = sorted((a % n, b % n) for a, b in pairs)
     source, target = (np.array([p[k] for p in pairs], dtype=np.int32) for k in (0, 1))
@@ -190,7 +222,9 @@ def test_graph_primitives(n: int, pairs: list[tuple[int, int]], data: st.DataObj
         reach |= np.outer(reach[:, k], reach[k])
     labels = graph.components
     assert np.array_equal(labels[:, None] == labels[None, :], reach & reach.T)
-    assert np.array_equal(graph.forward([0]), reach[0]) and np.array_equal(graph.backward([0]), reach[:, 0])
+    assert np.array_equal(graph.forward([0]), reach[0]) and np.array_equal(
+        graph.backward([0]), reach[:, 0]
+    )
     goal = data.draw(st.integers(0, n - 1))
     path = graph.path(0, np.arange(n) == goal)
     assert (path is not None) == reach[0, goal]
@@ -215,8 +249,16 @@ def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
     """300 places, some 1e28 markings: the answer is honest and has a witness."""
     net = philosophers(60)
     result = examine(explore(net, limits=Limits(states=2000)))
-    assert result.deadlock_free.holds is False and result.live.holds is False and not result.live.complete
-    assert result.bounded.holds is True and result.safe.holds is True and result.reversible.holds is False
+    assert (
+        result.deadlock_free.holds is False
+        and result.live.holds is False
+        and not result.live.complete
+    )
+    assert (
+        result.bounded.holds is True
+        and result.safe.holds is True
+        and result.reversible.holds is False
+    )
     (found,) = result.deadlocks
     *_, last = net.replay(found.witness.firings)
     assert not net.enabled(last) and "fork0" in found.emptied

@@ -1,4 +1,5 @@
-"""Whole analyses and the commands: promised keys, numbers in closed form, pictures, and one clear line for bad input."""
+"""Whole analyses and the commands: promised keys, numbers in closed form, pictures, and one clear
+line for bad input."""
 
 from __future__ import annotations
 
@@ -10,25 +11,25 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from coordinator.analysis.commands import (
+from petrobot.coordinator.analysis.commands import (
     analyse_command,
     convert_command,
     graph_command,
     simulate_command,
 )
-from coordinator.analysis.forecast import forecast
-from coordinator.analysis.formats import read_net
-from coordinator.analysis.gspn import Gspn
-from coordinator.analysis.netfile import FormatError, NetFile
-from coordinator.analysis.picture import graph_svg
-from coordinator.analysis.pnml_writing import write_pnml
-from coordinator.analysis.rates import read_rates, unit_rates
-from coordinator.analysis.report import analyse, heat
-from coordinator.analysis.space import Limits, explore
-from coordinator.analysis.stochastic import stochastic_view
-from coordinator.net import Net
-from coordinator.task import Estimate, Status
-from coordinator.taskfile import load
+from petrobot.coordinator.analysis.forecast import forecast
+from petrobot.coordinator.analysis.formats import read_net
+from petrobot.coordinator.analysis.gspn import Gspn
+from petrobot.coordinator.analysis.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.picture import graph_svg
+from petrobot.coordinator.analysis.pnml_writing import write_pnml
+from petrobot.coordinator.analysis.rates import read_rates, unit_rates
+from petrobot.coordinator.analysis.report import analyse, heat
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.analysis.stochastic import stochastic_view
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Estimate, Status
+from petrobot.coordinator.taskfile import load
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers, queue
 
 CATCH = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
@@ -55,9 +56,15 @@ def test_a_net_file_gives_the_promised_keys(tmp_path: Path) -> None:
         True,
         True,
     )
-    assert data["max_tokens_per_place"] == 1 and data["deadlocks"] == [] and data["structure"]["conservative"]
+    assert (
+        data["max_tokens_per_place"] == 1
+        and data["deadlocks"] == []
+        and data["structure"]["conservative"]
+    )
     rates = tmp_path / "rates.toml"
-    rates.write_text("[rates]\n" + "".join(f"{k} = {v}\n" for k, v in KANBAN_RATES.items()), encoding="utf-8")
+    rates.write_text(
+        "[rates]\n" + "".join(f"{k} = {v}\n" for k, v in KANBAN_RATES.items()), encoding="utf-8"
+    )
     timed = analyse_command(path, load, rates=rates)
     assert set(timed.data) >= PROMISED | NUMBERS
     assert timed.data["throughput"]["tin1"] == pytest.approx(0.0925846346333826, abs=1e-12)
@@ -79,11 +86,16 @@ def test_deadlocks_are_told_with_replayable_witnesses() -> None:
 def test_a_partial_and_an_unbounded_net_are_owned_up_to() -> None:
     part = analyse(kanban(3), limits=Limits(states=1000)).to_json()
     assert (
-        part["complete"] is False and part["live"] is None and part["bounded"] is True and part["home_states"] is None
+        part["complete"] is False
+        and part["live"] is None
+        and part["bounded"] is True
+        and part["home_states"] is None
     )
     grows = Net.build({"p": 1}, {"t": ({"p": 1}, {"p": 2})})
     data = analyse(Gspn.of(grows, {"t": 1.0}), view="gspn", limits=Limits(states=50)).to_json()
-    assert data["states"] is None and data["bounded"] is False and data["max_tokens_per_place"] is None
+    assert (
+        data["states"] is None and data["bounded"] is False and data["max_tokens_per_place"] is None
+    )
     assert any("simulate instead" in note for note in data["notes"])
 
 
@@ -91,21 +103,40 @@ def test_the_catching_task_in_one_analysis() -> None:
     found = analyse(load(CATCH), view="gspn", stages=2)
     data = json.loads(json.dumps(found.to_json()))
     assert set(data) >= PROMISED | NUMBERS | {"recoveries", "forecast"}
-    assert data["bounded"] and data["live"] and data["reversible"] and data["sound"] and data["deadlock"] is False
-    assert data["judged_on_closed_net"] and {v["holds"] for k, v in data["verdicts"].items() if k != "safe"} == {True}
+    assert (
+        data["bounded"]
+        and data["live"]
+        and data["reversible"]
+        and data["sound"]
+        and data["deadlock"] is False
+    )
+    assert data["judged_on_closed_net"] and {
+        v["holds"] for k, v in data["verdicts"].items() if k != "safe"
+    } == {True}
     text = found.text()
-    assert "stable" in text and "controllable" in text and "recovered arm_back" in text and "P_complete" in text
+    assert (
+        "stable" in text
+        and "controllable" in text
+        and "recovered arm_back" in text
+        and "P_complete" in text
+    )
     assert 0 < max(heat(found).values()) <= 1
 
 
 def test_the_forecast_of_a_task_is_consistent() -> None:
-    """Firings per mission, conservation of runs, and what moving probability from ERROR to SUCCESS really does."""
+    """Firings per mission, conservation of runs, and what moving probability from ERROR to SUCCESS
+    really does."""
     task = load(CATCH)
     found = forecast(stochastic_view(task, stages=1, timer_stages=1))
     runs = found.firings["start"] + found.firings["no_images"]
     assert runs == pytest.approx(4.0, rel=1e-4)
-    assert found.firings["located"] + found.firings["not_located"] == pytest.approx(found.firings["start"], rel=1e-9)
-    assert found.goal_reliability is not None and 0 < found.conjunctive_reliability < found.goal_reliability < 1
+    assert found.firings["located"] + found.firings["not_located"] == pytest.approx(
+        found.firings["start"], rel=1e-9
+    )
+    assert (
+        found.goal_reliability is not None
+        and 0 < found.conjunctive_reliability < found.goal_reliability < 1
+    )
     assert found.throughput["start"] * found.mission_time == pytest.approx(found.firings["start"])
     assert found.mean_tokens["camera_free"] <= 1 and found.recovery_time > 0
     shares = dict.fromkeys(task.net.places, 0.0)
@@ -116,11 +147,19 @@ def test_the_forecast_of_a_task_is_consistent() -> None:
     moved = dict(primitive.estimates)
     moved[Status.SUCCESS] = replace(moved[Status.SUCCESS], share=moved[Status.SUCCESS].share + step)
     moved[Status.ERROR] = replace(moved[Status.ERROR], share=moved[Status.ERROR].share - step)
-    better = replace(task, primitive_tasks={**task.primitive_tasks, "locate_ball": replace(primitive, estimates=moved)})
+    better = replace(
+        task,
+        primitive_tasks={
+            **task.primitive_tasks,
+            "locate_ball": replace(primitive, estimates=moved),
+        },
+    )
     after = forecast(stochastic_view(better, stages=1, timer_stages=1))
     goals = sum(w.goal_gain for w in found.worth if w.place == "locate_ball")
     assert after.goal_reliability is not None
-    assert (after.goal_reliability - found.goal_reliability) * 4 / step == pytest.approx(goals, rel=1e-2)
+    assert (after.goal_reliability - found.goal_reliability) * 4 / step == pytest.approx(
+        goals, rel=1e-2
+    )
 
 
 def test_a_faster_action_saves_the_time_that_the_forecast_says() -> None:
@@ -129,11 +168,17 @@ def test_a_faster_action_saves_the_time_that_the_forecast_says() -> None:
     primitive = task.primitive_tasks["return_home"]
     quicker = {s: Estimate(e.share, e.mean * factor, e.cv) for s, e in primitive.estimates.items()}
     other = replace(
-        task, primitive_tasks={**task.primitive_tasks, "return_home": replace(primitive, estimates=quicker)}
+        task,
+        primitive_tasks={
+            **task.primitive_tasks,
+            "return_home": replace(primitive, estimates=quicker),
+        },
     )
     after = forecast(stochastic_view(other, stages=1, timer_stages=1))
     share = next(w.time_share for w in found.worth if w.place == "return_home")
-    assert (found.done.mean - after.done.mean) / found.done.mean / (1 - factor) == pytest.approx(share, rel=1e-2)
+    assert (found.done.mean - after.done.mean) / found.done.mean / (1 - factor) == pytest.approx(
+        share, rel=1e-2
+    )
 
 
 def test_simulation_and_solution_of_the_catching_task_agree() -> None:
@@ -143,7 +188,9 @@ def test_simulation_and_solution_of_the_catching_task_agree() -> None:
     mean, low, high = seen.data["time"]
     assert low - (high - low) < exact.done.mean < high + (high - low)
     assert seen.data["quantiles"]["0.9"] == pytest.approx(exact.law().quantile(0.9), rel=0.1)
-    fewer = simulate_command(CATCH, load, np.random.default_rng(5), replicas=200, stages=3, changes=["runs=1"])
+    fewer = simulate_command(
+        CATCH, load, np.random.default_rng(5), replicas=200, stages=3, changes=["runs=1"]
+    )
     assert fewer.data["time"][0] < mean / 2
 
 
@@ -152,7 +199,9 @@ def test_simulating_a_net_needs_a_horizon_and_rates(tmp_path: Path) -> None:
     path = tmp_path / "queue.pnml"
     path.write_text(write_pnml(NetFile(gspn.net, "queue", gspn)), encoding="utf-8")
     assert simulate_command(path, load, np.random.default_rng(1)).code == 2
-    seen = simulate_command(path, load, np.random.default_rng(1), replicas=200, horizon=300.0, warmup=20.0)
+    seen = simulate_command(
+        path, load, np.random.default_rng(1), replicas=200, horizon=300.0, warmup=20.0
+    )
     mean, low, high = seen.data["throughput"]["serve"]
     assert low - 0.01 < 0.7289444010755486 < high + 0.01 and mean > 0
     assert "serve" in seen.text
@@ -209,7 +258,8 @@ def test_bad_rates_files_say_what_is_wrong(text: str, said: str) -> None:
 
 
 def test_rates_may_stand_at_the_top_and_be_few() -> None:
-    """As a flat table or JSON; transitions that are not named get 1/s, or keep what their net file says."""
+    """As a flat table or JSON; transitions that are not named get 1/s, or keep what their net file
+    says."""
     assert read_rates("serve = 2", "r", NetFile(queue(2))).rate == (1.0, 2.0)
     assert read_rates('{"serve": 2.5}', "r", NetFile(queue(2))).rate == (1.0, 2.5)
     known = Gspn.of(queue(2), {"serve": 4.0}, servers={"serve": None})
@@ -218,7 +268,11 @@ def test_rates_may_stand_at_the_top_and_be_few() -> None:
 
 
 def test_rates_files() -> None:
-    gspn = read_rates("default_rate = 2.0\n[rates]\narrive = 1\n[servers]\nserve = 'infinite'", "r", NetFile(queue(2)))
+    gspn = read_rates(
+        "default_rate = 2.0\n[rates]\narrive = 1\n[servers]\nserve = 'infinite'",
+        "r",
+        NetFile(queue(2)),
+    )
     assert gspn.rate == (1.0, 2.0) and gspn.servers == (1, None)
     assert unit_rates(NetFile(queue(2))).rate == (1.0, 1.0)
 

@@ -1,4 +1,5 @@
-"""The robot's words on small cells whose answers are known, and on random nets against slow definitions."""
+"""The robot's words on small cells whose answers are known, and on random nets against slow
+definitions."""
 
 from __future__ import annotations
 
@@ -7,15 +8,16 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis.graph import Graph
-from coordinator.analysis.robot import Flow, Recovery, Roles, judge, legal_exits
-from coordinator.analysis.space import Limits, explore
-from coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.graph import Graph
+from petrobot.coordinator.analysis.robot import Flow, Recovery, Roles, judge, legal_exits
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.net import Marking, Net
 from tests.analysis.random_nets import state_machines
 
 
 def arm(attempts: int, *, give_up: bool = True, renewed: bool = True) -> Net:
-    """One action with an error exit, `attempts` retries of its recovery, an honest end, and a repair that closes the net."""
+    """One action with an error exit, `attempts` retries of its recovery, an honest end, and a
+    repair that closes the net."""
     arcs: dict[str, tuple[dict[str, int], dict[str, int]]] = {
         "start": ({"idle": 1, "runs": 1}, {"move": 1}),
         "done": ({"move": 1}, {"idle": 1, "runs": 1}),
@@ -30,9 +32,22 @@ def arm(attempts: int, *, give_up: bool = True, renewed: bool = True) -> Net:
     if renewed:
         arcs["repair"] = ({"out_of_order": 1, "used": attempts} if attempts else {"out_of_order": 1},
                           {"idle": 1, "left": attempts} if attempts else {"idle": 1})  # fmt: skip
-    places = {"idle": 1, "runs": 1, "move": 0, "recover": 0, "clean": 0, "left": attempts, "used": 0, "out_of_order": 0}
+    places = {
+        "idle": 1,
+        "runs": 1,
+        "move": 0,
+        "recover": 0,
+        "clean": 0,
+        "left": attempts,
+        "used": 0,
+        "out_of_order": 0,
+    }
     return Net.build(
-        places, arcs, inhibitors={"back": {"used": 1}, "give_up": {"left": 1}} if give_up else {"back": {"used": 1}}
+        places,
+        arcs,
+        inhibitors={"back": {"used": 1}, "give_up": {"left": 1}}
+        if give_up
+        else {"back": {"used": 1}},
     )
 
 
@@ -67,7 +82,9 @@ def test_kappa_counts_the_errors_that_recovery_survives(attempts: int) -> None:
     assert fault.kappa == attempts
     assert fault.strategy == ("recovered", "back")
     assert fault.resumed is False
-    assert by_name(judge(explore(net), roles_of(net)).recoveries, "again").kappa == 0  # after the last attempt
+    assert (
+        by_name(judge(explore(net), roles_of(net)).recoveries, "again").kappa == 0
+    )  # after the last attempt
 
 
 def test_a_repair_makes_recovery_almost_sure_and_kappa_unlimited() -> None:
@@ -82,7 +99,10 @@ def test_a_repair_makes_recovery_almost_sure_and_kappa_unlimited() -> None:
     )
     assert by_name(verdicts.recoveries, "fault").kappa is None
     alone = judge(explore(net), roles_of(net), explore(arm(2, renewed=False)))
-    assert by_name(alone.recoveries, "fault").kappa == 2 and by_name(alone.recoveries, "give_up").kappa == -1
+    assert (
+        by_name(alone.recoveries, "fault").kappa == 2
+        and by_name(alone.recoveries, "give_up").kappa == -1
+    )
     assert by_name(alone.recoveries, "fault").almost_sure.holds
 
 
@@ -95,11 +115,19 @@ def test_a_missing_recovery_is_caught_with_a_witness() -> None:
             "fault": ({"move": 1}, {"broken": 1}),
         },
     )
-    roles = Roles(lambda m: m[2] == 0, frozenset({"fault"}), frozenset({"start"}), {"move": frozenset({"start"})})
+    roles = Roles(
+        lambda m: m[2] == 0,
+        frozenset({"fault"}),
+        frozenset({"start"}),
+        {"move": frozenset({"start"})},
+    )
     verdicts = judge(explore(net), roles)
     (fault,) = verdicts.recoveries
     assert fault.possible.holds is False and fault.kappa == -1 and fault.resumed is None
-    assert fault.possible.witness is not None and fault.possible.witness.firings == ("start", "fault")
+    assert fault.possible.witness is not None and fault.possible.witness.firings == (
+        "start",
+        "fault",
+    )
     assert verdicts.stable.holds is False and verdicts.attracted.witness is not None
     assert verdicts.controllable.holds is False and verdicts.unforced == ("move",)
 
@@ -125,7 +153,9 @@ def test_leaving_the_legal_set_is_shown_and_controllable_exits_are_not() -> None
     fine = legal_exits(explore(net), roles_of(net), lambda m: m[net.place_index["move"]] == 0)
     assert fine.holds is True
     bad = legal_exits(explore(net), roles_of(net), roles_of(net).nominal)
-    assert bad.holds is False and bad.witness is not None and bad.witness.firings == ("start", "fault")
+    assert (
+        bad.holds is False and bad.witness is not None and bad.witness.firings == ("start", "fault")
+    )
 
 
 def test_a_part_of_the_space_promises_nothing() -> None:
@@ -136,11 +166,14 @@ def test_a_part_of_the_space_promises_nothing() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(state_machines(tokens=1), st.data())
-def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(net: Net, data: st.DataObject) -> None:
-    """Against value iteration over the support: strategies that leave out free edges, all others equally likely.
+def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(
+    net: Net, data: st.DataObject
+) -> None:
+    """Against value iteration over the support: strategies that leave out free edges, all others
+    equally likely.
 
-    With memoryless strategies enumerated outright, a vertex wins iff under some strategy every vertex reached can still
-    reach the goal.
+    With memoryless strategies enumerated outright, a vertex wins iff under some strategy every
+    vertex reached can still reach the goal.
     """
     space = explore(net)
     edges, n = len(space.target), len(space)

@@ -1,4 +1,5 @@
-"""Simulation against the exact chain, and phase-type laws against their moments and scipy's laws."""
+"""Simulation against the exact chain, and phase-type laws against their moments and scipy's
+laws."""
 
 from __future__ import annotations
 
@@ -8,14 +9,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
 
-from coordinator.analysis.completion import completion, law
-from coordinator.analysis.gspn import Chain, Gspn
-from coordinator.analysis.markov import long_run, transient
-from coordinator.analysis.phase_type import fit, fit_samples, gamma_quantile
-from coordinator.analysis.simulate import Estimate, goal_by_marking, simulate, token_game
-from coordinator.analysis.simulate_kernel import Tables, play
-from coordinator.net import Net
-from services.comm.compiled import COMPILED
+from petrobot.coordinator.analysis.completion import completion, law
+from petrobot.coordinator.analysis.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.markov import long_run, transient
+from petrobot.coordinator.analysis.phase_type import fit, fit_samples, gamma_quantile
+from petrobot.coordinator.analysis.simulate import Estimate, goal_by_marking, simulate, token_game
+from petrobot.coordinator.analysis.simulate_kernel import Tables, play
+from petrobot.coordinator.net import Net
+from petrobot.services.comm.compiled import COMPILED
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, stages
 from tests.analysis.random_nets import gspns
 
@@ -51,11 +52,20 @@ def test_completion_lies_in_the_intervals() -> None:
     chain = Chain.of(gspn)
     goal = chain.space.tokens(2) > 0
     done = completion(chain, goal)
-    seen = simulate(gspn, sure(2), replicas=4000, goal=lambda tokens: tokens[2] > 0, horizon=1e9, confidence=0.9999)
+    seen = simulate(
+        gspn,
+        sure(2),
+        replicas=4000,
+        goal=lambda tokens: tokens[2] > 0,
+        horizon=1e9,
+        confidence=0.9999,
+    )
     assert seen.completed is not None and seen.time is not None
     assert seen.completed.covers(done.probability) and seen.time.covers(done.mean)
     assert seen.quantile(0.9) == pytest.approx(law(chain, goal).quantile(0.9), rel=0.1)
-    same = simulate(gspn, sure(2), replicas=4000, goal=goal_by_marking(lambda m: m[2] > 0), horizon=1e9)
+    same = simulate(
+        gspn, sure(2), replicas=4000, goal=goal_by_marking(lambda m: m[2] > 0), horizon=1e9
+    )
     assert np.array_equal(same.times, seen.times)
 
 
@@ -68,7 +78,9 @@ def test_random_nets_lie_in_wide_intervals(gspn: Gspn, seed: int) -> None:
     grid = np.linspace(0, times, 61)
     tokens = np.stack([chain.space.tokens(p) for p in range(len(gspn.net.places))], axis=1)
     exact = np.asarray(np.trapezoid(transient(chain, grid.tolist()) @ tokens, grid, axis=0)) / times
-    seen = simulate(gspn, np.random.default_rng(seed), replicas=replicas, horizon=times, confidence=1 - 1e-9)
+    seen = simulate(
+        gspn, np.random.default_rng(seed), replicas=replicas, horizon=times, confidence=1 - 1e-9
+    )
     for value, (_, found) in zip(exact, seen.mean_tokens.items(), strict=True):
         assert found.low - 0.03 <= value <= found.high + 0.03
 
@@ -86,7 +98,12 @@ def test_limits_and_determinism() -> None:
 def test_a_dead_replica_is_not_completed() -> None:
     gspn = Gspn.of(stages(2), {"t0": 1.0, "t1": 1.0})
     seen = simulate(gspn, sure(6), replicas=20, goal=lambda tokens: tokens[0] > 5, horizon=1e3)
-    assert seen.completed is not None and seen.completed.mean == 0.0 and seen.time is None and seen.complete
+    assert (
+        seen.completed is not None
+        and seen.completed.mean == 0.0
+        and seen.time is None
+        and seen.complete
+    )
 
 
 def test_token_game_plays_the_net() -> None:
@@ -110,7 +127,9 @@ def test_fits_meet_mean_and_variance(mean: float, cv: float) -> None:
 def test_too_small_a_spread_keeps_the_mean_and_owns_up_to_the_error() -> None:
     fitted = fit(2.0, 0.0, stages=25)
     assert fitted.mean == pytest.approx(2.0) and fitted.variance == pytest.approx(4.0 / 25)
-    assert fitted.error_at_90(2.0) == pytest.approx(gamma(25, scale=2 / 25).ppf(0.9) / 2 - 1, rel=1e-9)
+    assert fitted.error_at_90(2.0) == pytest.approx(
+        gamma(25, scale=2 / 25).ppf(0.9) / 2 - 1, rel=1e-9
+    )
     shifted = fit(2.0, 0.01, shift=1.8)
     assert shifted.mean == pytest.approx(2.0) and shifted.variance == pytest.approx(0.01)
     assert shifted.cdf(1.8) == 0.0
@@ -123,7 +142,10 @@ def test_fitting_measured_durations() -> None:
     fitted, error = fit_samples(sample.tolist())
     assert fitted.mean == pytest.approx(float(sample.mean())) and abs(error) < 0.02
     late = sample + 20
-    plain, with_shift = fit_samples(late.tolist(), stages=25)[1], fit_samples(late.tolist(), stages=25, shifted=True)[1]
+    plain, with_shift = (
+        fit_samples(late.tolist(), stages=25)[1],
+        fit_samples(late.tolist(), stages=25, shifted=True)[1],
+    )
     assert abs(with_shift) < 0.01 < abs(plain)
     assert gamma_quantile(3.0, 1.5) == pytest.approx(gamma(6.0, scale=0.5).ppf(0.9))
     assert gamma_quantile(3.0, 0.0) == 3.0
@@ -132,16 +154,17 @@ def test_fitting_measured_durations() -> None:
 def test_estimates() -> None:
     wide, narrow = (Estimate.share(k, 10 * k, 0.95) for k in (3, 300))
     assert wide.low < narrow.low < 0.1 < narrow.high < wide.high
-    assert Estimate.share(0, 10, 0.95).low == pytest.approx(0.0) and Estimate.share(10, 10, 0.95).high == pytest.approx(
-        1.0
-    )
+    assert Estimate.share(0, 10, 0.95).low == pytest.approx(0.0) and Estimate.share(
+        10, 10, 0.95
+    ).high == pytest.approx(1.0)
     assert Estimate.of(np.array([1.0]), 0.95).covers(1e9)
 
 
 @settings(max_examples=15, deadline=None)
 @given(gspns(), st.integers(0, 2**32))
 def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
-    """The kernel as it stands (compiled where numba is installed) against the replicas of numpy, within wide intervals."""
+    """The kernel as it stands (compiled where numba is installed) against the replicas of numpy,
+    within wide intervals."""
     random = np.random.default_rng(seed)
     tables, initial = Tables.of(gspn), np.array(gspn.net.initial)
     runs, horizon, warmup = 120, 3.0, 0.5
@@ -151,10 +174,15 @@ def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
         _, seen = play(initial, tables, random, horizon, warmup, 10_000, fires[i], area[i])
         assert seen == pytest.approx(horizon - warmup)
         assert area[i].sum() == pytest.approx(sum(gspn.net.initial) * seen)
-    other = simulate(gspn, random, replicas=600, horizon=horizon, warmup=warmup, confidence=1 - 1e-9)
+    other = simulate(
+        gspn, random, replicas=600, horizon=horizon, warmup=warmup, confidence=1 - 1e-9
+    )
     for t, name in enumerate(gspn.net.transitions):
         ours = Estimate.of(fires[:, t] / (horizon - warmup), 1 - 1e-9)
-        assert ours.low - 0.1 <= other.throughput[name].high and other.throughput[name].low <= ours.high + 0.1
+        assert (
+            ours.low - 0.1 <= other.throughput[name].high
+            and other.throughput[name].low <= ours.high + 0.1
+        )
 
 
 def test_the_compiled_engine_is_an_extra() -> None:
@@ -163,7 +191,9 @@ def test_the_compiled_engine_is_an_extra() -> None:
         with pytest.raises(ImportError, match=r"petrobot\[fast\]"):
             simulate(gspn, sure(10), horizon=10.0, engine="numba")
         return
-    seen = simulate(gspn, sure(10), replicas=300, horizon=300.0, warmup=30.0, engine="numba", confidence=0.9999)
+    seen = simulate(
+        gspn, sure(10), replicas=300, horizon=300.0, warmup=30.0, engine="numba", confidence=0.9999
+    )
     assert seen.throughput["serve"].covers(0.7289444010755486) and seen.complete
     with pytest.raises(ValueError, match="for a goal"):
         simulate(gspn, sure(10), goal=lambda tokens: tokens[0] > 1, horizon=1.0, engine="numba")
@@ -171,7 +201,8 @@ def test_the_compiled_engine_is_an_extra() -> None:
 
 @pytest.mark.parametrize("kernel", [False, True], ids=["side by side", "one after the other"])
 def test_an_inhibitor_holds_arrivals_back(kernel: bool) -> None:
-    """A queue that takes nobody in beyond two, as fast out as in: 0, 1 and 2 are equally likely, so the mean is 1."""
+    """A queue that takes nobody in beyond two, as fast out as in: 0, 1 and 2 are equally likely, so
+    the mean is 1."""
     net = Net.build(
         {"source": 1, "waiting": 0},
         {"arrives": ({"source": 1}, {"source": 1, "waiting": 1}), "leaves": ({"waiting": 1}, {})},

@@ -1,4 +1,5 @@
-"""The three engines against the firing rule of the net itself, and against each other under every limit."""
+"""The three engines against the firing rule of the net itself, and against each other under every
+limit."""
 
 from __future__ import annotations
 
@@ -9,14 +10,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis import explore_numba
-from coordinator.analysis.explore import Engine, Explored
-from coordinator.analysis.explore_integers import IntegerEngine
-from coordinator.analysis.explore_numpy import NumpyEngine
-from coordinator.analysis.pack import Layout, TooManyTokens
-from coordinator.analysis.space import EngineName, Limits, Space, explore
-from coordinator.net import Net
-from services.comm.compiled import COMPILED
+from petrobot.coordinator.analysis import explore_numba
+from petrobot.coordinator.analysis.explore import Engine, Explored
+from petrobot.coordinator.analysis.explore_integers import IntegerEngine
+from petrobot.coordinator.analysis.explore_numpy import NumpyEngine
+from petrobot.coordinator.analysis.pack import Layout, TooManyTokens
+from petrobot.coordinator.analysis.space import EngineName, Limits, Space, explore
+from petrobot.coordinator.net import Net
+from petrobot.services.comm.compiled import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 from tests.waiting import Limit
@@ -28,7 +29,9 @@ ENGINES: dict[str, Callable[[Explored], Engine]] = {
 }
 
 
-def run(kind: str, net: Net, *, least: int = 1, cap: int | None = None, keep: bool = True) -> Explored:
+def run(
+    kind: str, net: Net, *, least: int = 1, cap: int | None = None, keep: bool = True
+) -> Explored:
     """A whole search by one engine, from the narrowest layout unless said otherwise."""
     engine = ENGINES[kind](Explored.start(net, Layout.for_net(net, least=least), keep))
     limit = Limit("the end of the search")
@@ -75,8 +78,15 @@ def test_engines_stop_at_the_same_marking_under_a_cap(net: Net, cap: int) -> Non
 
 
 @settings(max_examples=60, deadline=None)
-@given(nets(priorities=False), st.integers(1, 40), st.sampled_from(sorted(ENGINES)), st.sampled_from(sorted(ENGINES)))
-def test_one_engine_goes_on_where_another_stopped(net: Net, cap: int, first: str, second: str) -> None:
+@given(
+    nets(priorities=False),
+    st.integers(1, 40),
+    st.sampled_from(sorted(ENGINES)),
+    st.sampled_from(sorted(ENGINES)),
+)
+def test_one_engine_goes_on_where_another_stopped(
+    net: Net, cap: int, first: str, second: str
+) -> None:
     expected = brute_force(net, 200)
     assume(expected is not None)
     engine = ENGINES[second](run(first, net, cap=cap))
@@ -94,7 +104,9 @@ def test_auto_hands_over_to_numpy_and_agrees_with_plain_integers() -> None:
     assert list(auto.markings(1000))[3][1].tolist() == list(plain.markings(1000))[3][1].tolist()
 
 
-@pytest.mark.parametrize(("n", "states", "edges"), [(1, 160, 616), (2, 4600, 28120), (3, 58400, 446400)])
+@pytest.mark.parametrize(
+    ("n", "states", "edges"), [(1, 160, 616), (2, 4600, 28120), (3, 58400, 446400)]
+)
 def test_kanban_has_the_published_number_of_markings(n: int, states: int, edges: int) -> None:
     space = explore(kanban(n))
     assert (len(space), space.edges, space.complete) == (states, edges, True)
@@ -103,7 +115,9 @@ def test_kanban_has_the_published_number_of_markings(n: int, states: int, edges:
 @pytest.mark.parametrize("kind", sorted(ENGINES))
 def test_fields_grow_with_the_tokens(kind: str) -> None:
     net = Net.build(
-        {"p": 1, "q": 0}, {"double": ({"p": 1}, {"p": 2}), "move": ({"p": 300}, {"q": 1})}, capacity={"p": 999, "q": 5}
+        {"p": 1, "q": 0},
+        {"double": ({"p": 1}, {"p": 2}), "move": ({"p": 300}, {"q": 1})},
+        capacity={"p": 999, "q": 5},
     )
     found = run(kind, net)
     assert found.layout.tokens(found.words, 0).max() == 999
@@ -112,7 +126,8 @@ def test_fields_grow_with_the_tokens(kind: str) -> None:
 
 @pytest.mark.parametrize("engine", ["integers", "numpy"])
 def test_more_tokens_than_a_word_can_count_end_the_search(engine: EngineName) -> None:
-    """What was found before is kept, marked as a part; an initial marking that no word can count is refused."""
+    """What was found before is kept, marked as a part; an initial marking that no word can count is
+    refused."""
     huge = Net.build({"p": 1}, {"grow": ({"p": 1}, {"p": (1 << 62) + 1})})
     part = explore(huge, engine=engine)
     assert not part.complete and "unbounded" in part.reason
@@ -122,7 +137,9 @@ def test_more_tokens_than_a_word_can_count_end_the_search(engine: EngineName) ->
 
 
 def unbounded() -> Net:
-    return Net.build({"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})})
+    return Net.build(
+        {"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})}
+    )
 
 
 @pytest.mark.parametrize("engine", ["auto", "integers", "numpy"])
@@ -161,7 +178,11 @@ def test_ctrl_c_leaves_a_consistent_part(engine: EngineName) -> None:
         if calls == 2:
             raise KeyboardInterrupt
 
-    space = explore(unbounded() if engine == "integers" else kanban(3), engine=engine, limits=Limits(progress=progress))
+    space = explore(
+        unbounded() if engine == "integers" else kanban(3),
+        engine=engine,
+        limits=Limits(progress=progress),
+    )
     assert not space.complete and space.reason == "interrupted"
     whole = explore(space.net, engine=engine, limits=Limits(states=len(space) + 2000))
     assert np.array_equal(whole.target[: len(space.target)], space.target)
@@ -184,7 +205,9 @@ def test_numbers_and_markings_are_inverse() -> None:
     space = explore(kanban(1))
     assert [space.number(space.marking(i)) for i in range(len(space))] == list(range(len(space)))
     assert space.number((7,) * 16) is None and space.number((1 << 40,) * 16) is None
-    assert space.bounds == (1,) * 16 and space.most_tokens == max(sum(space.marking(i)) for i in range(len(space)))
+    assert space.bounds == (1,) * 16 and space.most_tokens == max(
+        sum(space.marking(i)) for i in range(len(space))
+    )
 
 
 def test_without_edges_the_counts_stay() -> None:
@@ -214,7 +237,9 @@ def test_layout_round_trips_and_fields_stay_apart() -> None:
 
 def test_progress_is_told() -> None:
     told: list[tuple[int, int]] = []
-    space: Space = explore(kanban(2), limits=Limits(progress=lambda found, done: told.append((found, done))))
+    space: Space = explore(
+        kanban(2), limits=Limits(progress=lambda found, done: told.append((found, done)))
+    )
     assert told == sorted(told) and told[-1][0] <= len(space)
 
 

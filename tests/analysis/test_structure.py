@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 
-from coordinator.analysis import structure
-from coordinator.analysis.siphons import (
+from petrobot.coordinator.analysis import structure
+from petrobot.coordinator.analysis.siphons import (
     controlled_siphons,
     empty_siphon,
     largest_trap,
     minimal_siphons,
     minimal_traps,
 )
-from coordinator.analysis.space import explore
-from coordinator.analysis.structure import (
+from petrobot.coordinator.analysis.space import explore
+from petrobot.coordinator.analysis.structure import (
     Vector,
     conflict_sets,
     exclusive_places,
@@ -30,7 +30,7 @@ from coordinator.analysis.structure import (
     place_semiflows,
     transition_semiflows,
 )
-from coordinator.net import Net
+from petrobot.coordinator.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
 
@@ -49,7 +49,9 @@ def test_semiflows_annul_the_incidence_matrix_and_are_minimal(net: Net) -> None:
     for flows, rows in ((place_semiflows(net), C), (transition_semiflows(net), C.T)):
         assert flows.complete
         supports = [frozenset(y) for y in flows.vectors]
-        assert not any(a < b for a in supports for b in supports) and len(set(supports)) == len(supports)
+        assert not any(a < b for a in supports for b in supports) and len(set(supports)) == len(
+            supports
+        )
         for y in flows.vectors:
             assert min(y.values()) > 0 and not (dense(y, len(rows)) @ rows).any()
 
@@ -57,7 +59,8 @@ def test_semiflows_annul_the_incidence_matrix_and_are_minimal(net: Net) -> None:
 @settings(max_examples=40, deadline=None)
 @given(nets(weights=2, places=5, transitions=5))
 def test_every_minimal_support_is_found(net: Net) -> None:
-    """A support is minimal when its rows have a one-dimensional kernel with a positive vector (brute force over supports)."""
+    """A support is minimal when its rows have a one-dimensional kernel with a positive vector
+    (brute force over supports)."""
     C = incidence(net)
     expected: set[frozenset[int]] = set()
     for size in range(1, len(net.places) + 1):
@@ -102,7 +105,9 @@ def test_a_lyapunov_function_never_grows_and_proves_boundedness(net: Net) -> Non
     function = lyapunov(net)
     assume(function is not None and function)
     assert function is not None
-    assert set(function.weights) == set(range(len(net.places))) and min(function.weights.values()) > 0
+    assert (
+        set(function.weights) == set(range(len(net.places))) and min(function.weights.values()) > 0
+    )
     space = explore(net)
     assert space.complete
     value = np.array([function.value(space.marking(i)) for i in range(len(space))])
@@ -158,7 +163,16 @@ def siphons_by_definition(net: Net) -> set[frozenset[int]]:
 
 def turned_round(net: Net) -> Net:
     none = tuple(() for _ in net.transitions)
-    return Net(net.places, net.transitions, net.produce, net.consume, none, net.initial, net.capacity, net.priority)
+    return Net(
+        net.places,
+        net.transitions,
+        net.produce,
+        net.consume,
+        none,
+        net.initial,
+        net.capacity,
+        net.priority,
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -202,7 +216,10 @@ def test_conflicts_and_exclusion(n: int) -> None:
     assert len(conflict_sets(net)) == 1
     pairs = exclusive_places(net, place_semiflows(net))
     named = {(net.places[p], net.places[q]) for p, q in pairs}
-    assert all(tuple(sorted(pair, key=net.places.index)) in named for pair in [("think0", "eat0"), ("eat0", "fork0")])
+    assert all(
+        tuple(sorted(pair, key=net.places.index)) in named
+        for pair in [("think0", "eat0"), ("eat0", "fork0")]
+    )
     space = explore(net)
     for p, q in pairs:
         assert not ((space.tokens(p) > 0) & (space.tokens(q) > 0)).any()

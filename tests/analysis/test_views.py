@@ -1,4 +1,5 @@
-"""The two views of a task: what each keeps, numbers in closed form, and the shipped tasks with broken variants."""
+"""The two views of a task: what each keeps, numbers in closed form, and the shipped tasks with
+broken variants."""
 
 from __future__ import annotations
 
@@ -11,17 +12,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis.booleans import boolean_view
-from coordinator.analysis.completion import Completion, completion
-from coordinator.analysis.gspn import Chain
-from coordinator.analysis.markov import visits_before
-from coordinator.analysis.ordinary import OrdinaryView
-from coordinator.analysis.qualitative import examine
-from coordinator.analysis.robot import judge
-from coordinator.analysis.space import Limits, explore
-from coordinator.analysis.stochastic import Measured, NoEstimate, StochasticView, stochastic_view
-from coordinator.conditions import parse
-from coordinator.task import (
+from petrobot.coordinator.analysis.booleans import boolean_view
+from petrobot.coordinator.analysis.completion import Completion, completion
+from petrobot.coordinator.analysis.gspn import Chain
+from petrobot.coordinator.analysis.markov import visits_before
+from petrobot.coordinator.analysis.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.qualitative import examine
+from petrobot.coordinator.analysis.robot import judge
+from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.analysis.stochastic import (
+    Measured,
+    NoEstimate,
+    StochasticView,
+    stochastic_view,
+)
+from petrobot.coordinator.conditions import parse
+from petrobot.coordinator.task import (
     Counts,
     End,
     Estimate,
@@ -40,7 +46,7 @@ from coordinator.task import (
     Variable,
     VariableType,
 )
-from coordinator.taskfile import load
+from petrobot.coordinator.taskfile import load
 
 SHIPPED = sorted((Path(__file__).parents[2] / "coordinator" / "tasks").glob("*.toml"))
 EXPONENTIAL = {
@@ -50,15 +56,23 @@ EXPONENTIAL = {
 }
 
 
-def action(name: str, estimates: dict[Status, Estimate] | None = None, **more: Any) -> dict[str, Any]:
+def action(
+    name: str, estimates: dict[Status, Estimate] | None = None, **more: Any
+) -> dict[str, Any]:
     """Primitive task and action place of one name."""
     known = EXPONENTIAL if estimates is None else estimates
-    primitive = PrimitiveTask(name, f"{name} is done", more.pop("alternatives", ("a",)), 10.0, estimates=known)
+    primitive = PrimitiveTask(
+        name, f"{name} is done", more.pop("alternatives", ("a",)), 10.0, estimates=known
+    )
     return {"primitive": primitive, "place": Place(name, Kind.ACTION, task=name, **more)}
 
 
 def task_of(
-    actions: list[dict[str, Any]], others: list[Place], transitions: list[Transition], final: str, **more: Any
+    actions: list[dict[str, Any]],
+    others: list[Place],
+    transitions: list[Transition],
+    final: str,
+    **more: Any,
 ) -> Task:
     places = [a["place"] for a in actions] + others
     return Task(
@@ -89,7 +103,9 @@ def one_step(**more: Any) -> Task:
     )
 
 
-def completed(task: Task, measured: Measured | None = None, **more: Any) -> tuple[StochasticView, Completion]:
+def completed(
+    task: Task, measured: Measured | None = None, **more: Any
+) -> tuple[StochasticView, Completion]:
     view = stochastic_view(task, measured, **more)
     chain = Chain.of(view.gspn)
     ordinary = OrdinaryView(task)
@@ -120,9 +136,12 @@ def test_measured_runs_choices_and_no_declared_estimates() -> None:
 
 
 def test_a_preempting_event_races_with_the_run() -> None:
-    """P(event first) = mean / (mean + wait) for one exponential run; what is left of the run vanishes."""
+    """P(event first) = mean / (mean + wait) for one exponential run; what is left of the run
+    vanishes."""
     task = one_step(estimates={Status.SUCCESS: Estimate(1.0, 2.0, 1.0)})
-    caught = Transition("caught", (taken("act", End.PREEMPT, Counts.SUCCESS),), (Output("done"),), events=("hit",))
+    caught = Transition(
+        "caught", (taken("act", End.PREEMPT, Counts.SUCCESS),), (Output("done"),), events=("hit",)
+    )
     task = replace(
         task,
         transitions={**task.transitions, "caught": caught},
@@ -136,7 +155,9 @@ def test_a_preempting_event_races_with_the_run() -> None:
     hits = [done.chain.gspn.net.transition_index[case] for case in view.cases["caught"]]
     assert flow[np.isin(done.chain.label, hits)].sum() == pytest.approx(2 / 5)
     assert not done.chain.space.bounds[done.chain.space.net.place_index["act.begin"]] > 1
-    steady = replace(task.primitive_tasks["act"], estimates={Status.SUCCESS: Estimate(1.0, 2.0, 0.0)})
+    steady = replace(
+        task.primitive_tasks["act"], estimates={Status.SUCCESS: Estimate(1.0, 2.0, 0.0)}
+    )
     _, fixed = completed(replace(task, primitive_tasks={"act": steady}), stages=64)
     assert fixed.mean == pytest.approx(3 * (1 - np.exp(-2 / 3)), rel=5e-3)
 
@@ -183,7 +204,9 @@ def test_servers_let_runs_go_on_side_by_side_and_the_others_queue() -> None:
 
 
 def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() -> None:
-    task = one_step(estimates={Status.SUCCESS: Estimate(0.75, 1.0), Status.FAILURE: Estimate(0.25, 1.0)})
+    task = one_step(
+        estimates={Status.SUCCESS: Estimate(0.75, 1.0), Status.FAILURE: Estimate(0.25, 1.0)}
+    )
     places = {**task.places, "poor": Place("poor", Kind.RESOURCE)}
     good, poor = (
         Transition(n, (taken("act", End.NORMAL),), (Output(p),), when=parse(f'act.status == "{s}"'))
@@ -198,8 +221,12 @@ def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() ->
     }
     free = replace(split, transitions=either)
     view, done = completed(free)
-    assert done.probability == pytest.approx(0.5) and any("condition" in text for text in view.assumptions)
-    assert completed(free, Measured(switches={"ok": 0.9, "soso": 0.1}))[1].probability == pytest.approx(0.9)
+    assert done.probability == pytest.approx(0.5) and any(
+        "condition" in text for text in view.assumptions
+    )
+    assert completed(free, Measured(switches={"ok": 0.9, "soso": 0.1}))[
+        1
+    ].probability == pytest.approx(0.9)
 
 
 def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
@@ -214,26 +241,38 @@ def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
     with pytest.raises(NoEstimate, match="positive"):
         stochastic_view(one_step(estimates={Status.SUCCESS: Estimate(1.0, 0.0)}))
     several = one_step(servers=2)
-    stop = Transition("stop", (taken("act", End.PREEMPT, Counts.NONE),), (Output("idle"),), events=("tick",))
+    stop = Transition(
+        "stop", (taken("act", End.PREEMPT, Counts.NONE),), (Output("idle"),), events=("tick",)
+    )
     with pytest.raises(ValueError, match="one server for the forecast"):
         stochastic_view(replace(several, transitions={**several.transitions, "stop": stop}))
 
 
 @st.composite
 def tasks(draw: st.DrawFn) -> Task:
-    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors, timers and events."""
+    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors, timers
+    and events."""
     names = [f"a{i}" for i in range(draw(st.integers(1, 3)))]
     controls = [
-        Place(f"c{i}", Kind.CONTROL, draw(st.integers(0, 2)), capacity=draw(st.sampled_from([None, 3])))
+        Place(
+            f"c{i}",
+            Kind.CONTROL,
+            draw(st.integers(0, 2)),
+            capacity=draw(st.sampled_from([None, 3])),
+        )
         for i in range(3)
     ]
     everywhere = [*names, *(c.name for c in controls)]
     transitions = []
     for i in range(draw(st.integers(3, 8))):
         sources = draw(st.lists(st.sampled_from(everywhere), min_size=1, max_size=2, unique=True))
-        ends = st.sampled_from([(End.NORMAL, None), (End.ERROR, None), (End.GOING, None), (End.PREEMPT, Counts.NONE)])
+        ends = st.sampled_from(
+            [(End.NORMAL, None), (End.ERROR, None), (End.GOING, None), (End.PREEMPT, Counts.NONE)]
+        )
         inputs = tuple(Input(s, 1, *draw(ends)) if s in names else Input(s) for s in sources)
-        outputs = tuple(Output(p) for p in draw(st.lists(st.sampled_from(everywhere), max_size=2, unique=True)))
+        outputs = tuple(
+            Output(p) for p in draw(st.lists(st.sampled_from(everywhere), max_size=2, unique=True))
+        )
         barred = draw(st.lists(st.sampled_from(everywhere), max_size=1))
         trigger = draw(st.sampled_from(["event", "after", "none"]))
         going_only = all(a.end is End.GOING for a in inputs)
@@ -257,7 +296,9 @@ def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: 
     view = stochastic_view(task, stages=2, timer_stages=2)
     space = explore(view.gspn.net, limits=Limits(states=1500))
     net, gspn_net = task.net, view.gspn.net
-    for i, t, j in zip(space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True):
+    for i, t, j in zip(
+        space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True
+    ):
         before, after = view.projected(space.marking(i)), view.projected(space.marking(j))
         name = view.origin.get(gspn_net.transitions[t])
         if name is None:
@@ -324,39 +365,67 @@ def test_the_catching_task_survives_three_further_errors() -> None:
 
 def test_broken_variants_are_caught_with_witnesses() -> None:
     task = catching()
-    lost = {n: t for n, t in task.transitions.items() if n not in ("recovered", "recover_again", "give_up")}
+    lost = {
+        n: t
+        for n, t in task.transitions.items()
+        if n not in ("recovered", "recover_again", "give_up")
+    }
     view = OrdinaryView(replace(task, transitions=lost))
     stuck = examine(explore(view.net), final=view.is_end)
     assert stuck.deadlock_free.holds is False and stuck.deadlock_free.witness is not None
-    assert list(view.net.replay(stuck.deadlock_free.witness.firings))[-1][view.net.place_index["recover_arm"]] == 1
+    assert (
+        list(view.net.replay(stuck.deadlock_free.witness.firings))[-1][
+            view.net.place_index["recover_arm"]
+        ]
+        == 1
+    )
 
     twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
     leaking = replace(task.transitions["not_located"], outputs=twice)
     view = OrdinaryView(replace(task, transitions={**task.transitions, "not_located": leaking}))
     leak = examine(explore(view.net, limits=Limits(states=3000)), final=view.is_end)
-    assert leak.bounded.holds is False and leak.bounded.witness is not None and "runs" in leak.bounded.reason
+    assert (
+        leak.bounded.holds is False
+        and leak.bounded.witness is not None
+        and "runs" in leak.bounded.reason
+    )
     *_, before = view.net.replay(leak.bounded.witness.firings)
     *_, after = view.net.replay(leak.bounded.witness.loop, before)
     assert after[view.net.place_index["runs"]] > before[view.net.place_index["runs"]]
 
-    double = replace(task.transitions["in_place"], outputs=(Output("catch_ball"), Output("arm_free")))
+    double = replace(
+        task.transitions["in_place"], outputs=(Output("catch_ball"), Output("arm_free"))
+    )
     places = {**task.places, "arm_free": replace(task.places["arm_free"], capacity=None)}
-    view = OrdinaryView(replace(task, places=places, transitions={**task.transitions, "in_place": double}))
+    view = OrdinaryView(
+        replace(task, places=places, transitions={**task.transitions, "in_place": double})
+    )
     space = explore(view.net, limits=Limits(states=20_000))
-    both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (space.tokens(view.net.place_index["catch_ball"]) > 0)
+    both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (
+        space.tokens(view.net.place_index["catch_ball"]) > 0
+    )
     assert both.any()
-    assert list(view.net.replay(space.path(int(np.argmax(both)))))[-1] == space.marking(int(np.argmax(both)))
+    assert list(view.net.replay(space.path(int(np.argmax(both)))))[-1] == space.marking(
+        int(np.argmax(both))
+    )
 
 
 def with_variable(initial: bool | None) -> Task:
-    """A run of `look` writes `seen`; its normal exits ask for it; a second look is only for what was not seen."""
+    """A run of `look` writes `seen`; its normal exits ask for it; a second look is only for what
+    was not seen."""
     task = task_of(
         [action("look", out={"seen": "seen"})],
-        [Place("idle", Kind.CONTROL, 1), Place("found", Kind.CONTROL), Place("missed", Kind.CONTROL)],
+        [
+            Place("idle", Kind.CONTROL, 1),
+            Place("found", Kind.CONTROL),
+            Place("missed", Kind.CONTROL),
+        ],
         [
             Transition("go", (Input("idle"),), (Output("look"),)),
             Transition("hit", (taken("look", End.NORMAL),), (Output("found"),), when=parse("seen")),
-            Transition("miss", (taken("look", End.NORMAL),), (Output("missed"),), when=parse("not seen")),
+            Transition(
+                "miss", (taken("look", End.NORMAL),), (Output("missed"),), when=parse("not seen")
+            ),
             Transition("wrong", (Input("missed"),), (Output("found"),), when=parse("seen")),
         ],
         "found == 1 or missed == 1",
@@ -369,16 +438,26 @@ def test_boolean_variables_are_kept_as_complementary_places(initial: bool | None
     task = with_variable(initial)
     view = boolean_view(task)
     space = explore(view.net)
-    names = [t for t, level in zip(view.net.transitions, examine(space).levels, strict=True) if level]
+    names = [
+        t for t, level in zip(view.net.transitions, examine(space).levels, strict=True) if level
+    ]
     fired = {view.origin[name] for name in names if name in view.origin}
-    assert fired == {"go", "hit", "miss"} and "wrong" not in fired  # seen stays false behind `miss`: nothing writes it
+    assert (
+        fired == {"go", "hit", "miss"} and "wrong" not in fired
+    )  # seen stays false behind `miss`: nothing writes it
     values = [i for i, p in enumerate(view.net.places) if p.startswith("seen=")]
     assert all(sum(space.marking(i)[p] for p in values) == 1 for i in range(len(space)))
     width = len(task.net.places)
-    for i, t, j in zip(space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True):
+    for i, t, j in zip(
+        space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True
+    ):
         before, after = space.marking(i)[:width], space.marking(j)[:width]
         name = view.origin.get(view.net.transitions[t])
-        assert before == after if name is None else task.net.fire(before, task.net.transition_index[name]) == after
+        assert (
+            before == after
+            if name is None
+            else task.net.fire(before, task.net.transition_index[name]) == after
+        )
     assert examine(explore(task.net)).dead_transitions == ()
 
 
@@ -390,4 +469,10 @@ def test_other_conditions_are_dropped_and_too_many_variables_refused() -> None:
     many = {f"v{i}": Variable(f"v{i}", VariableType.BOOL, False) for i in range(9)}
     wide = replace(task.transitions["hit"], when=parse(" and ".join(many)))
     with pytest.raises(ValueError, match="9 boolean variables"):
-        boolean_view(replace(task, variables={**task.variables, **many}, transitions={**task.transitions, "hit": wide}))
+        boolean_view(
+            replace(
+                task,
+                variables={**task.variables, **many},
+                transitions={**task.transitions, "hit": wide},
+            )
+        )

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.analysis.commands import analyse_command, simulate_command
-from coordinator.analysis.netfile import FormatError
-from coordinator.analysis.report import analyse
-from coordinator.analysis.stochastic import Measured
-from coordinator.analysis.whatif import change_net, change_task, read_change
-from coordinator.net import Net
-from coordinator.task import Estimate, Status
-from coordinator.taskfile import dumps, load
+from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
+from petrobot.coordinator.analysis.netfile import FormatError
+from petrobot.coordinator.analysis.report import analyse
+from petrobot.coordinator.analysis.stochastic import Measured
+from petrobot.coordinator.analysis.whatif import change_net, change_task, read_change
+from petrobot.coordinator.net import Net
+from petrobot.coordinator.task import Estimate, Status
+from petrobot.coordinator.taskfile import dumps, load
 from tests.analysis.broken import TASKS
 
 CATCH = TASKS / "catch_ball.toml"
@@ -29,7 +29,9 @@ def test_tokens_are_as_in_the_file(tmp_path: Path) -> None:
     what_if = analyse_command(CATCH, load, view="gspn", stages=2, changes=["runs=2"])
     as_file = analyse_command(edited, load, view="gspn", stages=2)
     assert what_if.data["states"] == as_file.data["states"] < what_if.data["as_it_is"]["states"]
-    assert what_if.data["forecast"]["mean"] == pytest.approx(as_file.data["forecast"]["mean"], rel=1e-12)
+    assert what_if.data["forecast"]["mean"] == pytest.approx(
+        as_file.data["forecast"]["mean"], rel=1e-12
+    )
     assert "mean time" in what_if.text and what_if.data["what_if"] == ["runs=2"]
 
 
@@ -45,7 +47,11 @@ def test_shares_keep_their_proportions() -> None:
     assert sum(e.share for e in found.values()) == pytest.approx(1.0)
     assert found[Status.ERROR] == replace(estimates[Status.ERROR], share=0.5)
     ratio = found[Status.SUCCESS].share / estimates[Status.SUCCESS].share
-    assert all(found[s].share == pytest.approx(ratio * e.share) for s, e in estimates.items() if s is not Status.ERROR)
+    assert all(
+        found[s].share == pytest.approx(ratio * e.share)
+        for s, e in estimates.items()
+        if s is not Status.ERROR
+    )
 
 
 def test_what_is_improved_improves() -> None:
@@ -61,7 +67,9 @@ def test_what_is_improved_improves() -> None:
     worse = complete("recover_arm.error.share=0.9")
     assert worse < complete() < complete("recover_arm.error.share=0.0") <= 1.0
     sure = {Status.SUCCESS: Estimate(1.0, 0.5)}
-    known = Measured(runs={("recover_arm", a): sure for a in task.primitive_tasks["recover_arm"].alternatives})
+    known = Measured(
+        runs={("recover_arm", a): sure for a in task.primitive_tasks["recover_arm"].alternatives}
+    )
     _, supposed = change_task(task, known, [read_change("recover_arm.error.share=0.25")])
     (found,) = supposed.runs.values()
     assert {s: e.share for s, e in found.items()} == {Status.SUCCESS: 0.75, Status.ERROR: 0.25}

@@ -1,11 +1,14 @@
-"""Speed of the analysis beside other tools, in one run: states/s, firings/s, GSPN solve and completion times, with memory.
+"""Speed of the analysis beside other tools, in one run: states/s, firings/s, GSPN solve and
+completion times, with memory.
 
-    python -m tests.bench.analysis            # all of it; tools that are not installed are named and skipped
+    python -m tests.bench.analysis            # all of it; tools that are not installed are named
+                                              and skipped
     python -m tests.bench.analysis --quick    # small nets only
     python -m tests.bench.analysis --write docs/figures-analysis.md    # the table as a page, too
 
-Every measurement runs in a process of its own, so that its peak memory is its own; seconds are CPU seconds without imports and
-compilation. Only figures of one run are comparable: the ratios say how many times longer the other tool takes.
+Every measurement runs in a process of its own, so that its peak memory is its own; seconds are CPU
+seconds without imports and compilation. Only figures of one run are comparable: the ratios say how
+many times longer the other tool takes.
 """
 
 from __future__ import annotations
@@ -27,8 +30,15 @@ ROOT = Path(__file__).parents[2]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from coordinator.net import Net  # noqa: E402 - the repository's root comes first
-from tests.analysis.generators import KANBAN_RATES, fms, kanban, philosophers, robot_cell, shared_memory  # noqa: E402
+from petrobot.coordinator.net import Net  # noqa: E402 - the repository's root comes first
+from tests.analysis.generators import (  # noqa: E402
+    KANBAN_RATES,
+    fms,
+    kanban,
+    philosophers,
+    robot_cell,
+    shared_memory,
+)
 
 SPACES: dict[str, Callable[[], Net]] = {
     "kanban-2": lambda: kanban(2),
@@ -53,7 +63,8 @@ NEEDS = {"numba": "numba", "snakes": "snakes", "pm4py": "pm4py", "storm": "storm
 
 
 def timed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """CPU seconds of some work, with what it says: every tool here works in one thread, and others may use the machine."""
+    """CPU seconds of some work, with what it says: every tool here works in one thread, and others
+    may use the machine."""
     start = time.process_time()
     said = work()
     return {"seconds": time.process_time() - start, **said}
@@ -64,7 +75,7 @@ def timed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 def space_ours(name: str, engine: str) -> dict[str, Any]:
     """Our exploration by one engine."""
-    from coordinator.analysis.space import explore
+    from petrobot.coordinator.analysis.space import explore
 
     net = SPACES[name]()
     explore(kanban(1), engine=engine)  # type: ignore[arg-type] # imports and compiles
@@ -139,7 +150,9 @@ def storm_model(net: Net, rates: dict[str, float]) -> Any:
 
     builder = getattr(gspn, "GspnBuilder", None) or gspn.GSPNBuilder  # renamed in stormpy 2
     builder = builder()
-    places = [builder.add_place(CAPACITY, n, p) for p, n in zip(net.places, net.initial, strict=True)]
+    places = [
+        builder.add_place(CAPACITY, n, p) for p, n in zip(net.places, net.initial, strict=True)
+    ]
     for t, name in enumerate(net.transitions):
         node = builder.add_timed_transition(0, rates.get(name, 1.0), 1, name)
         for p, w in net.consume[t]:
@@ -178,8 +191,8 @@ def firings_ours(name: str, engine: str) -> dict[str, Any]:
     """Stochastic simulation of Kanban-2 by one engine."""
     import numpy as np
 
-    from coordinator.analysis.gspn import Gspn
-    from coordinator.analysis.simulate import simulate
+    from petrobot.coordinator.analysis.gspn import Gspn
+    from petrobot.coordinator.analysis.simulate import simulate
 
     gspn, count = Gspn.of(kanban(2), KANBAN_RATES), 10_000_000 if engine == "numba" else 1_500_000
     if engine == "numba":
@@ -223,15 +236,19 @@ def firings_snakes(name: str) -> dict[str, Any]:
 
 def long_run_ours(name: str, engine: str) -> dict[str, Any]:
     """Build and solve the chain of a Kanban net."""
-    from coordinator.analysis.gspn import Chain, Gspn
-    from coordinator.analysis.markov import long_run
+    from petrobot.coordinator.analysis.gspn import Chain, Gspn
+    from petrobot.coordinator.analysis.markov import long_run
 
     gspn = Gspn.of(SPACES[name](), KANBAN_RATES)
     import scipy.sparse.linalg  # noqa: F401 - its import is not to be measured
 
     def work() -> dict[str, Any]:
         run = long_run(Chain.of(gspn))
-        return {"states": run.chain.n, "residual": run.residual, "throughput": run.throughput["tin1"]}
+        return {
+            "states": run.chain.n,
+            "residual": run.residual,
+            "throughput": run.throughput["tin1"],
+        }
 
     return timed(work)
 
@@ -253,12 +270,13 @@ def long_run_storm(name: str) -> dict[str, Any]:
 
 
 def completion_ours(name: str, engine: str) -> dict[str, Any]:
-    """Mean time to completion and reliability of the shipped catching task, phases refined as in `name` (stages-N)."""
-    from coordinator.analysis.completion import completion
-    from coordinator.analysis.gspn import Chain
-    from coordinator.analysis.ordinary import OrdinaryView
-    from coordinator.analysis.stochastic import stochastic_view
-    from coordinator.taskfile import load
+    """Mean time to completion and reliability of the shipped catching task, phases refined as in
+    `name` (stages-N)."""
+    from petrobot.coordinator.analysis.completion import completion
+    from petrobot.coordinator.analysis.gspn import Chain
+    from petrobot.coordinator.analysis.ordinary import OrdinaryView
+    from petrobot.coordinator.analysis.stochastic import stochastic_view
+    from petrobot.coordinator.taskfile import load
 
     task = load(ROOT / "coordinator" / "tasks" / "catch_ball.toml")
     ordinary, stages = OrdinaryView(task), int(name.split("-")[1])
@@ -283,20 +301,28 @@ def one(measure: str, name: str, engine: str) -> None:
     """Run one measurement in this process and print it."""
     work = MEASURES[measure]
     said = work(name, engine) if engine else work(name)
-    print(json.dumps(said | {"megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+    print(
+        json.dumps(said | {"megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024})
+    )
 
 
 def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None:
-    """One measurement in a process of its own; None if its tool is not installed or it failed (said on the way)."""
+    """One measurement in a process of its own; None if its tool is not installed or it failed (said
+    on the way)."""
     tool = NEEDS.get(measure.rpartition("-")[2]) or NEEDS.get(engine)
     if tool and find_spec(tool) is None:
         print(f"{measure} {name}: {tool} is not installed, skipped")
         return None
     command = [sys.executable, str(Path(__file__)), "--one", measure, name, engine]
     one_thread = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False, env=one_thread)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, check=False, env=one_thread
+    )
     if done.returncode:
-        print(f"{measure} {name}: failed: {done.stderr.strip().splitlines()[-1] if done.stderr else done.returncode}")
+        print(
+            f"{measure} {name}: failed: "
+            f"{done.stderr.strip().splitlines()[-1] if done.stderr else done.returncode}"
+        )
         return None
     said: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return said
@@ -317,7 +343,8 @@ def line(what: str, said: dict[str, Any], unit: str, reference: float | None) ->
     rate = said[unit] / said["seconds"]
     ratio = f"{reference / rate:8.1f} x" if reference else " " * 10
     tell(
-        f"  {what:22}{said[unit]:>11,} {unit:8}{said['seconds']:9.3f} s{rate:14,.0f} /s{ratio}{said['megabytes']:8.0f} MB"
+        f"  {what:22}{said[unit]:>11,} {unit:8}{said['seconds']:9.3f} s{rate:14,.0f} "
+        f"/s{ratio}{said['megabytes']:8.0f} MB"
     )
 
 
@@ -363,16 +390,22 @@ def bench_stochastic(quick: bool) -> None:
     for name in ("stages-4",) if quick else ("stages-4", "stages-8", "stages-16"):
         said = measured("completion", name, "auto")
         if said:
-            tell(f"completion of the catching task, {name}: {said['states']:,} markings, build {said['build_seconds']:.3f} s, "
+            tell(f"completion of the catching task, {name}: {said['states']:,} markings, " f"build {said['build_seconds']:.3f} s, "
                   f"mean and probability {said['seconds']:.4f} s, {said['megabytes']:.0f} MB")  # fmt: skip
 
 
 def main() -> None:
     """The whole table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="small nets only")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="write what is printed as a page, too")
-    parser.add_argument("--one", nargs=3, metavar=("MEASURE", "NAME", "ENGINE"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--write", type=Path, metavar="FILE", help="write what is printed as a page, too"
+    )
+    parser.add_argument(
+        "--one", nargs=3, metavar=("MEASURE", "NAME", "ENGINE"), help=argparse.SUPPRESS
+    )
     options = parser.parse_args()
     if options.one:
         one(*options.one)
@@ -385,14 +418,19 @@ def main() -> None:
 
 def page() -> str:
     """The figures as a page of docs/."""
-    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", *NEEDS.values()) if find_spec(name))
+    versions = ", ".join(
+        f"{name} {version(name)}" for name in ("numpy", *NEEDS.values()) if find_spec(name)
+    )
     machine = f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, {versions}"
     told = "\n".join(TOLD)
     return (
         "# Figures: the analysis beside other tools\n\n"
-        "Made by `python -m tests.bench.analysis --write docs/figures-analysis.md`, all tools in one run, each measurement in a\n"
-        "process of its own: CPU seconds without imports and compilation, and the peak memory of that process. Ratios hold\n"
-        f"elsewhere, seconds do not ({machine}). SNAKES and pm4py are stopped after {SLOW_STATES:,} markings: their\n"
+        "Made by `python -m tests.bench.analysis --write docs/figures-analysis.md`, all "
+        "tools in one run, each measurement in a\n"
+        "process of its own: CPU seconds without imports and compilation, and the peak "
+        "memory of that process. Ratios hold\n"
+        f"elsewhere, seconds do not ({machine}). SNAKES and pm4py are stopped after "
+        f"{SLOW_STATES:,} markings: their\n"
         "rate counts.\n\n"
         f"```\n{told}\n```\n"
     )

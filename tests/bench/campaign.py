@@ -1,6 +1,8 @@
-"""What a campaign adds to its cells: CPU seconds a throw in a block and in a bare lock-step cell of the same seeds, in turn.
+"""What a campaign adds to its cells: CPU seconds a throw in a block and in a bare lock-step cell of
+the same seeds, in turn.
 
-`python -m tests.bench.campaign [--throws N] [--rounds N]`; the first round of each warms caches and does not count.
+`python -m tests.bench.campaign [--throws N] [--rounds N]`; the first round of each warms caches and
+does not count.
 """
 
 from __future__ import annotations
@@ -11,10 +13,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from coordinator.campaign.block import Bench, run_block
-from coordinator.campaign.plan import Plan
-from coordinator.cli.loading import task_path
-from coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.campaign.block import Bench, run_block
+from petrobot.coordinator.campaign.plan import Plan
+from petrobot.coordinator.cli.loading import task_path
+from petrobot.coordinator.launch import Setting, lockstep_cell
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,12 +39,24 @@ def block(bench: Bench, seed: int, throws: int) -> float:
 
 def main() -> None:
     """Print both and their ratio."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--throws", type=int, default=4, metavar="N", help="in each cell (%(default)s)")
-    parser.add_argument("--rounds", type=int, default=3, metavar="N", help="that count (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--throws", type=int, default=4, metavar="N", help="in each cell (%(default)s)"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=3, metavar="N", help="that count (%(default)s)"
+    )
     options = parser.parse_args()
     bench = Bench.of(
-        Plan(str(task_path("catch_ball")), str(ROOT / "services.toml"), options.throws, ("B",), block=options.throws)
+        Plan(
+            str(task_path("catch_ball")),
+            str(ROOT / "services.toml"),
+            options.throws,
+            ("B",),
+            block=options.throws,
+        )
     )
     times: dict[str, list[float]] = {"bare cell": [], "campaign block": []}
     for seed in range(1, options.rounds + 2):

@@ -3,9 +3,10 @@
     python tests/bench/doors.py
     python tests/bench/doors.py --json out.json
 
-The server is a process of its own, the attackers are others (for connections) or this one. *Grown* is by how much the server's
-largest resident set (VmHWM) exceeds that of its start. The good client calls every millisecond, from this process, which is also
-busy attacking: its times are upper bounds, and ratios to the calm row are what counts.
+The server is a process of its own, the attackers are others (for connections) or this one. *Grown*
+is by how much the server's largest resident set (VmHWM) exceeds that of its start. The good client
+calls every millisecond, from this process, which is also busy attacking: its times are upper
+bounds, and ratios to the calm row are what counts.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from coordinator.certificates import make_certificates
-from services.comm import messages as m
-from services.comm.client import Client
+from petrobot.coordinator.certificates import make_certificates
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.client import Client
 from tests.doors.conftest import KEY, MIB, Stranger, Victim, frame
 from tests.doors.test_attacks import STRANGE, _bombard, _flood, crowd_at
 
@@ -58,10 +59,10 @@ async def times(client: Client, until: Callable[[int], bool]) -> list[float]:
 
 HEAVY = """
 import asyncio, sys
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.wire import NEWEST_VERSION as V
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.wire import NEWEST_VERSION as V
 
 PAYLOADS = [
     [[]] * 19_900, [{}] * 19_900, [[None] * 5] * 19_900, [None] * 130_000, [1.5] * 110_000, ["x"] * 130_000,
@@ -86,10 +87,13 @@ asyncio.run(main())
 
 @contextlib.asynccontextmanager
 async def heavy(server: Victim) -> AsyncIterator[None]:
-    """One that has the key calls with what takes longest to read, two at a time, from a process of its own."""
+    """One that has the key calls with what takes longest to read, two at a time, from a process of
+    its own."""
     command = [sys.executable, "-c", HEAVY, server.host, str(server.port), KEY.hex()]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    process = await asyncio.create_subprocess_exec(*command, env=environment, stdout=asyncio.subprocess.PIPE)
+    process = await asyncio.create_subprocess_exec(
+        *command, env=environment, stdout=asyncio.subprocess.PIPE
+    )
     assert process.stdout is not None
     await process.stdout.readline()
     yield
@@ -158,7 +162,9 @@ async def under(attack: Attack, server: Victim) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures as JSON")
     parser.add_argument("--only", metavar="TEXT", default="", help="rows whose name has this text")
     options = parser.parse_args()
@@ -184,7 +190,8 @@ def main() -> None:
                 server.close()
             row = rows[name]
             print(
-                f"{name:22} calls {row['calls']:5}  p50 {row['p50_ms']:7.2f} ms  p99 {row['p99_ms']:8.2f}"
+                f"{name:22} calls {row['calls']:5}  p50 {row['p50_ms']:7.2f} ms  p99 "
+                f"{row['p99_ms']:8.2f}"
                 f"  max {row['max_ms']:8.1f}  grown {row['grown_MiB']:5.1f} MiB"
             )
     print(f"load {os.getloadavg()[0]:.1f}")

@@ -1,11 +1,13 @@
-"""What the journal costs: a token in, an action started on another process, its result, a firing, the next start, over and over.
+"""What the journal costs: a token in, an action started on another process, its result, a firing,
+the next start, over and over.
 
     python tests/bench/durability.py                 # best on the disk that runs/ is on
     python tests/bench/durability.py --rounds 5 --json out.json
 
-Contenders take turns in one run: the bare wire (one call after the other), the executor without a journal, with one that is flushed
-(actions without a device), with one that is synced at each start (an action with a device). Counts syncs per firing, and times a
-group of independent starts that share one sync. Ratios are what counts: microseconds are this machine's and this disk's.
+Contenders take turns in one run: the bare wire (one call after the other), the executor without a
+journal, with one that is flushed (actions without a device), with one that is synced at each start
+(an action with a device). Counts syncs per firing, and times a group of independent starts that
+share one sync. Ratios are what counts: microseconds are this machine's and this disk's.
 """
 
 from __future__ import annotations
@@ -23,17 +25,17 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from coordinator.launch import Setting, local_programs, realtime_mission
-from coordinator.mission.partners import Forgetful, Store
-from coordinator.mission.realtime import RealtimeMission
-from coordinator.record.journal import JournalWriter
-from coordinator.record.recording import JournalStore
-from coordinator.supervisor import Supervisor
-from coordinator.taskfile import loads
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.directory import Directory, parse
-from services.comm.messages import Hello
+from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
+from petrobot.coordinator.mission.partners import Forgetful, Store
+from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.taskfile import loads
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.messages import Hello
 from tests.bench.processes import load, quantile
 from tests.ports import free_ports
 
@@ -92,7 +94,8 @@ def task_text(lines: int, tokens: int) -> str:
 def directory(folder: Path, lines: int, device: bool) -> Directory:
     """A node with an action for each line, each with a device of its own or without any."""
     actions = "".join(
-        ACTION.format(n=n, where=f'device = "hand{n}"' if device else 'node = "far"') for n in range(lines)
+        ACTION.format(n=n, where=f'device = "hand{n}"' if device else 'node = "far"')
+        for n in range(lines)
     )
     devices = "".join(DEVICE.format(n=n) for n in range(lines)) if device else ""
     text = SERVICES.format(port=free_ports(1)[0], device=devices, actions=actions)
@@ -148,7 +151,11 @@ class Bench:
             raise RuntimeError(f"{name}: {mission.tally.runs[0]}")
         if writer is not None:
             used = writer.syncs - syncs
-            self.counts[name] = {"syncs": used, "firings": mission.tally.firings, "starts": self._tokens}
+            self.counts[name] = {
+                "syncs": used,
+                "firings": mission.tally.firings,
+                "starts": self._tokens,
+            }
             writer.close()
 
     def _keep(self, name: str, begun: float) -> None:
@@ -188,8 +195,12 @@ async def measure(folder: Path, rounds: int, tokens: int) -> Bench:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, default=Path(), help="on the disk to measure (default: here)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--folder", type=Path, default=Path(), help="on the disk to measure (default: here)"
+    )
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--tokens", type=int, default=200)
     parser.add_argument("--json", metavar="FILE", type=Path)
@@ -198,12 +209,19 @@ def main() -> None:
         bench = asyncio.run(measure(Path(folder).resolve(), options.rounds, options.tokens))
     base = statistics.median(bench.us["bare wire"])
     print(f"{options.rounds} rounds of {options.tokens} tokens; load {load()}")
-    print(f"{'us per token':28}{'median':>10}{'best':>10}{'worst':>10}{'x wire':>8}{'syncs/firing':>14}")
+    print(
+        f"{'us per token':28}{'median':>10}{'best':>10}{'worst':>10}{'x wire':>8}{'syncs/firing':>14}"
+    )
     rows: dict[str, Any] = {}
     for name, values in bench.us.items():
         counts = bench.counts.get(name, {})
         per = counts["syncs"] / counts["firings"] if counts else 0.0
-        rows[name] = {"us": values, "ratio": statistics.median(values) / base, "syncs_per_firing": per, **counts}
+        rows[name] = {
+            "us": values,
+            "ratio": statistics.median(values) / base,
+            "syncs_per_firing": per,
+            **counts,
+        }
         middle, low, high = statistics.median(values), min(values), quantile(values, 1.0)
         print(f"{name:28}{middle:10.0f}{low:10.0f}{high:10.0f}{middle / base:8.1f}{per:14.3f}")
     if options.json:

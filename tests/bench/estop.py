@@ -1,13 +1,16 @@
-"""How long an emergency stop takes: from the order to the quick stop on the drives' bus, and the whole command beside it.
+"""How long an emergency stop takes: from the order to the quick stop on the drives' bus, and the
+whole command beside it.
 
-    python tests/bench/estop.py                      # 200 stops over a warm connection, 20 whole commands
-    python tests/bench/estop.py --stops 50 --json out.json
+    python tests/bench/estop.py                      # 200 stops over a warm connection, 20 whole
+                                                     commands python tests/bench/estop.py --stops 50
+                                                     --json out.json
 
-The simulated drives, the motion node and this bench are processes of their own, as in the cell. *Warm* is a client that is
-connected already, as the coordinator and the page's server are: from the moment the order is given to the moment a port on the
-bus hears the first controlword QUICK STOP. *Command* is `petrobot estop` from the start of its process: Python and its imports
-are in it. Before each stop the drives are enabled again by an action. The bus has cycles of 4 ms, so 2 ms are its own on
-average.
+The simulated drives, the motion node and this bench are processes of their own, as in the cell.
+*Warm* is a client that is connected already, as the coordinator and the page's server are: from the
+moment the order is given to the moment a port on the bus hears the first controlword QUICK STOP.
+*Command* is `petrobot estop` from the start of its process: Python and its imports are in it.
+Before each stop the drives are enabled again by an action. The bus has cycles of 4 ms, so 2 ms are
+its own on average.
 """
 
 from __future__ import annotations
@@ -28,15 +31,15 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from coordinator.launch import local_programs
-from coordinator.operator.emergency import CLEAR, STOP, EmergencyLine
-from coordinator.supervisor import Supervisor
-from services.comm.caller import Caller
-from services.comm.cia402 import State
-from services.comm.client import Client
-from services.comm.credentials import Credentials
-from services.comm.directory import Directory
-from services.comm.messages import Hello
+from petrobot.coordinator.launch import local_programs
+from petrobot.coordinator.operator.emergency import CLEAR, STOP, EmergencyLine
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.cia402 import State
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import Credentials
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.messages import Hello
 from tests.doors.arm_cell import ROOT, Ear, cell_in, ear_on
 
 FLOOR_MS = 20.0
@@ -52,7 +55,11 @@ def quantile(values: Sequence[float], q: float) -> float:
 
 def summary(seconds: Sequence[float]) -> dict[str, float]:
     """p50, p99 and the largest, in ms."""
-    shown = {"p50_ms": quantile(seconds, 0.5), "p99_ms": quantile(seconds, 0.99), "max_ms": max(seconds)}
+    shown = {
+        "p50_ms": quantile(seconds, 0.5),
+        "p99_ms": quantile(seconds, 0.99),
+        "max_ms": max(seconds),
+    }
     return {"n": len(seconds), **{name: round(1e3 * value, 2) for name, value in shown.items()}}
 
 
@@ -79,10 +86,19 @@ async def warm(line: EmergencyLine, client: Client, ear: Ear, stops: int) -> lis
     return took
 
 
-async def commands(directory: Directory, line: EmergencyLine, client: Client, ear: Ear, stops: int) -> list[float]:
+async def commands(
+    directory: Directory, line: EmergencyLine, client: Client, ear: Ear, stops: int
+) -> list[float]:
     """Stops by the whole command."""
     took = []
-    command = [sys.executable, "-m", "coordinator", "estop", "--services", str(directory.source)]
+    command = [
+        sys.executable,
+        "-m",
+        "petrobot.coordinator",
+        "estop",
+        "--services",
+        str(directory.source),
+    ]
     for _ in range(stops):
         await line.order(CLEAR, PATIENCE)
         await enabled(client, ear)
@@ -126,9 +142,13 @@ async def measure(folder: Path, stops: int, whole: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--stops", type=int, default=200, help="warm stops (default: %(default)s)")
-    parser.add_argument("--commands", type=int, default=20, help="whole commands (default: %(default)s)")
+    parser.add_argument(
+        "--commands", type=int, default=20, help="whole commands (default: %(default)s)"
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures as JSON")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -136,10 +156,14 @@ def main() -> None:
     for what in ("warm", "command"):
         row = figures[what]
         print(
-            f"{what:8} n {row['n']:4}  p50 {row['p50_ms']:7.2f} ms  p99 {row['p99_ms']:7.2f}  max {row['max_ms']:7.2f}"
+            f"{what:8} n {row['n']:4}  p50 {row['p50_ms']:7.2f} ms  p99 {row['p99_ms']:7.2f} "
+            f" max {row['max_ms']:7.2f}"
         )
     kept = "kept" if figures["warm"]["p99_ms"] < FLOOR_MS else "NOT KEPT"
-    print(f"floor of {FLOOR_MS:g} ms at p99, warm, on an idle machine: {kept} (load {figures['load'][0]:g})")
+    print(
+        f"floor of {FLOOR_MS:g} ms at p99, warm, on an idle machine: {kept} (load "
+        f"{figures['load'][0]:g})"
+    )
     if options.json:
         options.json.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
 

@@ -1,15 +1,19 @@
-"""How long until a lost process is known: a node at its caller, the sender of a set-point stream at its receiver.
+"""How long until a lost process is known: a node at its caller, the sender of a set-point stream at
+its receiver.
 
     python tests/bench/faults.py                       # 30 of each
     python tests/bench/faults.py --rounds 5 --json out.json
-    python tests/bench/faults.py --busy --alarms 60    # both cores loaded; false alarms in 60 s, too
+    python tests/bench/faults.py --busy --alarms 60    # both cores loaded; false alarms in 60 s,
+                                                       too
 
-Each round starts a process of its own, waits until it works, and kills it (kill -9), freezes it (SIGSTOP) or cuts the cable to
-it (no byte comes through and no word that it is over). A node is known to be lost when the caller is told (`PeerLost`), a
-stream when its receiver withdraws the last value; that one is given in periods of the stream. Its run has ended when the caller
-is given its one end, ERROR `lost`, executed = unknown. Floors: killed node 50 ms, its run 0.3 s; frozen or cut both 1.2 s;
-stream 3 periods and one look of the receiver's loop (the longest that it took in these rounds). A false alarm is a node that
-lives and is said to be lost: with `--alarms` four of them are watched, each with a run, in as many seconds.
+Each round starts a process of its own, waits until it works, and kills it (kill -9), freezes it
+(SIGSTOP) or cuts the cable to it (no byte comes through and no word that it is over). A node is
+known to be lost when the caller is told (`PeerLost`), a stream when its receiver withdraws the last
+value; that one is given in periods of the stream. Its run has ended when the caller is given its
+one end, ERROR `lost`, executed = unknown. Floors: killed node 50 ms, its run 0.3 s; frozen or cut
+both 1.2 s; stream 3 periods and one look of the receiver's loop (the longest that it took in these
+rounds). A false alarm is a node that lives and is said to be lost: with `--alarms` four of them are
+watched, each with a run, in as many seconds.
 """
 
 from __future__ import annotations
@@ -31,10 +35,10 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from services.comm import messages as m
-from services.comm.caller import Accepted, Caller, Ended, Notice, PeerLost
-from services.comm.client import Client
-from services.comm.stream import STALE_AFTER, Incoming, StreamReceiver
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Accepted, Caller, Ended, Notice, PeerLost
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.stream import STALE_AFTER, Incoming, StreamReceiver
 from tests.bench.processes import load, quantile
 from tests.comm.fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
 
@@ -70,7 +74,8 @@ async def lose_a_node(fault: Fault) -> tuple[float, float]:
     with part("node") as process:
         cable = Cable(int(await asyncio.to_thread(first_line, process)))
         caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "c1", 1))
-        # What is killed is reached directly: a cable's end that is held open would answer in the dead node's place.
+        # What is killed is reached directly: a cable's end that is held open would answer in the
+        # dead node's place.
         port = cable.far if fault is Fault.KILLED else cable.port
         client = Client(HOST, port, caller, on_notices=take)
         client.start()
@@ -119,7 +124,10 @@ async def false_alarms(seconds: float) -> dict[str, int]:
 def busy(wanted: bool) -> Iterator[None]:
     """Two processes for each core that never wait."""
     code = "while True: pass"
-    spinning = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2 * (os.cpu_count() or 1) * wanted)]
+    spinning = [
+        subprocess.Popen([sys.executable, "-c", code])
+        for _ in range(2 * (os.cpu_count() or 1) * wanted)
+    ]
     try:
         yield
     finally:
@@ -144,7 +152,8 @@ class Last:
 
 
 def lose_a_sender(fault: Fault, period: float) -> tuple[float, float]:
-    """Seconds from the fault until the last set point counts no more, and the longest between two looks at it."""
+    """Seconds from the fault until the last set point counts no more, and the longest between two
+    looks at it."""
     last = Last()
     receiver = StreamReceiver("motion", {STREAM: Incoming(period, last)})
     cable = Cable(receiver.address[1])
@@ -188,7 +197,9 @@ def run(rounds: int, periods: Sequence[float]) -> dict[str, dict[str, float]]:
     for fault in Fault:
         pairs = [asyncio.run(lose_a_node(fault)) for _ in range(rounds)]
         limit = KNOWN_WITHIN[fault]
-        found[f"node {fault.value}: known (ms)"] = row([1e3 * known for known, _ in pairs], 1e3 * limit)
+        found[f"node {fault.value}: known (ms)"] = row(
+            [1e3 * known for known, _ in pairs], 1e3 * limit
+        )
         found[f"node {fault.value}: run ended (ms)"] = row(
             [1e3 * ended for _, ended in pairs], 1e3 * ENDED_WITHIN[fault]
         )
@@ -203,10 +214,22 @@ def run(rounds: int, periods: Sequence[float]) -> dict[str, dict[str, float]]:
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=30, help="of each fault (default: %(default)s)")
-    parser.add_argument("--busy", action="store_true", help="with two processes a core that never wait")
-    parser.add_argument("--alarms", type=float, default=0.0, metavar="S", help="count false alarms for so many seconds")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=30, help="of each fault (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--busy", action="store_true", help="with two processes a core that never wait"
+    )
+    parser.add_argument(
+        "--alarms",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="count false alarms for so many seconds",
+    )
     parser.add_argument("--nodes", action="store_true", help="nodes alone, no streams")
     parser.add_argument("--json", metavar="FILE", help="write the results")
     arguments = parser.parse_args()
@@ -224,11 +247,17 @@ def main() -> None:
     for name, one in found.items():
         figures = "".join(f"{one[key]:10.2f}" for key in ("median", "p99", "max", "floor"))
         print(f"{name:48}{figures}{'' if one['p99'] <= one['floor'] else '   NOT MET'}")
-    print(f"{arguments.rounds} of each; load of this machine before: {before}; after: {where['load_after']}")
+    print(
+        f"{arguments.rounds} of each; load of this machine before: {before}; after: "
+        f"{where['load_after']}"
+    )
     if alarms:
         print(f"false alarms in {arguments.alarms:g} s with {WATCHED} nodes that live: {alarms}")
     if arguments.json:
-        shown = {name: {key: (None if math.isinf(v) else v) for key, v in one.items()} for name, one in found.items()}
+        shown = {
+            name: {key: (None if math.isinf(v) else v) for key, v in one.items()}
+            for name, one in found.items()
+        }
         results = {"where": where, "faults": shown, "alarms": alarms}
         Path(arguments.json).write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

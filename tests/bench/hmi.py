@@ -1,18 +1,22 @@
-"""How much the operator's page costs: per painted update in the browser, and in the coordinator's own loop.
+"""How much the operator's page costs: per painted update in the browser, and in the coordinator's
+own loop.
 
     python tests/bench/hmi.py [--nodes 100 300] [--seconds 8] [--gate-cpu MS] [--json FILE]
 
-A synthetic net is fed 50 updates a second (a firing with its marking, progress of three runs, one variable) through the
-real feed and server. Measured: in headless Chromium the main thread's time for each painted update (Chromium's own
-`TaskDuration`), frames a second, gaps in the sequence, and the time from the change in the server to the painted frame; in
-the loop its own CPU time and how late its 50 Hz ticker came, without a client and with five in another process, one of
-which reads next to nothing. `--gate-cpu` makes the run fail when a painted update costs more, or when there was a gap.
+A synthetic net is fed 50 updates a second (a firing with its marking, progress of three runs, one
+variable) through the real feed and server. Measured: in headless Chromium the main thread's time
+for each painted update (Chromium's own `TaskDuration`), frames a second, gaps in the sequence, and
+the time from the change in the server to the painted frame; in the loop its own CPU time and how
+late its 50 Hz ticker came, without a client and with five in another process, one of which reads
+next to nothing. `--gate-cpu` makes the run fail when a painted update costs more, or when there was
+a gap.
 
     python tests/bench/hmi.py --checks 300 [--rounds 3] [--seconds 8] [--json FILE]
 
-A real mission in real time over two nodes fires as fast as its actions of 10 ms allow, while an asker in another process gives
-commands and, in every second turn, a third process draws: three checks of a net of so many places at a time, without a pause.
-Told are firings a second and the commands' latency with and without the drawing, and the ratios of their medians.
+A real mission in real time over two nodes fires as fast as its actions of 10 ms allow, while an
+asker in another process gives commands and, in every second turn, a third process draws: three
+checks of a net of so many places at a time, without a pause. Told are firings a second and the
+commands' latency with and without the drawing, and the ratios of their medians.
 """
 
 from __future__ import annotations
@@ -35,8 +39,8 @@ import aiohttp
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
-from coordinator.hmi.feed import Feed  # noqa: E402 - the bench runs as a file
-from coordinator.hmi.server import Page, start_page  # noqa: E402
+from petrobot.coordinator.hmi.feed import Feed  # noqa: E402 - the bench runs as a file
+from petrobot.coordinator.hmi.server import Page, start_page  # noqa: E402
 from tests.hmi.conftest import ARGUMENTS, BROWSER  # noqa: E402
 from tests.station.conftest import SCRIPT, TASK, Cell  # noqa: E402
 
@@ -78,8 +82,16 @@ class SyntheticMission:
 
     def start_run(self, i: int) -> None:
         """A run that goes on for the whole measurement."""
-        run = {"id": f"r{i}", "place": self.places[i], "primitive_task": "t", "action": f"action {i}", "node": "n"}
-        self.feed.emit("run_started", run={**run, "why": "", "started": 0.0, "deadline": 99.0, "progress": 0.0})
+        run = {
+            "id": f"r{i}",
+            "place": self.places[i],
+            "primitive_task": "t",
+            "action": f"action {i}",
+            "node": "n",
+        }
+        self.feed.emit(
+            "run_started", run={**run, "why": "", "started": 0.0, "deadline": 99.0, "progress": 0.0}
+        )
 
     def snapshot(self) -> dict[str, Any]:
         """The state."""
@@ -98,7 +110,13 @@ class SyntheticMission:
         self.number += 1
         i = self.number % len(self.places)
         after = (i + 1) % len(self.places)
-        firing = {"number": self.number, "transition": f"step_{i}", "at": at, "cause": "end of a run", "error": False}
+        firing = {
+            "number": self.number,
+            "transition": f"step_{i}",
+            "at": at,
+            "cause": "end of a run",
+            "error": False,
+        }
         self.feed.emit("fired", time=at, firing=firing)
         self.feed.emit("marking", time=at, marking={self.places[i]: 0, self.places[after]: 1})
         for run in range(3):
@@ -117,16 +135,40 @@ def task_of(places: list[str]) -> dict[str, Any]:
         for i, n in enumerate(places)
     ]
     steps: list[dict[str, Any]] = [
-        {"name": f"step_{i}", "label": "", "in_macro": "", "events": [], "when": "", "after": None, "error": False}
+        {
+            "name": f"step_{i}",
+            "label": "",
+            "in_macro": "",
+            "events": [],
+            "when": "",
+            "after": None,
+            "error": False,
+        }
         | {"x": at(i)["x"] + 100, "y": at(i)["y"]}
         for i in range(len(places))
     ]
     arcs = []
     for i, name in enumerate(places):
         following = places[(i + 1) % len(places)]
-        arcs.append({"place": name, "transition": f"step_{i}", "direction": "in", "weight": 1, "end": "normal"})
-        arcs.append({"place": following, "transition": f"step_{i}", "direction": "out", "weight": 1})
-    general = {"name": "bench", "primitive_tasks": {}, "events": {}, "parameters": {}, "runs_place": ""}
+        arcs.append(
+            {
+                "place": name,
+                "transition": f"step_{i}",
+                "direction": "in",
+                "weight": 1,
+                "end": "normal",
+            }
+        )
+        arcs.append(
+            {"place": following, "transition": f"step_{i}", "direction": "out", "weight": 1}
+        )
+    general = {
+        "name": "bench",
+        "primitive_tasks": {},
+        "events": {},
+        "parameters": {},
+        "runs_place": "",
+    }
     return {**general, "places": drawn, "transitions": steps, "arcs": arcs}
 
 
@@ -160,7 +202,9 @@ async def in_browser(page: Page, mission: SyntheticMission, seconds: float) -> d
         await tab.wait_for_selector(".net .transition")
         await ticking(mission, 1.0)
         session = await tab.context.new_cdp_session(tab)
-        await session.send("Performance.enable", {"timeDomain": "threadTicks"})  # CPU time of the thread, not the clock
+        await session.send(
+            "Performance.enable", {"timeDomain": "threadTicks"}
+        )  # CPU time of the thread, not the clock
         await tab.evaluate(PROBE)
         before = await busy(session)
         await ticking(mission, seconds)
@@ -185,7 +229,8 @@ async def busy(session: Any) -> float:
 
 
 async def crowd(url: str, token: str) -> None:
-    """Five clients, the last of which takes a message every two seconds; runs in a process of its own."""
+    """Five clients, the last of which takes a message every two seconds; runs in a process of its
+    own."""
     headers = {"Authorization": f"Bearer {token}"}
     async with aiohttp.ClientSession(headers=headers) as http:
         sockets = [await http.ws_connect(url, max_msg_size=0) for _ in range(5)]
@@ -202,7 +247,9 @@ async def read(socket: aiohttp.ClientWebSocketResponse, pause: float) -> None:
             await asyncio.sleep(pause)
 
 
-async def with_crowd(page: Page, measure: Callable[[], Awaitable[dict[str, float]]]) -> dict[str, float]:
+async def with_crowd(
+    page: Page, measure: Callable[[], Awaitable[dict[str, float]]]
+) -> dict[str, float]:
     """Measure while five clients are connected from another process."""
     url = page.url.partition("?")[0] + "api/live"
     process = await asyncio.create_subprocess_exec(
@@ -217,7 +264,7 @@ async def with_crowd(page: Page, measure: Callable[[], Awaitable[dict[str, float
         await process.wait()
 
 
-# --- a mission beside somebody who draws ----------------------------------------------------------------------------------
+# --- a mission beside somebody who draws ------------------------------------------------------
 
 
 def drawing(places: int) -> dict[str, Any]:
@@ -225,13 +272,17 @@ def drawing(places: int) -> dict[str, Any]:
     document: dict[str, Any] = {
         "schema": 1,
         "task": {"name": "drawn", "final": "done > 0"},
-        "primitive_tasks": {"look": {"goal": "seen", "alternatives": ["look_at_table"], "deadline": 5.0}},
+        "primitive_tasks": {
+            "look": {"goal": "seen", "alternatives": ["look_at_table"], "deadline": 5.0}
+        },
         "places": {"done": {"kind": "control"}},
         "transitions": {},
     }
     for i in range(places):
         then = f"p{i + 1}" if i + 1 < places else "done"
-        document["places"][f"p{i}"] = {"kind": "action", "task": "look"} | ({} if i else {"tokens": 1})
+        document["places"][f"p{i}"] = {"kind": "action", "task": "look"} | (
+            {} if i else {"tokens": 1}
+        )
         document["transitions"][f"t{i}"] = {"in": [f"p{i}:normal"], "out": [then]}
         document["transitions"][f"e{i}"] = {"in": [f"p{i}:error"], "out": [then]}
     return document
@@ -244,7 +295,10 @@ async def draw(url: str, token: str, places: int) -> None:
 
         async def hand(name: str) -> None:
             for turn in itertools.count():
-                body = {"name": name, "document": {**document, "task": {**document["task"], "text": f"turn {turn}"}}}
+                body = {
+                    "name": name,
+                    "document": {**document, "task": {**document["task"], "text": f"turn {turn}"}},
+                }
                 async with http.post("/api/check", json=body) as answer:
                     assert answer.status == 200, await answer.text()
                 print(name, flush=True)
@@ -253,20 +307,25 @@ async def draw(url: str, token: str, places: int) -> None:
 
 
 async def give(url: str, token: str, seconds: float) -> None:
-    """Give a command every 50 ms and print how long each took (ms); runs in a process of its own."""
+    """Give a command every 50 ms and print how long each took (ms); runs in a process of its
+    own."""
     late = []
     async with aiohttp.ClientSession(url, headers={"Authorization": f"Bearer {token}"}) as http:
         until = time.perf_counter() + seconds
         while time.perf_counter() < until:
             begun = time.perf_counter()
-            async with http.post("/api/command", json={"verb": "ask_controls", "name": "asker"}) as answer:
+            async with http.post(
+                "/api/command", json={"verb": "ask_controls", "name": "asker"}
+            ) as answer:
                 assert answer.status == 200, await answer.text()
             late.append((time.perf_counter() - begun) * 1000)
             await asyncio.sleep(0.05)
     print(json.dumps(late))
 
 
-async def beside(page: Page, state: Mapping[str, Any], seconds: float, places: int) -> dict[str, float]:
+async def beside(
+    page: Page, state: Mapping[str, Any], seconds: float, places: int
+) -> dict[str, float]:
     """Firings a second and latencies for so long, with somebody who draws unless `places` is 0."""
     arguments = [sys.executable, __file__]
     drawer = None
@@ -289,7 +348,12 @@ async def beside(page: Page, state: Mapping[str, Any], seconds: float, places: i
         checks = rest.count(b"\n")
     late = sorted(json.loads(said))
     worst = {"command_p99_ms": late[int(len(late) * 0.99)], "command_worst_ms": late[-1]}
-    return {"firings_per_s": rate, "command_p50_ms": statistics.median(late), **worst, "checks": checks}
+    return {
+        "firings_per_s": rate,
+        "command_p50_ms": statistics.median(late),
+        **worst,
+        "checks": checks,
+    }
 
 
 def mission_of(state: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -324,10 +388,19 @@ async def with_checks(places: int, seconds: float, rounds: int) -> dict[str, Any
         for node in cell.nodes.values():
             await node.close()
     medians = {
-        turn: {key: statistics.median(one[key] for one in many) for key in many[0]} for turn, many in turns.items()
+        turn: {key: statistics.median(one[key] for one in many) for key in many[0]}
+        for turn, many in turns.items()
     }
-    ratios = {key: medians["checks"][key] / medians["alone"][key] for key in list(medians["alone"])[:3]}
-    return {"places": places, "medians": medians, "ratios": ratios, "estop_ms": stopped, "turns": turns}
+    ratios = {
+        key: medians["checks"][key] / medians["alone"][key] for key in list(medians["alone"])[:3]
+    }
+    return {
+        "places": places,
+        "medians": medians,
+        "ratios": ratios,
+        "estop_ms": stopped,
+        "turns": turns,
+    }
 
 
 async def measured(nodes: int, seconds: float) -> dict[str, Any]:
@@ -350,13 +423,20 @@ async def measured(nodes: int, seconds: float) -> dict[str, Any]:
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--nodes", type=int, nargs="+", default=[100, 300])
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--gate-cpu", type=float, help="fail when a painted update costs more ms, or at a gap")
+    parser.add_argument(
+        "--gate-cpu", type=float, help="fail when a painted update costs more ms, or at a gap"
+    )
     parser.add_argument("--json", type=Path)
     parser.add_argument(
-        "--checks", type=int, metavar="PLACES", help="a mission beside checks of a net of so many places"
+        "--checks",
+        type=int,
+        metavar="PLACES",
+        help="a mission beside checks of a net of so many places",
     )
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--crowd", nargs=2, help=argparse.SUPPRESS)
@@ -370,7 +450,9 @@ def main() -> int:
         asyncio.run(give(options.give[0], options.give[1], float(options.give[2])))
         return 0
     if options.checks:
-        text = json.dumps(asyncio.run(with_checks(options.checks, options.seconds, options.rounds)), indent=2)
+        text = json.dumps(
+            asyncio.run(with_checks(options.checks, options.seconds, options.rounds)), indent=2
+        )
         print(text)
         if options.json:
             options.json.write_text(text, encoding="utf-8")
@@ -385,7 +467,11 @@ def main() -> int:
         options.json.write_text(text)
     if options.gate_cpu is None:
         return 0
-    bad = [r for r in results if r["browser"]["gaps"] or r["browser"]["cpu_ms_per_update"] > options.gate_cpu]
+    bad = [
+        r
+        for r in results
+        if r["browser"]["gaps"] or r["browser"]["cpu_ms_per_update"] > options.gate_cpu
+    ]
     return 1 if bad else 0
 
 

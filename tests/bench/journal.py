@@ -1,4 +1,5 @@
-"""Times appends to the journal beside SQLite in WAL mode, in turn in one process; prints medians and 99 % quantiles."""
+"""Times appends to the journal beside SQLite in WAL mode, in turn in one process; prints medians
+and 99 % quantiles."""
 
 from __future__ import annotations
 
@@ -12,10 +13,15 @@ from pathlib import Path
 
 import msgpack
 
-from coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.journal import JournalWriter
 
 RECORD = {
-    "stimulus": {"kind": "RunEnded", "run": "action#1", "values": {"point": [[0.1, 1.0, 0.2]] * 8}, "seconds": 0.4}
+    "stimulus": {
+        "kind": "RunEnded",
+        "run": "action#1",
+        "values": {"point": [[0.1, 1.0, 0.2]] * 8},
+        "seconds": 0.4,
+    }
 }
 
 
@@ -28,18 +34,26 @@ def timed(append: Callable[[], object]) -> float:
 
 def row(name: str, seconds: list[float]) -> str:
     """One line of the table, in microseconds."""
-    return f"{name:32} {statistics.median(seconds) * 1e6:9.0f} {sorted(seconds)[int(0.99 * len(seconds))] * 1e6:9.0f}"
+    return (
+        f"{name:32} {statistics.median(seconds) * 1e6:9.0f} "
+        f"{sorted(seconds)[int(0.99 * len(seconds))] * 1e6:9.0f}"
+    )
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path(), help="on the disk to measure (default: here)")
+    parser.add_argument(
+        "--folder", type=Path, default=Path(), help="on the disk to measure (default: here)"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         writer = JournalWriter(Path(folder) / "a.journal", {})
         base = sqlite3.connect(Path(folder) / "a.sqlite", isolation_level=None)
-        for statement in ("pragma journal_mode=wal", "create table records (number integer primary key, data blob)"):
+        for statement in (
+            "pragma journal_mode=wal",
+            "create table records (number integer primary key, data blob)",
+        ):
             base.execute(statement)
 
         def own(durable: bool) -> None:

@@ -1,10 +1,14 @@
-"""The convergence study of docs/learning.md: every selector in Bernoulli worlds with known J, 1,000 seeds each.
+"""The convergence study of docs/learning.md: every selector in Bernoulli worlds with known J, 1,000
+seeds each.
 
     python -m tests.bench.learning            the table, under three minutes of one core
-    python -m tests.bench.learning --write    put it into docs/learning.md and draw docs/pictures/learning-*.svg (needs matplotlib)
-    python -m tests.bench.learning --long     also a million trials of the schemes of Nikolic and Fu (ten minutes or so)
+    python -m tests.bench.learning --write    put it into docs/learning.md and draw
+                                              docs/pictures/learning-*.svg (needs matplotlib)
+    python -m tests.bench.learning --long     also a million trials of the schemes of Nikolic and Fu
+                                              (ten minutes or so)
 
-The worlds are played with the rules that mission runs use (tests/learning/test_selectors.py compares them bit by bit).
+The worlds are played with the rules that mission runs use (tests/learning/test_selectors.py
+compares them bit by bit).
 """
 
 from __future__ import annotations
@@ -18,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.learning.automata import NikolicFu
-from coordinator.learning.batch import Array
-from coordinator.learning.rule import Rule
-from coordinator.learning.selectors import RULES
+from petrobot.coordinator.learning.automata import NikolicFu
+from petrobot.coordinator.learning.batch import Array
+from petrobot.coordinator.learning.rule import Rule
+from petrobot.coordinator.learning.selectors import RULES
 from tests.learning.worlds import Played, World, gapped, play
 
 ROOT = Path(__file__).parents[2]
@@ -44,13 +48,17 @@ WORLDS = {
     "hard": free(0.05),
     "costs": World("costs", (0.95, 0.9, 0.85, 0.6), (4.0, 1.2, 2.0, 3.0)),
     "equal": free(0.0, 0.8),
-    "changing": World("changing", (0.5, 0.5, 0.5, 0.9), (0.0,) * 4, TRIALS // 2, (0.9, 0.5, 0.5, 0.5)),
+    "changing": World(
+        "changing", (0.5, 0.5, 0.5, 0.9), (0.0,) * 4, TRIALS // 2, (0.9, 0.5, 0.5, 0.5)
+    ),
 }
 CONTROLS: dict[str, Rule] = {
     "gain 1/(k+1)^0.6": NikolicFu("power", k0=1.0, exponent=0.6),
     "gain 2/(k+2)": NikolicFu("double", c=2.0, k0=2.0),
 }
-NOTED: dict[str, Rule] = {"gain k^-0.7, even mixing 5n/k": NikolicFu("noted", k0=0.0, exponent=0.7, mixing=5.0)}
+NOTED: dict[str, Rule] = {
+    "gain k^-0.7, even mixing 5n/k": NikolicFu("noted", k0=0.0, exponent=0.7, mixing=5.0)
+}
 
 
 def rules() -> dict[str, Rule]:
@@ -76,21 +84,25 @@ def measure(rule: Rule) -> dict[str, dict[str, Any]]:
             "recent": float(played.recent[played.checkpoints.index(AT)].mean()),
             "regret": float(regret.mean()),
             "curve": played.regret.mean(axis=1).tolist(),
-            "before": float(played.recent[played.checkpoints.index(TRIALS // 2)].mean()) if world.change else None,
+            "before": float(played.recent[played.checkpoints.index(TRIALS // 2)].mean())
+            if world.change
+            else None,
             "after": float(played.optimal.mean()),
             "end": float(played.regret[-1].mean()),
         }
     return out
 
 
-# --- the table ---------------------------------------------------------------------------------------------------------
+# --- the table --------------------------------------------------------------------------------
 
 
 def table(found: dict[str, dict[str, dict[str, Any]]]) -> str:
     """Two tables in Markdown."""
     lines = [
-        "After 500 trials, 4 actions, 1,000 seeds. *p*: share of seeds with p >= 0.95 on the optimum; *ends*: share that ends",
-        "on it (p > 0.5; for the bandit rules p is all on their lowest J); *plays*: share of the last 100 choices that were",
+        "After 500 trials, 4 actions, 1,000 seeds. *p*: share of seeds with p >= 0.95 on the "
+        "optimum; *ends*: share that ends",
+        "on it (p > 0.5; for the bandit rules p is all on their lowest J); *plays*: share of "
+        "the last 100 choices that were",
         "optimal; *regret*: mean sum of J above the optimum.",
         "",
         "| selector | easy: p / ends / plays / regret | middle | hard | costs |",
@@ -101,13 +113,16 @@ def table(found: dict[str, dict[str, dict[str, Any]]]) -> str:
         lines.append(f"| {_label(name)} | " + " | ".join(cells) + " |")
     lines += [
         "",
-        "| selector | equal: regret | changing: optimal before the change / at the end | changing: regret after 2,000 |",
+        "| selector | equal: regret | changing: optimal before the change / at the end | "
+        "changing: regret after 2,000 |",
         "|---|---|---|---|",
     ]
     for name, worlds in found.items():
         change = worlds["changing"]
         both = f"{_percent(change['before'])} / {_percent(change['after'])} %"
-        lines.append(f"| {_label(name)} | {worlds['equal']['end']:.0f} | {both} | {change['end']:.0f} |")
+        lines.append(
+            f"| {_label(name)} | {worlds['equal']['end']:.0f} | {both} | {change['end']:.0f} |"
+        )
     return "\n".join(lines)
 
 
@@ -124,7 +139,7 @@ def _cell(figures: dict[str, Any]) -> str:
     return f"{shares} % / {figures['regret']:.0f}"
 
 
-# --- a million trials --------------------------------------------------------------------------------------------------
+# --- a million trials -------------------------------------------------------------------------
 
 
 def long_run(rule: Rule, world: World) -> dict[str, Any]:
@@ -153,7 +168,7 @@ LONG_RULES: dict[str, Rule] = {
 }
 
 
-# --- pictures ----------------------------------------------------------------------------------------------------------
+# --- pictures ---------------------------------------------------------------------------------
 
 
 def draw(found: dict[str, dict[str, dict[str, Any]]], long: dict[str, Any] | None) -> None:
@@ -161,7 +176,9 @@ def draw(found: dict[str, dict[str, dict[str, Any]]], long: dict[str, Any] | Non
     import matplotlib
 
     matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "petrobot", "font.size": 9, "axes.spines.top": False})
+    matplotlib.rcParams.update(
+        {"svg.hashsalt": "petrobot", "font.size": 9, "axes.spines.top": False}
+    )
     _draw_regret(found)
     _draw_gaps()
     if long is not None:
@@ -182,8 +199,14 @@ def _draw_regret(found: dict[str, dict[str, dict[str, Any]]]) -> None:
     for ax, world in zip(axes.flat, ("easy", "middle", "hard", "changing"), strict=True):
         for i, name in enumerate(shown):
             style = "--" if name not in RULES else "-"
-            ax.plot(MARKS, found[name][world]["curve"], style, color=f"C{i % 10}", label=name, lw=1.2)
-        ax.set(title=f"{world}: gap {WORLDS[world].gap:.2g}", xlabel="trial", ylabel="cumulative regret (J)")
+            ax.plot(
+                MARKS, found[name][world]["curve"], style, color=f"C{i % 10}", label=name, lw=1.2
+            )
+        ax.set(
+            title=f"{world}: gap {WORLDS[world].gap:.2g}",
+            xlabel="trial",
+            ylabel="cumulative regret (J)",
+        )
     axes[1, 1].legend(fontsize=7, loc="upper left")
     _save(figure, "learning-regret.svg")
 
@@ -195,12 +218,20 @@ def _draw_gaps() -> None:
     gaps = [0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5]
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.6))
     for name in ("nikolic_fu", "nikolic_fu_fast", "thompson"):
-        played = [play(RULES[name](), free(g), AT, SEEDS, np.random.default_rng([8, i])) for i, g in enumerate(gaps)]
+        played = [
+            play(RULES[name](), free(g), AT, SEEDS, np.random.default_rng([8, i]))
+            for i, g in enumerate(gaps)
+        ]
         left.plot(gaps, [float(p.regret[-1].mean()) for p in played], "o-", label=name)
         simple = [g * float(np.mean(1 - p.p_best[-1])) for g, p in zip(gaps, played, strict=True)]
         right.plot(gaps, simple, "o-", label=name)
-    left.set(xlabel="gap of J between best and others", ylabel=f"cumulative regret after {AT} trials (J)")
-    right.set(xlabel="gap of J between best and others", ylabel=f"simple regret after {AT} trials (J a trial)")
+    left.set(
+        xlabel="gap of J between best and others", ylabel=f"cumulative regret after {AT} trials (J)"
+    )
+    right.set(
+        xlabel="gap of J between best and others",
+        ylabel=f"simple regret after {AT} trials (J a trial)",
+    )
     left.legend()
     _save(figure, "learning-gaps.svg")
 
@@ -210,8 +241,12 @@ def _draw_long(long: dict[str, Any]) -> None:
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.8))
     for i, (name, run) in enumerate(long.items()):
-        left.loglog(run["trials"], np.maximum(run["median"], 1e-16), color=f"C{i}", label=f"{name}, median")
-        left.loglog(run["trials"], np.maximum(run["worst"], 1e-16), ":", color=f"C{i}", label="worst seed")
+        left.loglog(
+            run["trials"], np.maximum(run["median"], 1e-16), color=f"C{i}", label=f"{name}, median"
+        )
+        left.loglog(
+            run["trials"], np.maximum(run["worst"], 1e-16), ":", color=f"C{i}", label="worst seed"
+        )
         right.semilogx(run["trials"], run["least_tries"], color=f"C{i}", label=name)
     left.set(xlabel="trial", ylabel="1 - p of the optimum", ylim=(1e-9, 2))
     right.set(xlabel="trial", ylabel="tries of the least tried action (median)")
@@ -220,7 +255,7 @@ def _draw_long(long: dict[str, Any]) -> None:
     _save(figure, "learning-million.svg")
 
 
-# --- the command -------------------------------------------------------------------------------------------------------
+# --- the command ------------------------------------------------------------------------------
 
 
 def write_page(text: str, long: dict[str, Any] | None) -> None:
@@ -229,11 +264,15 @@ def write_page(text: str, long: dict[str, Any] | None) -> None:
     page = _between(page, "convergence", text)
     if long is not None:
         rows = [
-            f"| `{name}` | {run['median'][-1]:.1e} | {run['worst'][-1]:.1e} | {100 * run['stuck']:.0f} % | "
+            f"| `{name}` | {run['median'][-1]:.1e} | {run['worst'][-1]:.1e} | "
+            f"{100 * run['stuck']:.0f} % | "
             f"{run['least_tries'][-1]:.0f} |"
             for name, run in long.items()
         ]
-        head = "| after 1,000,000 trials, 16 seeds | 1 - p*, median | worst seed | still at a wrong action | least tried action |"
+        head = (
+            "| after 1,000,000 trials, 16 seeds | 1 - p*, median | worst seed | still at "
+            "a wrong action | least tried action |"
+        )
         page = _between(page, "million", "\n".join([head, "|---|---|---|---|---|", *rows]))
     PAGE.write_text(page, encoding="utf-8")
 
@@ -246,18 +285,31 @@ def _between(page: str, mark: str, text: str) -> str:
 
 def main() -> None:
     """Measure, print, and on request write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="write docs/learning.md and the pictures")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="write docs/learning.md and the pictures"
+    )
     parser.add_argument("--long", action="store_true", help="play a million trials too")
     parser.add_argument(
-        "--json", type=Path, metavar="FILE", help="keep all figures here; what is there is not measured again"
+        "--json",
+        type=Path,
+        metavar="FILE",
+        help="keep all figures here; what is there is not measured again",
     )
     options = parser.parse_args()
     begun = time.process_time()
-    kept = json.loads(options.json.read_text(encoding="utf-8")) if options.json and options.json.exists() else {}
+    kept = (
+        json.loads(options.json.read_text(encoding="utf-8"))
+        if options.json and options.json.exists()
+        else {}
+    )
     kept["worlds"] = kept.get("worlds") or {name: measure(rule) for name, rule in rules().items()}
     if options.long:
-        kept["long"] = kept.get("long") or {name: long_run(rule, free(0.4)) for name, rule in LONG_RULES.items()}
+        kept["long"] = kept.get("long") or {
+            name: long_run(rule, free(0.4)) for name, rule in LONG_RULES.items()
+        }
     if options.json:
         options.json.write_text(json.dumps(kept), encoding="utf-8")
     print(table(kept["worlds"]))

@@ -1,4 +1,5 @@
-"""Processes of a benchmark: started again from the same script, one core each end, and the quantiles of what they measured."""
+"""Processes of a benchmark: started again from the same script, one core each end, and the
+quantiles of what they measured."""
 
 from __future__ import annotations
 
@@ -9,9 +10,12 @@ from collections.abc import Sequence
 
 
 def pin(core: int) -> bool:
-    """Put this process on one core, ahead of ordinary processes. False where that is not permitted."""
+    """Put this process on one core, ahead of ordinary processes. False where that is not
+    permitted."""
     try:
-        os.sched_setaffinity(0, range(os.cpu_count() or 1))  # a parent that is pinned itself has left it one core only
+        os.sched_setaffinity(
+            0, range(os.cpu_count() or 1)
+        )  # a parent that is pinned itself has left it one core only
         cores = sorted(os.sched_getaffinity(0))
         if len(cores) < 2:
             return False
@@ -23,7 +27,8 @@ def pin(core: int) -> bool:
 
 
 def share() -> bool:
-    """Put this process, and all that it starts from now on, on one core, as ordinary processes. False where that cannot be."""
+    """Put this process, and all that it starts from now on, on one core, as ordinary processes.
+    False where that cannot be."""
     if not hasattr(os, "sched_setaffinity"):
         return False
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

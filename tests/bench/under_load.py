@@ -1,10 +1,11 @@
 """Repeat the tests that start processes while every core is busy, and report how often each failed.
 
     python -m tests.bench.under_load 20            all tests marked `processes`
-    python -m tests.bench.under_load 5 tests/cli   those of a folder (everything after the number is for pytest)
+    python -m tests.bench.under_load 5 tests/cli   those of a folder (everything after the number is
+                                                   for pytest)
 
-Each round has one process of load a core beside it, and a limit. What pytest said is kept in reports/under_load. Exit code 1 if any
-test failed in any round, or a round reached its limit.
+Each round has one process of load a core beside it, and a limit. What pytest said is kept in
+reports/under_load. Exit code 1 if any test failed in any round, or a round reached its limit.
 """
 
 from __future__ import annotations
@@ -57,7 +58,9 @@ def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
     ]
     with busy_cores(), report.with_suffix(".txt").open("w", encoding="utf-8") as said:
         try:
-            done = subprocess.run(command, cwd=ROOT, stdout=said, stderr=said, timeout=ROUND_LIMIT_S, check=False)
+            done = subprocess.run(
+                command, cwd=ROOT, stdout=said, stderr=said, timeout=ROUND_LIMIT_S, check=False
+            )
         except subprocess.TimeoutExpired:
             return 0, [f"the whole round (not done after {ROUND_LIMIT_S} s)"]
     if done.returncode not in (0, 1):
@@ -82,10 +85,16 @@ def main() -> int:
     for number in range(1, rounds + 1):
         ran, failed = one_round(number, chosen)
         failures.update(failed)
-        print(f"round {number} of {rounds}: {ran} tests ran, {len(failed)} failed (load {load()})", flush=True)
+        print(
+            f"round {number} of {rounds}: {ran} tests ran, {len(failed)} failed (load {load()})",
+            flush=True,
+        )
     for name, count in failures.most_common():
         print(f"failed {count} of {rounds}: {name}")
-    print(f"{'nothing' if not failures else len(failures)} failed in {rounds} rounds; what pytest said: {KEPT}")
+    print(
+        f"{'nothing' if not failures else len(failures)} failed in {rounds} rounds; what "
+        f"pytest said: {KEPT}"
+    )
     return 1 if failures else 0
 
 

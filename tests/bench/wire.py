@@ -1,12 +1,14 @@
-"""Speed of the wire beside others, in one run: call round trip, calls per second, 100 kB, set-point streams.
+"""Speed of the wire beside others, in one run: call round trip, calls per second, 100 kB, set-point
+streams.
 
     python tests/bench/wire.py                       # all that is installed
     python tests/bench/wire.py --quick --json out.json
 
-Contenders take turns every few calls, so that a busy machine is busy for all. Each end is a process of its own. All is
-measured three times: with both ends SCHED_FIFO on different cores (where that is permitted), as ordinary processes that share
-one core, and as the scheduler likes it. The first two show the code's own cost; in the third the scheduler may keep the ends of
-one contender on one core and put those of another on two, of which the other one has to be woken for each message. Ratios are
+Contenders take turns every few calls, so that a busy machine is busy for all. Each end is a process
+of its own. All is measured three times: with both ends SCHED_FIFO on different cores (where that is
+permitted), as ordinary processes that share one core, and as the scheduler likes it. The first two
+show the code's own cost; in the third the scheduler may keep the ends of one contender on one core
+and put those of another on two, of which the other one has to be woken for each message. Ratios are
 what counts: microseconds are this machine's.
 """
 
@@ -32,7 +34,8 @@ from tests.bench.wire_streams import measure_streams
 
 IN_FLIGHT = 64
 LEAST = 50
-"""Calls of each of those in flight, at least, when calls per second are counted: a start must not weigh."""
+"""Calls of each of those in flight, at least, when calls per second are counted: a start must not
+weigh."""
 BIG = 100_000
 GAP = 0.001
 """Seconds between spaced calls: the other end sleeps by then."""
@@ -54,7 +57,8 @@ class Table:
         self._askers = {one.name: Asker(__file__, one.name, pinned) for one in contenders}
 
     def measure(self, rounds: int, calls: int) -> None:
-        """Rounds of all; within a round they take turns every few calls, so that the machine is in one mood for all."""
+        """Rounds of all; within a round they take turns every few calls, so that the machine is in
+        one mood for all."""
         for number in range(rounds):
             taken = self._take_turns(calls, 0.0)
             spaced = self._take_turns(calls // 4, GAP)
@@ -81,7 +85,8 @@ class Table:
             one.close()
 
     def results(self) -> dict[str, dict[str, float]]:
-        """Microseconds and calls per second, and their ratios to the bare echo's (median, least and largest of the rounds)."""
+        """Microseconds and calls per second, and their ratios to the bare echo's (median, least and
+        largest of the rounds)."""
         found = {}
         for name, row in self.rows.items():
             ratios = self.ratios(name, Bare.name, "round p50")
@@ -100,7 +105,9 @@ class Table:
 
     def ratios(self, name: str, to: str, what: str) -> list[float]:
         """Of each round: one contender's figure as a multiple of another's."""
-        return [own / its for own, its in zip(self.rows[name][what], self.rows[to][what], strict=True)]
+        return [
+            own / its for own, its in zip(self.rows[name][what], self.rows[to][what], strict=True)
+        ]
 
 
 Goals = dict[str, tuple[list[float], float, bool]]
@@ -113,10 +120,14 @@ def call_goals(table: Table) -> Goals:
     goals: Goals = {}
     for what, column in (("calls in a row", "round p50"), ("spaced calls", "spaced p50")):
         goals[f"p50 <= 1.6 x bare echo, {what}"] = _below(table.ratios(ours, bare, column), 1.6)
-        goals[f"p50 <= 2.0 x bare echo with MAC, {what}"] = _below(table.ratios(sealed, bare, column), 2.0)
+        goals[f"p50 <= 2.0 x bare echo with MAC, {what}"] = _below(
+            table.ratios(sealed, bare, column), 2.0
+        )
         for peer in PEERS:
             if peer in table.rows:
-                goals[f"p50 not above {peer}'s, {what}"] = _below(table.ratios(ours, peer, column), NOISE)
+                goals[f"p50 not above {peer}'s, {what}"] = _below(
+                    table.ratios(ours, peer, column), NOISE
+                )
     for peer in ("Pyro5", "RPyC"):
         if peer in table.rows:
             rates = table.ratios(ours, peer, "rate")
@@ -151,7 +162,9 @@ def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
     print(f"\n== {how} ==")
     show("calls", calls)
     show("streams (age when taken)", streams)
-    print(f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}{'least':>8}{'largest':>8}")
+    print(
+        f"\n{'goal (median, least and largest of the rounds)':52}{'limit':>7}{'median':>8}{'least':>8}{'largest':>8}"
+    )
     for goal, (found, limit, met) in goals.items():
         row = "".join(f"{one:8.2f}" for one in (quantile(found, 0.5), min(found), max(found)))
         print(f"{goal:52}{limit:7.2f}{row}  {'met' if met else 'NOT MET'}")
@@ -165,7 +178,11 @@ def _is_installed(one: type[Contender]) -> bool:
 def run(arguments: argparse.Namespace) -> dict[str, Any]:
     """All measurements, in every way of scheduling that is permitted."""
     missing = [one.name for one in CONTENDERS if not _is_installed(one)]
-    where: dict[str, Any] = {"python": platform.python_version(), "cores": os.cpu_count(), "load_before": load()}
+    where: dict[str, Any] = {
+        "python": platform.python_version(),
+        "cores": os.cpu_count(),
+        "load_before": load(),
+    }
     where["missing"] = missing
     results: dict[str, Any] = {"where": where}
     if arguments.pin and pin(0):
@@ -194,14 +211,23 @@ def _be_one_end(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=9, help="interleaved rounds")
-    parser.add_argument("--calls", type=int, default=2000, help="calls of each contender in a round")
+    parser.add_argument(
+        "--calls", type=int, default=2000, help="calls of each contender in a round"
+    )
     parser.add_argument("--seconds", type=float, default=4.0, help="length of each stream")
-    parser.add_argument("--quick", action="store_true", help="3 rounds of 500 calls, streams of 1 s")
+    parser.add_argument(
+        "--quick", action="store_true", help="3 rounds of 500 calls, streams of 1 s"
+    )
     parser.add_argument("--json", metavar="FILE", help="write the results")
     parser.add_argument(
-        "--pin", action=argparse.BooleanOptionalAction, default=True, help="measure with SCHED_FIFO, too"
+        "--pin",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="measure with SCHED_FIFO, too",
     )
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     parser.add_argument("--ask", nargs=2, help=argparse.SUPPRESS)

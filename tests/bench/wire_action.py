@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from services.action import Context, Result, success
+from petrobot.services.action import Context, Result, success
 
 
 def echo(ctx: Context, **values: Any) -> Result:

@@ -1,7 +1,8 @@
-"""The two ends of a contender of `wire.py`, a process each: who asks, told from outside what to measure, and who answers.
+"""The two ends of a contender of `wire.py`, a process each: who asks, told from outside what to
+measure, and who answers.
 
-No contender shares a process with another: how large a heap is, for one, decides whether each read of asyncio's gets fresh
-pages from the kernel, and so what a bare echo takes.
+No contender shares a process with another: how large a heap is, for one, decides whether each read
+of asyncio's gets fresh pages from the kernel, and so what a bare echo takes.
 """
 
 from __future__ import annotations
@@ -59,8 +60,12 @@ class Asker:
 
 
 def ask(contender: Contender, port: int) -> None:
-    """Be the process that asks: connect, then measure what standard input orders, a line each, until it ends."""
-    measures: dict[str, Callable[..., Any]] = {"latencies": contender.latencies, "rate": contender.rate}
+    """Be the process that asks: connect, then measure what standard input orders, a line each,
+    until it ends."""
+    measures: dict[str, Callable[..., Any]] = {
+        "latencies": contender.latencies,
+        "rate": contender.rate,
+    }
     contender.connect(port)
     contender.latencies(WARM_UP, 0)
     gc.collect()

@@ -1,4 +1,5 @@
-"""The contenders of `wire.py`: one echo service each, served by a process of its own and asked by another one.
+"""The contenders of `wire.py`: one echo service each, served by a process of its own and asked by
+another one.
 
 All carry the same record there and back: a name, three numbers and a text, by value.
 """
@@ -13,16 +14,20 @@ from collections.abc import Awaitable, Coroutine
 from pathlib import Path
 from typing import Any, ClassVar
 
-from services.comm.callee import Callee, Offer
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.directory import parse
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.server import Server
-from services.shell import NodeShell
+from petrobot.services.comm.callee import Callee, Offer
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import parse
+from petrobot.services.comm.messages import Call, Hello, Outcome
+from petrobot.services.comm.server import Server
+from petrobot.services.shell import NodeShell
 
 ROOT = Path(__file__).resolve().parents[2]
-RECORD = {"name": "catch_point", "value": [1.0, 0.25, 0.6], "text": "a record of about one hundred bytes, by value"}
+RECORD = {
+    "name": "catch_point",
+    "value": [1.0, 0.25, 0.6],
+    "text": "a record of about one hundred bytes, by value",
+}
 KEY = bytes(range(32))
 HOST = "127.0.0.1"
 
@@ -42,9 +47,11 @@ class Contender:
         raise NotImplementedError
 
     def latencies(self, count: int, size: int, gap: float = 0.0) -> list[float]:
-        """Seconds of each of `count` calls, one after the other, with a record (size 0) or so many bytes.
+        """Seconds of each of `count` calls, one after the other, with a record (size 0) or so many
+        bytes.
 
-        With a `gap` (s) each call finds the other end asleep, as a call now and then does; without, both stay awake.
+        With a `gap` (s) each call finds the other end asleep, as a call now and then does; without,
+        both stay awake.
         """
         raise NotImplementedError
 
@@ -190,7 +197,8 @@ class _BufferedAsker(_Asker, asyncio.BufferedProtocol):
 
 
 class Bare(AsyncContender):
-    """asyncio alone: the bytes of our own frame are sent back as they came. The measure of all others."""
+    """asyncio alone: the bytes of our own frame are sent back as they came. The measure of all
+    others."""
 
     name = "bare asyncio echo"
     FRAME = bytes(170)
@@ -213,7 +221,8 @@ class Bare(AsyncContender):
 
 
 class BareBuffered(Bare):
-    """The same with `asyncio.BufferedProtocol`, which spares a fresh buffer of 256 KiB for each read."""
+    """The same with `asyncio.BufferedProtocol`, which spares a fresh buffer of 256 KiB for each
+    read."""
 
     name = "bare, buffered protocol"
     echo = _Buffered
@@ -242,7 +251,9 @@ class Petrobot(AsyncContender):
             raise ConnectionError("the node does not answer")
 
     def ask(self, value: Any) -> Awaitable[Any]:
-        return self.client.call("echo", {"v": value} if isinstance(value, bytes) else value, deadline=10.0)
+        return self.client.call(
+            "echo", {"v": value} if isinstance(value, bytes) else value, deadline=10.0
+        )
 
     def leave(self) -> Coroutine[Any, Any, None]:
         return self.client.close()

@@ -1,6 +1,7 @@
 """The peers that `wire.py` is measured beside, each used as its own manual says for speed.
 
-Pyro5 with msgpack and a proxy a thread, RPyC with tuples (dicts travel by reference), pyzmq and grpc on asyncio.
+Pyro5 with msgpack and a proxy a thread, RPyC with tuples (dicts travel by reference), pyzmq and
+grpc on asyncio.
 """
 
 from __future__ import annotations
@@ -200,7 +201,9 @@ class Grpc(AsyncContender):
 
         handler = grpc.unary_unary_rpc_method_handler(echo, msgpack.unpackb, msgpack.packb)
         self.server = grpc.aio.server()
-        self.server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("bench", {"echo": handler}),))
+        self.server.add_generic_rpc_handlers(
+            (grpc.method_handlers_generic_handler("bench", {"echo": handler}),)
+        )
         port = self.server.add_insecure_port(f"{HOST}:0")
         await self.server.start()
         return int(port)

@@ -1,7 +1,9 @@
-"""Set points through a `StreamSender` beside the same numbers through a raw socket: how old each is when it is taken.
+"""Set points through a `StreamSender` beside the same numbers through a raw socket: how old each is
+when it is taken.
 
-One process sends both, each at its rate, half a period apart; one process takes both in from one `select`. So the two see the
-same scheduler, the same pacing by absolute deadline and the same load, and what differs is what the stream itself does.
+One process sends both, each at its rate, half a period apart; one process takes both in from one
+`select`. So the two see the same scheduler, the same pacing by absolute deadline and the same load,
+and what differs is what the stream itself does.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from services.comm.stream import Incoming, StreamReceiver, StreamSender
+from petrobot.services.comm.stream import Incoming, StreamReceiver, StreamSender
 from tests.bench.processes import pin, quantile, start
 
 RATES = (100, 250, 1000)
@@ -25,7 +27,8 @@ HOST = "127.0.0.1"
 RAW, STREAM = "raw socket", "petrobot stream"
 REST = (0.0,) * 7
 _RECORD = struct.Struct("9d")
-"""When it was due, when it was sent, and seven numbers more: as many as a predicted catching point has."""
+"""When it was due, when it was sent, and seven numbers more: as many as a predicted catching point
+has."""
 
 
 def send_both(raw_port: int, stream_port: int, rate: int, seconds: float) -> None:
@@ -49,7 +52,8 @@ def send_both(raw_port: int, stream_port: int, rate: int, seconds: float) -> Non
 
 
 class Ages:
-    """A sink that writes down how old each set point is when it is taken (s): since it was due, and since it was sent."""
+    """A sink that writes down how old each set point is when it is taken (s): since it was due, and
+    since it was sent."""
 
     def __init__(self) -> None:
         self.since_due: list[float] = []
@@ -92,7 +96,8 @@ def receive_both(rate: int, seconds: float, pinned: bool) -> dict[str, Ages]:
 
 
 def measure_streams(rounds: int, seconds: float, pinned: bool) -> dict[str, dict[str, float]]:
-    """Ages (us) by rate and way, and the ratio of their p99 to the raw socket's: of all, and the median of the rounds'."""
+    """Ages (us) by rate and way, and the ratio of their p99 to the raw socket's: of all, and the
+    median of the rounds'."""
     found: dict[str, dict[str, float]] = {}
     for rate in RATES:
         taken = [receive_both(rate, seconds, pinned) for _ in range(rounds)]

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.campaign.block import Bench
-from coordinator.campaign.conduct import Campaign
-from coordinator.campaign.plan import Plan, digest
-from coordinator.campaign.worker import answer
+from petrobot.coordinator.campaign.block import Bench
+from petrobot.coordinator.campaign.conduct import Campaign
+from petrobot.coordinator.campaign.plan import Plan, digest
+from petrobot.coordinator.campaign.worker import answer
 
 HERE = Path(__file__).parent
 TASK, SERVICES = HERE / "toy" / "fetch.toml", HERE / "toy" / "services.toml"

@@ -1,4 +1,5 @@
-"""A campaign's table: the same whoever does the blocks, however many do, and however often it is interrupted."""
+"""A campaign's table: the same whoever does the blocks, however many do, and however often it is
+interrupted."""
 
 from __future__ import annotations
 
@@ -15,18 +16,25 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.campaign.conduct import Campaign, Progress
-from coordinator.campaign.observed import regime_of
-from coordinator.campaign.plan import MANIFEST, CampaignError, Plan, digest, read_manifest, write_manifest
-from coordinator.campaign.pool import LocalPool
-from coordinator.campaign.summary import Summary, comparisons, result_of
-from coordinator.campaign.table import TABLE, read_table
-from coordinator.campaign.worker import serve
-from coordinator.cli import main
-from coordinator.cli.campaign import text_of
-from coordinator.experience.estimates_file import EstimatesFile
-from coordinator.launch import Setting, lockstep_cell
-from coordinator.learning.objective import Question, compare
+from petrobot.coordinator.campaign.conduct import Campaign, Progress
+from petrobot.coordinator.campaign.observed import regime_of
+from petrobot.coordinator.campaign.plan import (
+    MANIFEST,
+    CampaignError,
+    Plan,
+    digest,
+    read_manifest,
+    write_manifest,
+)
+from petrobot.coordinator.campaign.pool import LocalPool
+from petrobot.coordinator.campaign.summary import Summary, comparisons, result_of
+from petrobot.coordinator.campaign.table import TABLE, read_table
+from petrobot.coordinator.campaign.worker import serve
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.campaign import text_of
+from petrobot.coordinator.experience.estimates_file import EstimatesFile
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.learning.objective import Question, compare
 from tests.campaign.conftest import SERVICES, TASK, Conduct
 from tests.waiting import beat, until
 
@@ -42,7 +50,9 @@ def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
         blocks = replace(toy_plan, runs=runs, block=block).blocks
         assert [b.index for b in blocks] == list(range(len(blocks)))
         assert sum(b.count for b in blocks) == runs
-        assert [b.first for b in blocks] == [sum(a.count for a in blocks[:i]) for i in range(len(blocks))]
+        assert [b.first for b in blocks] == [
+            sum(a.count for a in blocks[:i]) for i in range(len(blocks))
+        ]
         for regime in ("easy", "rough"):
             own = [b for b in blocks if b.regime == regime]
             assert [b.seed for b in own] == [1_000_000 + i for i in range(len(own))]
@@ -57,7 +67,16 @@ def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
     assert [row.n for row in rows] == list(range(1, 13))
     assert {row.regime for row in rows} == {"easy", "rough"}
     header = table(campaign.folder).split(b"\n")[0].decode().split(",")
-    assert {"n", "regime", "seed", "chosen.look", "look.status", "look.cost", "parts.x", "parts.gripped"} <= set(header)
+    assert {
+        "n",
+        "regime",
+        "seed",
+        "chosen.look",
+        "look.status",
+        "look.cost",
+        "parts.x",
+        "parts.gripped",
+    } <= set(header)
     for row in rows:
         assert row.throw is not None
         assert row.throw.runs[0].place == "look"
@@ -65,7 +84,10 @@ def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
         grips = [run for run in row.throw.runs if run.place == "grip"]
         assert all(run.cost == 1.0 for run in grips)  # grip_soft costs its force
         assert row.throw.goals == sum(run.taken == "gripped" for run in row.throw.runs)
-        assert row.throw.time is not None and row.throw.time >= sum(run.took for run in row.throw.runs) - 1e-6
+        assert (
+            row.throw.time is not None
+            and row.throw.time >= sum(run.took for run in row.throw.runs) - 1e-6
+        )
 
 
 def test_a_block_is_the_mission_run_that_petrobot_run_gives(conduct: Conduct) -> None:
@@ -132,13 +154,16 @@ def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int
         conduct("a", fails_at=0)
     path = plan_cut_off(whole.folder.parent / "a", size)
     with pytest.raises(
-        CampaignError, match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again"
+        CampaignError,
+        match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again",
     ):
         conduct("a")
     path.unlink()
     assert table(conduct("a").folder) == table(whole.folder)
     plan_cut_off(path.parent, size)
-    with pytest.raises(CampaignError, match=r"torn.*remove .*a to begin anew, or give another --out"):
+    with pytest.raises(
+        CampaignError, match=r"torn.*remove .*a to begin anew, or give another --out"
+    ):
         conduct("a")
 
 
@@ -154,7 +179,8 @@ def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> N
 def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
     conduct: Conduct, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever had been written when the process died: before the file is on the disk it has another name."""
+    """Whatever had been written when the process died: before the file is on the disk it has
+    another name."""
     folder = conduct("a").folder
     before = (folder / MANIFEST).read_bytes()
 
@@ -186,7 +212,11 @@ def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
     """Three ways to look times two to grip, in each regime."""
     rows = list(conduct("a", selector="round_robin", runs=24).table.rows())
     easy = [row.throw for row in rows if row.regime == "easy"]
-    seen = {tuple(run.action for run in t.runs if run.place in ("look", "grip")) for t in easy if t and len(t.runs) > 1}
+    seen = {
+        tuple(run.action for run in t.runs if run.place in ("look", "grip"))
+        for t in easy
+        if t and len(t.runs) > 1
+    }
     assert {combination[0] for combination in seen} == {"look_quick", "look_twice", "look_long"}
     assert len(seen) >= 5  # one of six may have been unseen
 
@@ -227,8 +257,11 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
     assert len(list(read_table(tmp_path / "by_3" / TABLE))) == 12
 
 
-def test_nothing_of_a_block_is_there_when_the_next_one_begins(toy_plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A worker's memory stays flat although a mission refers to itself in circles and the collector has its own time."""
+def test_nothing_of_a_block_is_there_when_the_next_one_begins(
+    toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker's memory stays flat although a mission refers to itself in circles and the collector
+    has its own time."""
     left: list[int] = []
 
     def orders() -> Iterator[str]:
@@ -237,7 +270,9 @@ def test_nothing_of_a_block_is_there_when_the_next_one_begins(toy_plan: Plan, mo
             yield json.dumps({"block": block.to_plain(), "weights": []})
             left.append(gc.collect())
 
-    monkeypatch.setattr(gc, "freeze", lambda: None)  # for good in a worker; here it would be for all tests that follow
+    monkeypatch.setattr(
+        gc, "freeze", lambda: None
+    )  # for good in a worker; here it would be for all tests that follow
     answers = io.StringIO()
     gc.collect()
     gc.disable()
@@ -259,7 +294,9 @@ def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
         resumed = conduct(f"part{fails_at}", **learning)
         assert table(resumed.folder) == table(whole.folder)
         assert resumed.policy.state() == whole.policy.state()
-    looks = [row.throw.runs[0].action for row in whole.table.rows() if row.throw and row.regime == "easy"]
+    looks = [
+        row.throw.runs[0].action for row in whole.table.rows() if row.throw and row.regime == "easy"
+    ]
     assert set(looks[:15]) == {"look_quick", "look_twice", "look_long"}  # first trials of each
 
 
@@ -267,7 +304,7 @@ def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
     """By regime, from the result of the campaign that learned."""
     import json
 
-    from coordinator.campaign.policies import learned_choices
+    from petrobot.coordinator.campaign.policies import learned_choices
 
     learnt = conduct("learnt", selector="thompson", runs=60, batch=12)
     (learnt.folder / "result.json").write_text(json.dumps(learnt.result()), encoding="utf-8")
@@ -282,7 +319,7 @@ def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
 
 def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
     """The same rows and columns as the CSV file; without pyarrow nothing is written."""
-    from coordinator.campaign.table import write_parquet
+    from petrobot.coordinator.campaign.table import write_parquet
 
     campaign = conduct("a")
     parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
@@ -298,17 +335,23 @@ def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path
     """Named by the location file, not by a lost worker."""
     other = tmp_path / "services.toml"
     other.write_text(
-        SERVICES.read_text(encoding="utf-8").replace("toy_actions:prepare", "no_such_module:prepare"), encoding="utf-8"
+        SERVICES.read_text(encoding="utf-8").replace(
+            "toy_actions:prepare", "no_such_module:prepare"
+        ),
+        encoding="utf-8",
     )
     with pytest.raises(CampaignError, match="no_such_module"):
         conduct("a", services=str(other), digests={"task": digest(TASK), "services": digest(other)})
 
 
 def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> None:
-    """Else with the target that the task file declares: cost is that of the hardest regime which still reaches it."""
+    """Else with the target that the task file declares: cost is that of the hardest regime which
+    still reaches it."""
     campaign = conduct("a", selector="round_robin", runs=240)
     task, plan = campaign.bench.task, campaign.plan
-    assert campaign.result()["judged"]["look"]["target"] == 0.9  # declared, if only by leaving it out
+    assert (
+        campaign.result()["judged"]["look"]["target"] == 0.9
+    )  # declared, if only by leaving it out
     sets = []
     for options in ({}, {"target": 0.3}, {"target": 0.6}, {"target": 0.99}, {"rho": 0.25}):
         summary = Summary.of(task, campaign.table.rows(), options=options)
@@ -316,16 +359,28 @@ def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> 
         judged, tallies = result["judged"]["look"], summary.estimates.of("look")
         target = options.get("target", 0.9)
         expected = compare(tallies, Question("wall", target, options.get("rho")))
-        assert (judged["cost"], judged["target"], judged["regimes"]) == ("wall", target, ["easy", "rough"])
+        assert (judged["cost"], judged["target"], judged["regimes"]) == (
+            "wall",
+            target,
+            ["easy", "rough"],
+        )
         assert judged["rho"] == pytest.approx(expected.rho)
-        assert result["J"]["look"] == {f.action: round(f.j, 6) if isfinite(f.j) else None for f in expected.figures}
-        inside = {a: [c for c, t in by.items() if t.interval()[0] >= target] for a, by in tallies.items()}
-        assert judged["meet_target"] == {a: list(map(regime_of, met)) for a, met in inside.items() if met}
+        assert result["J"]["look"] == {
+            f.action: round(f.j, 6) if isfinite(f.j) else None for f in expected.figures
+        }
+        inside = {
+            a: [c for c, t in by.items() if t.interval()[0] >= target] for a, by in tallies.items()
+        }
+        assert judged["meet_target"] == {
+            a: list(map(regime_of, met)) for a, met in inside.items() if met
+        }
         for f in expected.figures:
             assert f.reliability == min(tally.reliability for tally in tallies[f.action].values())
             if f.scenario is not None:
                 there = tallies[f.action][f.scenario]
-                assert there.reliability == min(tallies[f.action][c].reliability for c in inside[f.action])
+                assert there.reliability == min(
+                    tallies[f.action][c].reliability for c in inside[f.action]
+                )
                 assert f.cost == there.wall.mean
         said = text_of({**result, "chosen": {"look": result["chosen"]["look"]}})
         assert (f"no action surely reaches R {target:g}" in said) == (not judged["meet_target"])
@@ -336,7 +391,9 @@ def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> 
     assert sets[3] == [0, 0, 0]
     one = comparisons(task, summary.estimates.tallies, "rough")["look"]
     assert one.scenarios == ("regime=rough",)
-    assert all(f.admissible for f in one.figures), "in one regime the declared target rules nobody out"
+    assert all(f.admissible for f in one.figures), (
+        "in one regime the declared target rules nobody out"
+    )
 
 
 COUNTING = """
@@ -357,12 +414,15 @@ values = { force = 4.0 }
 def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
     conduct: Conduct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Declared in the task file: how many images a run averaged, as it reports, 1 where it reports nothing."""
+    """Declared in the task file: how many images a run averaged, as it reports, 1 where it reports
+    nothing."""
     monkeypatch.chdir(tmp_path)
     text = TASK.read_text(encoding="utf-8").replace('"look_long"]', '"look_long"]\ncost = "count"')
     (task := tmp_path / "fetch.toml").write_text(text, encoding="utf-8")
     (mock := tmp_path / "mock.toml").write_text(COUNTING, encoding="utf-8")
-    digests = {key: digest(path) for key, path in (("task", task), ("services", SERVICES), ("mock", mock))}
+    digests = {
+        key: digest(path) for key, path in (("task", task), ("services", SERVICES), ("mock", mock))
+    }
     counted = {"look_quick": 1.0, "look_twice": 2.0, "look_long": 16.0}
     campaign = conduct("a", task=str(task), mock=str(mock), digests=digests, selector="round_robin")
     for row in campaign.table.rows():
@@ -371,14 +431,28 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
     result = campaign.result()
     assert result["judged"]["look"]["cost"] == "count"
     assert result["J"]["look"] == {action: count / 16 for action, count in counted.items()}
-    told = ["run", str(task), "--services", str(SERVICES), "--mode", "lockstep", "--mock", str(mock), "--quiet"]
+    told = [
+        "run",
+        str(task),
+        "--services",
+        str(SERVICES),
+        "--mode",
+        "lockstep",
+        "--mock",
+        str(mock),
+        "--quiet",
+    ]
     assert main([*told, "--runs", "6", "--learn", "run.db", "--selector", "round_robin"]) == 0
     for path in (Path("run.db"), Path(result["estimates"])):
         kept = EstimatesFile(path).read()
         assert kept.question("look") == Question("count", 0.9)
         for action, by_context in kept.estimates.of("look").items():
             assert {tally.cost("count").mean for tally in by_context.values()} == {counted[action]}
-    learner = EstimatesFile(Path("run.db")).read().states("round_robin")["look"]["learners"]["regime=easy"]
+    learner = (
+        EstimatesFile(Path("run.db"))
+        .read()
+        .states("round_robin")["look"]["learners"]["regime=easy"]
+    )
     assert learner["cost"] == [2 * count for count in counted.values()]
 
 
@@ -386,7 +460,8 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
 def test_learned_show_judges_as_the_campaign_did(
     conduct: Conduct, selector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the cost, the target and the rho that its estimates file holds, also if no selector learned by them."""
+    """By the cost, the target and the rho that its estimates file holds, also if no selector
+    learned by them."""
     monkeypatch.chdir(tmp_path)
     options = {"target": 0.6, "rho": 0.2}
     result = conduct("a", selector=selector, runs=120, options=options).result()
@@ -395,7 +470,10 @@ def test_learned_show_judges_as_the_campaign_did(
     assert shown["grip"]["cost"] == "value:force"
     for task, actions in result["J"].items():
         about = shown[task]
-        found = {row["action"]: None if row["J"] is None else round(row["J"], 6) for row in about["actions"]}
+        found = {
+            row["action"]: None if row["J"] is None else round(row["J"], 6)
+            for row in about["actions"]
+        }
         assert found == actions
         assert (about["target"], about["rho"]) == (0.6, 0.2)
 
@@ -406,7 +484,9 @@ def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduc
     path = Path(campaign.result()["estimates"])
     whole = EstimatesFile(path).read().estimates
     path.write_bytes(b"no database at all, but long enough to be looked at" * 9)
-    with pytest.raises(CampaignError, match=r"not a database.*If it is removed, the same command makes it again"):
+    with pytest.raises(
+        CampaignError, match=r"not a database.*If it is removed, the same command makes it again"
+    ):
         campaign.result()
     path.unlink()
     campaign.result()
@@ -416,8 +496,12 @@ def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduc
 def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
     """J is 1 - R then, which nobody would see."""
     task = tmp_path / "fetch.toml"
-    task.write_text(TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8")
-    campaign = conduct("a", task=str(task), runs=24, digests={"task": digest(task), "services": digest(SERVICES)})
+    task.write_text(
+        TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8"
+    )
+    campaign = conduct(
+        "a", task=str(task), runs=24, digests={"task": digest(task), "services": digest(SERVICES)}
+    )
     result = campaign.result()
     assert result["judged"]["grip"]["uncosted"] == ["grip_soft"]
     result["chosen"]["grip"]["grip_hard"] = 1  # primitive tasks without a choice are not printed
@@ -430,7 +514,9 @@ async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
 ) -> None:
     """Its child holds its output and its input open; it ends with it."""
     mark, program = tmp_path / "left", tmp_path / "worker"
-    program.write_text(f"#!/bin/sh\nread plan\nsleep 3600 &\necho $! > {mark}\nread order\nkill -9 $$\n")
+    program.write_text(
+        f"#!/bin/sh\nread plan\nsleep 3600 &\necho $! > {mark}\nread order\nkill -9 $$\n"
+    )
     program.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(program))
     order = {"block": toy_plan.blocks[0].to_plain(), "weights": []}
@@ -439,5 +525,7 @@ async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
             await pool.run(order)
         assert pool.lost == 3
         left = int(mark.read_text())
-        while Path(f"/proc/{left}").exists() and " Z " not in Path(f"/proc/{left}/stat").read_text():
+        while (
+            Path(f"/proc/{left}").exists() and " Z " not in Path(f"/proc/{left}/stat").read_text()
+        ):
             await beat(0.01)

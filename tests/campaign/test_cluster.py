@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.campaign.cluster import ClusterPool
-from coordinator.campaign.conduct import Campaign, Progress
-from coordinator.campaign.plan import CampaignError, Plan
-from coordinator.campaign.table import TABLE
+from petrobot.coordinator.campaign.cluster import ClusterPool
+from petrobot.coordinator.campaign.conduct import Campaign, Progress
+from petrobot.coordinator.campaign.plan import CampaignError, Plan
+from petrobot.coordinator.campaign.table import TABLE
 from tests.campaign.conftest import HERE, Conduct
 from tests.waiting import beat
 
@@ -27,7 +27,11 @@ PATIENCE = 60.0
 @contextmanager
 def process(*arguments: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """One process of the cluster, ended at the end."""
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}", "DASK_DISTRIBUTED__WORKER__DAEMON": "false"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{ROOT}:{HERE}",
+        "DASK_DISTRIBUTED__WORKER__DAEMON": "false",
+    }
     with log.open("wb") as said:
         started = subprocess.Popen(
             [sys.executable, "-m", *arguments], cwd=ROOT, env=environment, stdout=said, stderr=said
@@ -40,12 +44,24 @@ def process(*arguments: str, log: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.processes
-def test_a_killed_worker_of_a_real_cluster_changes_nothing(conduct: Conduct, tmp_path: Path) -> None:
-    """Scheduler and two workers are processes of their own; one worker is killed with a block in hand."""
-    pytest.importorskip("distributed", reason="the extra `cluster` (dask.distributed) is not installed")
+def test_a_killed_worker_of_a_real_cluster_changes_nothing(
+    conduct: Conduct, tmp_path: Path
+) -> None:
+    """Scheduler and two workers are processes of their own; one worker is killed with a block in
+    hand."""
+    pytest.importorskip(
+        "distributed", reason="the extra `cluster` (dask.distributed) is not installed"
+    )
     alone = conduct("alone", selector="random", runs=30)
     where = tmp_path / "scheduler.json"
-    scheduler = ("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+    scheduler = (
+        "distributed.cli.dask_scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+    )
     worker = (
         "distributed.cli.dask_worker",
         "--scheduler-file",
@@ -66,7 +82,9 @@ def test_a_killed_worker_of_a_real_cluster_changes_nothing(conduct: Conduct, tmp
     assert (tmp_path / "cluster" / TABLE).read_bytes() == (alone.folder / TABLE).read_bytes()
 
 
-async def _conducted(folder: Path, plan: Plan, where: Path, victim: subprocess.Popen[bytes]) -> None:
+async def _conducted(
+    folder: Path, plan: Plan, where: Path, victim: subprocess.Popen[bytes]
+) -> None:
     """The campaign on the cluster; the victim dies after the second block that is done."""
     import json
 

@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from coordinator.campaign.conduct import Progress
-from coordinator.campaign.lock import held
-from coordinator.campaign.progress import ProgressLine, clock, line
-from coordinator.campaign.spent import times
-from coordinator.cli import main
-from coordinator.cli.campaign import text_of
+from petrobot.coordinator.campaign.conduct import Progress
+from petrobot.coordinator.campaign.lock import held
+from petrobot.coordinator.campaign.progress import ProgressLine, clock, line
+from petrobot.coordinator.campaign.spent import times
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.campaign import text_of
 from tests.campaign.conftest import HERE, SERVICES, TASK
 from tests.waiting import Limit
 
@@ -33,7 +33,22 @@ TOY = [str(TASK), "--services", str(SERVICES)]
 def campaign(folder: Path, *arguments: str) -> dict[str, Any]:
     """Run the command in this process (its workers are others) and give its JSON."""
     out = folder.with_suffix(".json")
-    assert main(["campaign", *TOY, "--out", str(folder), "--workers", "1", "--json", str(out), *arguments]) == 0
+    assert (
+        main(
+            [
+                "campaign",
+                *TOY,
+                "--out",
+                str(folder),
+                "--workers",
+                "1",
+                "--json",
+                str(out),
+                *arguments,
+            ]
+        )
+        == 0
+    )
     result: dict[str, Any] = json.loads(out.read_text(encoding="utf-8"))
     return result
 
@@ -42,7 +57,15 @@ def campaign(folder: Path, *arguments: str) -> dict[str, Any]:
 def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The whole loop on the toy cell, with the promised keys."""
     train = campaign(
-        tmp_path / "train", "--runs", "300", "--regime", "easy,rough", "--selector", "random", "--block", "30"
+        tmp_path / "train",
+        "--runs",
+        "300",
+        "--regime",
+        "easy,rough",
+        "--selector",
+        "random",
+        "--block",
+        "30",
     )
     promised = {
         "task",
@@ -64,15 +87,53 @@ def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFi
     assert sum(train["chosen"]["look"].values()) == train["begun"] <= train["runs"] == 300
     assert all(0 < j < 2.01 for j in train["J"]["look"].values())
     registered = tmp_path / "f.json"
-    told = ["forecast", str(TASK), "--estimates", str(tmp_path / "train"), "--runs", "150", "--replicates", "60"]
+    told = [
+        "forecast",
+        str(TASK),
+        "--estimates",
+        str(tmp_path / "train"),
+        "--runs",
+        "150",
+        "--replicates",
+        "60",
+    ]
     assert main([*told, "--out", str(registered)]) == 0
-    new = ["--runs", "300", "--regime", "easy,rough", "--selector", "random", "--block", "30", "--seed", "2"]
+    new = [
+        "--runs",
+        "300",
+        "--regime",
+        "easy,rough",
+        "--selector",
+        "random",
+        "--block",
+        "30",
+        "--seed",
+        "2",
+    ]
     found = campaign(tmp_path / "new", *new, "--check", str(registered))["check"]
     assert found["agrees"] and found["registered_before"] and found["same_task_file"]
-    assert {row["figure"] for row in found["rows"]} == {"R_goal", "P_complete", "mean", "q90", "R_conj"}
+    assert {row["figure"] for row in found["rows"]} == {
+        "R_goal",
+        "P_complete",
+        "mean",
+        "q90",
+        "R_conj",
+    }
     capsys.readouterr()
     table = tmp_path / "table.md"
-    assert main(["forecast", "--compare", str(registered), str(tmp_path / "new"), "--markdown", str(table)]) == 0
+    assert (
+        main(
+            [
+                "forecast",
+                "--compare",
+                str(registered),
+                str(tmp_path / "new"),
+                "--markdown",
+                str(table),
+            ]
+        )
+        == 0
+    )
     assert table.read_text(encoding="utf-8").count("| easy |") == 7
     assert main(["forecast", "--compare", str(registered), str(tmp_path / "train")]) == 2
     assert "was trained on" in capsys.readouterr().err
@@ -92,14 +153,17 @@ def test_train_forecast_run_and_compare(tmp_path: Path, capsys: pytest.CaptureFi
     from_sums = json.loads(capsys.readouterr().out)
     for regime in ("easy", "rough"):
         own = train["by_regime"][regime]["R_goal"]
-        assert from_sums["regimes"][regime]["figures"]["R_goal"]["value"] == pytest.approx(own, abs=0.05)
+        assert from_sums["regimes"][regime]["figures"]["R_goal"]["value"] == pytest.approx(
+            own, abs=0.05
+        )
 
 
 @pytest.mark.processes
 def test_a_finished_campaign_is_not_run_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The same command gives the same result at once; another number of runs has a folder of its own."""
+    """The same command gives the same result at once; another number of runs has a folder of its
+    own."""
     monkeypatch.chdir(tmp_path)
     told = ["campaign", *TOY, "--workers", "1", "--regime", "easy"]
     assert main([*told, "--runs", "4"]) == 0
@@ -130,10 +194,12 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
         "2",
     ]
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}"}
-    command = [sys.executable, "-m", "coordinator", "campaign"]
+    command = [sys.executable, "-m", "petrobot.coordinator", "campaign"]
 
     def start(*more: str) -> subprocess.Popen[bytes]:
-        return subprocess.Popen([*command, *more], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+        return subprocess.Popen(
+            [*command, *more], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
+        )
 
     part = start(*arguments, "--out", "part")
     table = tmp_path / "part" / "table.csv"
@@ -151,7 +217,15 @@ def test_a_killed_campaign_goes_on(tmp_path: Path) -> None:
 def test_names_longer_than_their_column_stand_apart_from_what_follows() -> None:
     """Regimes with several disturbances are long."""
     part = {"R_goal": 0.75, "wilson": [0.6, 0.9], "P_complete": 1.0, "mean": 4.0, "q90": 5.0}
-    result = {"task": "t", "begun": 4, "selector": "fixed", "seed": 1, "sim_s": 1.0, "wall_s": 1.0, "rows": "table.csv"}
+    result = {
+        "task": "t",
+        "begun": 4,
+        "selector": "fixed",
+        "seed": 1,
+        "sim_s": 1.0,
+        "wall_s": 1.0,
+        "rows": "table.csv",
+    }
     result |= {
         "by_regime": {"C+arm50+latency200": part},
         "chosen": {},
@@ -160,7 +234,10 @@ def test_names_longer_than_their_column_stand_apart_from_what_follows() -> None:
         **part,
     }
     rows = [line.split() for line in text_of(result).splitlines()[1:3]]
-    assert [row[:3] for row in rows] == [["C+arm50+latency200", "R_goal", "0.7500"], ["all", "R_goal", "0.7500"]]
+    assert [row[:3] for row in rows] == [
+        ["C+arm50+latency200", "R_goal", "0.7500"],
+        ["all", "R_goal", "0.7500"],
+    ]
 
 
 @pytest.mark.processes
@@ -169,7 +246,7 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
     command = [
         sys.executable,
         "-m",
-        "coordinator",
+        "petrobot.coordinator",
         "campaign",
         *TOY,
         "--runs",
@@ -181,7 +258,11 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
     ]
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}"}
     campaign = subprocess.Popen(
-        [*command, "--out", "part"], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*command, "--out", "part"],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     try:
         _until(lambda: _frozen_with_its_workers_at_work(campaign, tmp_path / "part"))
@@ -200,7 +281,8 @@ def test_no_worker_outlives_a_killed_campaign(tmp_path: Path) -> None:
 
 
 def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: Path) -> bool:
-    """Freeze a campaign that has two workers, neither of them a new one still on its way to its first block."""
+    """Freeze a campaign that has two workers, neither of them a new one still on its way to its
+    first block."""
     assert campaign.poll() is None
     campaign.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, campaign.pid, os.WSTOPPED)
@@ -212,7 +294,12 @@ def _frozen_with_its_workers_at_work(campaign: subprocess.Popen[bytes], folder: 
 
 
 def _children(parent: int) -> list[int]:
-    return [int(pid) for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="ascii").split()]
+    return [
+        int(pid)
+        for pid in Path(f"/proc/{parent}/task/{parent}/children")
+        .read_text(encoding="ascii")
+        .split()
+    ]
 
 
 def _until(condition: Callable[[], bool]) -> None:
@@ -250,7 +337,11 @@ def _until(condition: Callable[[], bool]) -> None:
     ],
 )
 def test_bad_input(
-    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Exit code 2, and one line with the remedy."""
     monkeypatch.chdir(tmp_path)
@@ -258,12 +349,15 @@ def test_bad_input(
     assert said in capsys.readouterr().err
 
 
-# --- progress ------------------------------------------------------------------------------------------------------------
+# --- progress ---------------------------------------------------------------------------------
 
 
 @pytest.mark.processes
-def test_two_at_once_do_not_write_one_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The second is told who is at it, and touches nothing; a lock whose holder is gone stands in nobody's way."""
+def test_two_at_once_do_not_write_one_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second is told who is at it, and touches nothing; a lock whose holder is gone stands in
+    nobody's way."""
     folder = tmp_path / "one"
     campaign(folder, "--runs", "3")
     before = (folder / "table.csv").read_bytes()

@@ -1,4 +1,5 @@
-"""What is written down of a throw: by scripted missions of the shipped task, and rows there and back."""
+"""What is written down of a throw: by scripted missions of the shipped task, and rows there and
+back."""
 
 from __future__ import annotations
 
@@ -10,18 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.campaign.block import scores
-from coordinator.campaign.plan import Plan, identity
-from coordinator.campaign.rows import Row, cells, columns, read_row
-from coordinator.campaign.throws import RunEntry, Throw, ThrowLog
-from coordinator.cli.loading import load_task
-from coordinator.engine.instructions import Corrected
-from coordinator.launch import Setting, lockstep_cell
-from coordinator.mission.mission import Mission
-from coordinator.task import Status
-from coordinator.taskfile import load
-from services.action import Status as ActionStatus
-from services.scripted import Line
+from petrobot.coordinator.campaign.block import scores
+from petrobot.coordinator.campaign.plan import Plan, identity
+from petrobot.coordinator.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.campaign.throws import RunEntry, Throw, ThrowLog
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.engine.instructions import Corrected
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.task import Status
+from petrobot.coordinator.taskfile import load
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.scripted import Line
 from tests.campaign.conftest import TASK
 from tests.mission.scripted_cell import directory_for, scripts
 
@@ -39,8 +40,11 @@ def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[ThrowLog, Missi
 
 
 def test_a_throw_has_its_runs_and_what_took_them() -> None:
-    """Durations from the coming of the token; parallel runs both; the time ends when everything is back."""
-    log, _ = logged({"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]})
+    """Durations from the coming of the token; parallel runs both; the time ends when everything is
+    back."""
+    log, _ = logged(
+        {"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
+    )
     assert len(log.throws) == 3
     throw = log.throws[0]
     by_place = {run.place: run for run in throw.runs}
@@ -51,7 +55,9 @@ def test_a_throw_has_its_runs_and_what_took_them() -> None:
     assert by_place["locate_ball"].took >= by_place["locate_ball"].seconds
     assert by_place["locate_ball"].values == {"images": 20.0}
     assert (
-        by_place["track_ball"].begun == by_place["move_to_point"].begun == pytest.approx(by_place["locate_ball"].took)
+        by_place["track_ball"].begun
+        == by_place["move_to_point"].begun
+        == pytest.approx(by_place["locate_ball"].took)
     )
     home = by_place["return_home"]
     assert throw.time == pytest.approx(home.begun + home.took)
@@ -83,15 +89,26 @@ def test_a_deferred_verdict_corrects_the_entry() -> None:
     """Once, for the estimates."""
     log, _ = logged({}, runs=1)
     log.instruction(
-        9.0, Corrected("locate_ball#1", "locate_ball", "locate_background", Status.SUCCESS, Status.FAILURE, "late")
+        9.0,
+        Corrected(
+            "locate_ball#1",
+            "locate_ball",
+            "locate_background",
+            Status.SUCCESS,
+            Status.FAILURE,
+            "late",
+        ),
     )
     runs = [run for run in log.throws[0].runs if run.place == "locate_ball"]
     known = [key for key in log._entries if key.startswith("locate_ball")]
-    log.instruction(9.0, Corrected(known[0], "locate_ball", runs[0].action, Status.SUCCESS, Status.FAILURE, "late"))
+    log.instruction(
+        9.0,
+        Corrected(known[0], "locate_ball", runs[0].action, Status.SUCCESS, Status.FAILURE, "late"),
+    )
     assert (runs[0].status, runs[0].cause) == ("failure", "late")
 
 
-# --- rows ------------------------------------------------------------------------------------------------------------------
+# --- rows -------------------------------------------------------------------------------------
 
 TEXT = st.text(st.characters(exclude_characters="\r", exclude_categories=["Cs"]), max_size=12)
 FINITE = st.floats(-1e6, 1e6).map(lambda x: round(x, 6))
@@ -128,8 +145,11 @@ SCORES = st.dictionaries(
 
 
 @given(THROWS | st.none(), SCORES, st.booleans())
-def test_rows_come_back_as_they_were(throw: Throw | None, score: dict[str, Any], known: bool) -> None:
-    """Through CSV, whatever texts hold; results that the first block did not have travel in `more`."""
+def test_rows_come_back_as_they_were(
+    throw: Throw | None, score: dict[str, Any], known: bool
+) -> None:
+    """Through CSV, whatever texts hold; results that the first block did not have travel in
+    `more`."""
     row = Row(7, "easy", 1_000_000, throw.k if throw else 2, 1, 3.25, throw, score)
     names = columns(TOY, [row] if known else [])
     out = io.StringIO()
@@ -171,7 +191,11 @@ def test_throws_travel_as_plain_data(throw: Throw) -> None:
 def test_scores_go_to_the_throw_that_they_are_of() -> None:
     """By `run` where there is one, else by `n`; plain values serve a single throw."""
     score = {
-        "balls": [{"n": 1, "run": 2, "x": 0.5}, {"n": 2, "run": 3, "x": 0.7}, {"n": 3, "run": None, "x": 0.9}],
+        "balls": [
+            {"n": 1, "run": 2, "x": 0.5},
+            {"n": 2, "run": 3, "x": 0.7},
+            {"n": 3, "run": None, "x": 0.9},
+        ],
         "parts": [{"n": 1, "y": 1.0}],
         "seen": 3,
     }

@@ -1,4 +1,5 @@
-"""Deferred verdicts in a campaign: table, estimates and summary hold what runs really came to, however it was interrupted."""
+"""Deferred verdicts in a campaign: table, estimates and summary hold what runs really came to,
+however it was interrupted."""
 
 from __future__ import annotations
 
@@ -8,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.campaign.conduct import Campaign
-from coordinator.campaign.observed import ESTIMATES
-from coordinator.campaign.plan import Plan, digest
-from coordinator.campaign.table import TABLE
-from coordinator.experience.estimates_file import EstimatesFile
+from petrobot.coordinator.campaign.conduct import Campaign
+from petrobot.coordinator.campaign.observed import ESTIMATES
+from petrobot.coordinator.campaign.plan import Plan, digest
+from petrobot.coordinator.campaign.table import TABLE
+from petrobot.coordinator.experience.estimates_file import EstimatesFile
 from tests.campaign.conftest import InlinePool
 from tests.mission.judged_parts import FOLDER, TRULY
 
@@ -24,7 +25,9 @@ BLOCKS = 3
 def plan() -> Plan:
     """Three blocks of six parts: of each, the first, third and fourth pick turn out bad."""
     digests = {"task": digest(TASK), "services": digest(SERVICES)}
-    return Plan(str(TASK), str(SERVICES), runs=6 * BLOCKS, block=6, batch=0, digests=digests, regimes=("",))
+    return Plan(
+        str(TASK), str(SERVICES), runs=6 * BLOCKS, block=6, batch=0, digests=digests, regimes=("",)
+    )
 
 
 def conducted(folder: Path, plan: Plan, fails_at: int | None = None) -> Campaign:
@@ -43,7 +46,10 @@ def test_the_table_and_the_estimates_hold_what_was_judged(tmp_path: Path, plan: 
         assert row.throw is not None
         assert (row.throw.status, row.throw.cause, row.throw.completed) == (status, cause, True)
         assert row.throw.all_success is (status == "success")
-        assert [(run.status, run.cause) for run in row.throw.runs] == [(status, cause), ("success", "")]
+        assert [(run.status, run.cause) for run in row.throw.runs] == [
+            (status, cause),
+            ("success", ""),
+        ]
     campaign.result()
     tallies = EstimatesFile(tmp_path / "a" / ESTIMATES).read().estimates.tallies
     (tally,) = [t for key, t in tallies.items() if key.primitive_task == "pick"]

@@ -1,11 +1,12 @@
-"""Actions and services of the toy cell: their chance is keyed by seed and run, and a hard part is hard for all of them."""
+"""Actions and services of the toy cell: their chance is keyed by seed and run, and a hard part is
+hard for all of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from services.action import Context, Result, error, failure, success
+from petrobot.services.action import Context, Result, error, failure, success
 
 HARD = {"easy": 0.1, "rough": 0.5}
 
@@ -18,7 +19,11 @@ async def look(ctx: Context, *, regime: str, seconds: float, share: float) -> Re
     chance = draw.random()
     if chance > share:
         return error("unseen") if chance > 0.5 + share / 2 else failure("blurred", hard=hard)
-    return failure("blurred", hard=hard) if hard and draw.random() < 0.6 else success(hard=hard, latency=seconds / 4)
+    return (
+        failure("blurred", hard=hard)
+        if hard and draw.random() < 0.6
+        else success(hard=hard, latency=seconds / 4)
+    )
 
 
 async def grip(ctx: Context, *, hard: bool, force: float, share: float) -> Result:
@@ -39,11 +44,25 @@ async def mend(ctx: Context) -> Result:
 
 def prepare(ctx: Context, *, regime: str, seed: int, runs: int) -> Result:
     """Refuse a regime that does not exist."""
-    return success() if regime in HARD else error("bad_arguments", f"no regime {regime!r}; there are easy and rough")
+    return (
+        success()
+        if regime in HARD
+        else error("bad_arguments", f"no regime {regime!r}; there are easy and rough")
+    )
 
 
 def score(ctx: Context, *, cycles: Sequence[dict[str, Any]]) -> Result:
     """A row for each part, and a picture of its own."""
-    rows = [{"n": c["n"], "x": 0.1 * c["n"], "y": c["ended_ago"], "gripped": c["status"] != "error"} for c in cycles]
-    plots = {"parts": {"title": "Where parts lay", "x": "parts.x", "y": "parts.y", "colour": "parts.gripped"}}
+    rows = [
+        {"n": c["n"], "x": 0.1 * c["n"], "y": c["ended_ago"], "gripped": c["status"] != "error"}
+        for c in cycles
+    ]
+    plots = {
+        "parts": {
+            "title": "Where parts lay",
+            "x": "parts.x",
+            "y": "parts.y",
+            "colour": "parts.gripped",
+        }
+    }
     return success(parts=rows, plots=plots, total=len(rows))

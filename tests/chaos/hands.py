@@ -1,4 +1,5 @@
-"""Toy hands for tests with real processes: quick actions that leave a line for each execution and notice a second performer."""
+"""Toy hands for tests with real processes: quick actions that leave a line for each execution and
+notice a second performer."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from services.action import Context, Result, success
+from petrobot.services.action import Context, Result, success
 
 
 class Hand:
@@ -50,7 +51,8 @@ class Hand:
 
 
 async def move(ctx: Context, log: str, hand: str, seconds: float = 0.05) -> Result:
-    """Move a hand for a while. The log gets `begin`, `end` and, if somebody else moves the hand, `overlap`."""
+    """Move a hand for a while. The log gets `begin`, `end` and, if somebody else moves the hand,
+    `overlap`."""
     with Path(f"{log}.{hand}").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

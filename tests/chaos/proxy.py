@@ -1,8 +1,9 @@
-"""A TCP proxy between coordinator and nodes that cuts, delays and repeats: `proxy.py PORT:NODE_PORT ...`, orders on standard input.
+"""A TCP proxy between coordinator and nodes that cuts, delays and repeats: `proxy.py PORT:NODE_PORT
+...`, orders on standard input.
 
-Orders, one a line: `cut N` breaks the connections of the N-th pair, `delay N SECONDS` holds back both directions for a while,
-`repeat N` sends the next frame of either direction twice. Frames are told apart by their length (docs/protocol.md); the
-handshake is passed on as it is.
+Orders, one a line: `cut N` breaks the connections of the N-th pair, `delay N SECONDS` holds back
+both directions for a while, `repeat N` sends the next frame of either direction twice. Frames are
+told apart by their length (docs/protocol.md); the handshake is passed on as it is.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ class Pair:
             writer.transport.abort()
             return
         self._writers |= {writer, back}
-        await asyncio.gather(self._pass(reader, back), self._pass(there, writer), return_exceptions=True)
+        await asyncio.gather(
+            self._pass(reader, back), self._pass(there, writer), return_exceptions=True
+        )
         for end in (writer, back):
             end.transport.abort()
             self._writers.discard(end)

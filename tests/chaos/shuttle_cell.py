@@ -50,10 +50,15 @@ args = {{ log = "{log}", hand = "right", seconds = 0.02 }}
 """
 
 
-def shuttle_services(folder: Path, *, fetch: float = 0.05, carry: float = 0.1, orphan: float = 1.0) -> Path:
-    """A services.toml in this folder; the hands log to `moves.txt` beside it. Times of actions and orphans in seconds."""
+def shuttle_services(
+    folder: Path, *, fetch: float = 0.05, carry: float = 0.1, orphan: float = 1.0
+) -> Path:
+    """A services.toml in this folder; the hands log to `moves.txt` beside it. Times of actions and
+    orphans in seconds."""
     path = folder / "services.toml"
-    text = SERVICES.format(*free_ports(3), log=folder / "moves.txt", fetch=fetch, carry=carry, orphan=orphan)
+    text = SERVICES.format(
+        *free_ports(3), log=folder / "moves.txt", fetch=fetch, carry=carry, orphan=orphan
+    )
     path.write_text(text, encoding="utf-8")
     return path
 

@@ -1,9 +1,12 @@
-"""Mission runs in real time while everything around them breaks: `storm.py SEED SECONDS FOLDER [--lo]`. Prints one JSON object.
+"""Mission runs in real time while everything around them breaks: `storm.py SEED SECONDS FOLDER
+[--lo]`. Prints one JSON object.
 
-Nodes live under the supervisor of `petrobot up`, each behind a proxy. Each mission run is a process `petrobot run`. Seeded
-weather kills nodes, workers and the coordinator (SIGKILL; `petrobot resume` then goes on with the run), freezes nodes and workers
-(SIGSTOP), cuts, delays and repeats what goes over the wire, and, in a network namespace of its own (`--lo`), takes the loopback
-down. Mission runs follow one another; each is judged by its journal and by what the hands noted. Last comes one in calm weather.
+Nodes live under the supervisor of `petrobot up`, each behind a proxy. Each mission run is a process
+`petrobot run`. Seeded weather kills nodes, workers and the coordinator (SIGKILL; `petrobot resume`
+then goes on with the run), freezes nodes and workers (SIGSTOP), cuts, delays and repeats what goes
+over the wire, and, in a network namespace of its own (`--lo`), takes the loopback down. Mission
+runs follow one another; each is judged by its journal and by what the hands noted. Last comes one
+in calm weather.
 """
 
 from __future__ import annotations
@@ -21,16 +24,16 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.cli.loading import load_task
-from coordinator.cli.replaying import recorded
-from coordinator.engine import Finished, Fired, RunRecorded, StartRun
-from coordinator.launch import local_programs, with_runs
-from coordinator.record.journal import JournalError, read_journal
-from coordinator.record.recording import STIMULUS
-from coordinator.record.runfolder import JOURNAL, RESULT
-from coordinator.supervisor import Supervisor
-from coordinator.task import Status
-from services.comm.directory import load
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.engine import Finished, Fired, RunRecorded, StartRun
+from petrobot.coordinator.launch import local_programs, with_runs
+from petrobot.coordinator.record.journal import JournalError, read_journal
+from petrobot.coordinator.record.recording import STIMULUS
+from petrobot.coordinator.record.runfolder import JOURNAL, RESULT
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.task import Status
+from petrobot.services.comm.directory import load
 from tests.chaos.by_proxy import NODES
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 from tests.ports import free_ports
@@ -45,7 +48,8 @@ LONGEST = 240.0
 RUNS = 24
 QUIET = ("--quiet", "--no-page")
 KILLS = 4
-"""Times at most that the coordinator of one mission run is killed: it has to come to its end some day."""
+"""Times at most that the coordinator of one mission run is killed: it has to come to its end some
+day."""
 UNREACHABLE, HANGS = 3, 1000
 PATIENCE = 60.0
 """Seconds that nodes have to notice that everybody has left."""
@@ -97,7 +101,8 @@ class Weather:
                 _signal(process, signal.SIGCONT)
 
     async def _kill_node(self) -> None:
-        """Unless one is still being started: on a busy machine nothing would ever be up for long enough to break."""
+        """Unless one is still being started: on a busy machine nothing would ever be up for long
+        enough to break."""
         if all([await _listens(port) for port in self._ports]):
             _signal(self._node(), signal.SIGKILL)
 
@@ -170,7 +175,10 @@ class Storm:
 
     async def pass_over(self, seconds: float) -> dict[str, Any]:
         """Run missions for so long in the storm, then one in calm weather; what was seen."""
-        pairs = [f"{port}:{self._directory.nodes[n].port}" for port, n in zip(self._proxied, NODES, strict=True)]
+        pairs = [
+            f"{port}:{self._directory.nodes[n].port}"
+            for port, n in zip(self._proxied, NODES, strict=True)
+        ]
         ports = [self._directory.nodes[name].port for name in NODES]
         command = [sys.executable, "-m", "tests.chaos.proxy", *pairs]
         pipe = asyncio.subprocess.PIPE
@@ -178,7 +186,9 @@ class Storm:
         assert proxy.stdout is not None and proxy.stdin is not None
         await proxy.stdout.readline()
         try:
-            async with Supervisor(local_programs(self._directory), self._folder / "logs") as supervisor:
+            async with Supervisor(
+                local_programs(self._directory), self._folder / "logs"
+            ) as supervisor:
                 weather = Weather(self._seed, supervisor, proxy, self._crash, self._lo, ports)
                 loop = asyncio.get_running_loop()
                 before, end = _sockets(supervisor), loop.time() + seconds
@@ -195,8 +205,11 @@ class Storm:
         return self._told(weather, left)
 
     def _hardly(self, weather: Weather) -> bool:
-        """Whether too little has happened yet to be called a storm: a slow machine needs longer for that."""
-        return sum(self._ends.values()) < LEAST_MISSIONS or sum(weather.seen.values()) < LEAST_EVENTS
+        """Whether too little has happened yet to be called a storm: a slow machine needs longer for
+        that."""
+        return (
+            sum(self._ends.values()) < LEAST_MISSIONS or sum(weather.seen.values()) < LEAST_EVENTS
+        )
 
     def _told(self, weather: Weather, sockets: dict[str, int]) -> dict[str, Any]:
         begun = moves(self._folder, "begin")
@@ -220,7 +233,8 @@ class Storm:
         }
 
     async def _calm(self, supervisor: Supervisor) -> None:
-        """All nodes are up again: a mission run without any error; then no fence was left behind."""
+        """All nodes are up again: a mission run without any error; then no fence was left
+        behind."""
         loop = asyncio.get_running_loop()
         end = loop.time() + LONGEST
         self._crash.clear()
@@ -231,11 +245,16 @@ class Storm:
         self._faults.append("no calm mission run without error came about")
 
     async def _left(self, supervisor: Supervisor, before: dict[str, int]) -> dict[str, int]:
-        """Sockets that nodes have more than at first, once those who left have had time to be gone."""
+        """Sockets that nodes have more than at first, once those who left have had time to be
+        gone."""
         loop = asyncio.get_running_loop()
         end = loop.time() + PATIENCE
         while True:
-            more = {name: count - before[name] for name, count in _sockets(supervisor).items() if count > before[name]}
+            more = {
+                name: count - before[name]
+                for name, count in _sockets(supervisor).items()
+                if count > before[name]
+            }
             if not more or loop.time() > end:
                 return more
             await beat(0.1)
@@ -256,8 +275,14 @@ class Storm:
             if not _stimuli(kept):
                 self._unborn += 1
                 return False
-            if (result := next(kept.glob(f"*/{RESULT}"), None)) is not None and code == -signal.SIGKILL:
-                code = 0 if json.loads(result.read_text(encoding="utf-8"))["status"] == "success" else 1
+            if (
+                result := next(kept.glob(f"*/{RESULT}"), None)
+            ) is not None and code == -signal.SIGKILL:
+                code = (
+                    0
+                    if json.loads(result.read_text(encoding="utf-8"))["status"] == "success"
+                    else 1
+                )
             if code != -signal.SIGKILL and code != UNREACHABLE:
                 break
             self._resumes += 1
@@ -265,14 +290,21 @@ class Storm:
         return self._judge(next(kept.iterdir()), code)
 
     async def _life(self, given: list[str], kept: Path, until: float, *, mortal: bool) -> int:
-        """One life of the coordinator: its exit code, -9 if the weather has killed it (once it had something to lose)."""
+        """One life of the coordinator: its exit code, -9 if the weather has killed it (once it had
+        something to lose)."""
         before = _stimuli(kept)
         ports = ",".join(map(str, self._proxied))
         with (self._folder / "coordinator.txt").open("ab") as out:
             command = [sys.executable, "-m", "tests.chaos.by_proxy", ports, *given]
-            process = await asyncio.create_subprocess_exec(*command, cwd=ROOT, stdout=out, stderr=out)
+            process = await asyncio.create_subprocess_exec(
+                *command, cwd=ROOT, stdout=out, stderr=out
+            )
         ending = asyncio.ensure_future(process.wait())
-        while not ending.done() and _stimuli(kept) == before and asyncio.get_running_loop().time() < until:
+        while (
+            not ending.done()
+            and _stimuli(kept) == before
+            and asyncio.get_running_loop().time() < until
+        ):
             await beat(0.02)
         self._crash.clear()
         crashing = asyncio.ensure_future(self._crash.wait())
@@ -290,8 +322,8 @@ class Storm:
         return code
 
     def _judge(self, folder: Path, code: int) -> bool:
-        """The end has a reason, every run one end, every firing is one of the net, the journal says the same again; whether all
-        runs ended well."""
+        """The end has a reason, every run one end, every firing is one of the net, the journal says
+        the same again; whether all runs ended well."""
         found = recorded(str(folder))
         self._torn += found.journal.torn_bytes > 0
         steps = list(found.steps())
@@ -308,16 +340,20 @@ class Storm:
         self._calls += len(started)
         self._causes.update(f"{r.cause} ({r.executed})" for r in records if r.cause)
         net = with_runs(load_task(str(TASK)), RUNS)[0].flat.net
-        markings = [tuple(m) for m in net.replay([f.transition for f in firings], firings[0].before)]
+        markings = [
+            tuple(m) for m in net.replay([f.transition for f in firings], firings[0].before)
+        ]
         checks = {
             "its end has no reason": bool(finished.reason),
-            "its result is another": (result["status"], result["firings"]) == (finished.status.value, len(firings)),
+            "its result is another": (result["status"], result["firings"])
+            == (finished.status.value, len(firings)),
             "its exit code is another": code == (0 if finished.status is Status.SUCCESS else 1),
             "a firing is none of the net": markings[1:] == [f.after for f in firings],
             "a run was started twice": len(started) == len(set(started)),
             "a run has not one end": sorted(r.run for r in records) == sorted(started),
             "an error has no cause": all(r.cause for r in records if r.status is Status.ERROR),
-            "tokens were lost": markings[-1][net.place_index["runs"]] == 0 or finished.status is Status.ERROR,
+            "tokens were lost": markings[-1][net.place_index["runs"]] == 0
+            or finished.status is Status.ERROR,
         }
         self._faults += [f"{folder}: {text}" for text, holds in checks.items() if not holds]
         return all(r.status is Status.SUCCESS for r in records)
@@ -359,19 +395,29 @@ def _stimuli(kept: Path) -> int:
     """How many stimuli the journal of a mission run holds; 0 while it has not begun."""
     journal = next(kept.glob(f"*/{JOURNAL}"), None)
     try:
-        return sum(r.kind == STIMULUS for r in read_journal(journal).records) if journal is not None else 0
+        return (
+            sum(r.kind == STIMULUS for r in read_journal(journal).records)
+            if journal is not None
+            else 0
+        )
     except JournalError:
         return 0
 
 
 def _marked() -> list[str]:
-    """Command lines of the other processes that carry this storm's mark: none may be left when it is over."""
+    """Command lines of the other processes that carry this storm's mark: none may be left when it
+    is over."""
     mark, found = f"{MARK}={os.environ.get(MARK, '')}".encode(), []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
             with contextlib.suppress(OSError):
                 if mark in (entry / "environ").read_bytes().split(b"\0"):
-                    found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+                    found.append(
+                        (entry / "cmdline")
+                        .read_bytes()
+                        .replace(b"\0", b" ")
+                        .decode(errors="replace")
+                    )
     return found
 
 

@@ -1,4 +1,5 @@
-"""Seeded chaos in real time: every mission run ends with a reason, nothing is executed twice, nothing is left behind."""
+"""Seeded chaos in real time: every mission run ends with a reason, nothing is executed twice,
+nothing is left behind."""
 
 from __future__ import annotations
 
@@ -20,10 +21,18 @@ NAMESPACE = ("unshare", "--user", "--map-root-user", "--net")
 
 
 def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[str, Any]:
-    """What a storm tells (tests/chaos/storm.py), in a network namespace of its own if the loopback is to be taken down."""
+    """What a storm tells (tests/chaos/storm.py), in a network namespace of its own if the loopback
+    is to be taken down."""
     command = [sys.executable, "-m", "tests.chaos.storm", str(seed), str(seconds), str(folder)]
     command = [*NAMESPACE, *command, "--lo"] if lo else command
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=seconds + 3 * LONGEST)
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=seconds + 3 * LONGEST,
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     told: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     print(told)
@@ -33,15 +42,22 @@ def storm(folder: Path, seed: int, seconds: float, *, lo: bool = False) -> dict[
 def judge(told: dict[str, Any]) -> None:
     """All that must hold in any weather."""
     assert told["faults"] == []
-    assert told["missions"] >= LEAST_MISSIONS and sum(told["weather"].values()) >= LEAST_EVENTS, "hardly a storm"
+    assert told["missions"] >= LEAST_MISSIONS and sum(told["weather"].values()) >= LEAST_EVENTS, (
+        "hardly a storm"
+    )
     assert set(told["ends"]) <= {"success", "error"}
     assert told["twice"] == [], "an action was executed twice"
     assert told["overlaps"] == [], "two performers for one hand"
     assert told["executed"] <= told["calls"]
     assert told["processes"] == [] and told["sockets"] == {}, "something was left behind"
-    leased = sum(times for cause, times in told["causes"].items() if cause.startswith("device_leased"))
-    # A coordinator that leaves unheard keeps its devices for 2 s. Its successor asks ten times a second.
-    unheard = told["killed"] + sum(told["weather"].get(kind, 0) for kind in ("cut", "delay", "freeze_node"))
+    leased = sum(
+        times for cause, times in told["causes"].items() if cause.startswith("device_leased")
+    )
+    # A coordinator that leaves unheard keeps its devices for 2 s. Its successor asks ten times a
+    # second.
+    unheard = told["killed"] + sum(
+        told["weather"].get(kind, 0) for kind in ("cut", "delay", "freeze_node")
+    )
     assert leased <= 20 * unheard, "coordinators that have left keep devices from those that come"
 
 
@@ -49,12 +65,15 @@ def namespace_permitted() -> bool:
     """Whether this user may have a network namespace of its own and set its loopback."""
     if not shutil.which("unshare") or not shutil.which("ip"):
         return False
-    tried = subprocess.run([*NAMESPACE, "ip", "link", "set", "lo", "up"], capture_output=True, check=False)
+    tried = subprocess.run(
+        [*NAMESPACE, "ip", "link", "set", "lo", "up"], capture_output=True, check=False
+    )
     return tried.returncode == 0
 
 
 needs_namespace = pytest.mark.skipif(
-    not namespace_permitted(), reason="no network namespace here: needs unshare and ip, and user namespaces permitted"
+    not namespace_permitted(),
+    reason="no network namespace here: needs unshare and ip, and user namespaces permitted",
 )
 
 

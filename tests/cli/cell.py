@@ -1,4 +1,5 @@
-"""A cell in one process: a node with an arm that takes its time, over real sockets, and a task with a bit of everything."""
+"""A cell in one process: a node with an arm that takes its time, over real sockets, and a task with
+a bit of everything."""
 
 from __future__ import annotations
 
@@ -7,11 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from services.action import Context, Result, success
-from services.comm.directory import Directory, parse
-from services.device import Ports
-from services.node import Node
-from services.place import InlinePlace
+from petrobot.services.action import Context, Result, success
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.device import Ports
+from petrobot.services.node import Node
+from petrobot.services.place import InlinePlace
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
 
@@ -132,7 +133,11 @@ class Arm:
 
     def picture(self) -> Mapping[str, Any]:
         """What the test shows it."""
-        return {"mime": "image/png", "data": self.sees, "width": 2, "height": 1, "age": 0.5} if self.sees else {}
+        return (
+            {"mime": "image/png", "data": self.sees, "width": 2, "height": 1, "age": 0.5}
+            if self.sees
+            else {}
+        )
 
     def stop(self, now: float) -> None:
         """Stand."""

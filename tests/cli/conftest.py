@@ -13,16 +13,16 @@ from typing import Any, NamedTuple
 import pytest
 import pytest_asyncio
 
-from coordinator.cli import main
-from coordinator.hmi.server import Page, start_page
-from coordinator.launch import Setting, realtime_mission
-from coordinator.mission.mission import Mission
-from coordinator.mission.partners import FirstAlternative
-from coordinator.mission.realtime import RealtimeMission
-from coordinator.operator.door_file import Door, door_open
-from coordinator.operator.operation import Operation
-from coordinator.record.runfolder import JOURNAL
-from coordinator.taskfile import loads
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.launch import Setting, realtime_mission
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.operator.door_file import Door, door_open
+from petrobot.coordinator.operator.operation import Operation
+from petrobot.coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.taskfile import loads
 from tests.cli.cell import TASK, Arm, RobotNode, directory_in
 from tests.waiting import beat
 
@@ -104,7 +104,9 @@ async def cell_of(folder: Path, read: Callable[[], Any]) -> AsyncIterator[Termin
     robot = RobotNode(directory)
     await robot.start()
     selector = FirstAlternative()
-    mission = realtime_mission(directory, Setting(loads(TASK, "reaching.toml"), selector=selector), RUN)
+    mission = realtime_mission(
+        directory, Setting(loads(TASK, "reaching.toml"), selector=selector), RUN
+    )
     shell = RealtimeMission(mission, directory)
     await shell.connect()
     operation = Operation(shell, selector)

@@ -1,7 +1,8 @@
-"""Runs commands one after the other in the present folder, and says in JSON what each said and left behind.
+"""Runs commands one after the other in the present folder, and says in JSON what each said and left
+behind.
 
-A process for itself, since the folder is on a disk that this process's mount namespace alone has. Its argument is a JSON list of
-command lines, each a list.
+A process for itself, since the folder is on a disk that this process's mount namespace alone has.
+Its argument is a JSON list of command lines, each a list.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from coordinator.cli import main
+from petrobot.coordinator.cli import main
 
 
 def outcome(command: list[str], there: set[Path]) -> dict[str, object]:

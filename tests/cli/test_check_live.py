@@ -7,16 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import main
+from petrobot.coordinator.cli import main
 from tests.cli.cell import SERVICES, TASK, RobotNode, directory_in
 
 
-async def said_of(folder: Path, services: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+async def said_of(
+    folder: Path, services: Path, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str]:
     """Exit code and output of a live check of the reaching task."""
     task = folder / "reaching.toml"
     task.write_text(TASK, encoding="utf-8")
     capsys.readouterr()
-    code = await asyncio.to_thread(main, ["check", str(task), "--services", str(services), "--live"])
+    code = await asyncio.to_thread(
+        main, ["check", str(task), "--services", str(services), "--live"]
+    )
     return code, capsys.readouterr().out
 
 
@@ -33,21 +37,28 @@ async def test_nodes_that_give_all(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 async def test_a_node_that_is_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its address, what it would have offered and the remedy are named; the exit code is that of an unreachable node."""
+    """Its address, what it would have offered and the remedy are named; the exit code is that of an
+    unreachable node."""
     directory = directory_in(tmp_path)
     code, said = await said_of(tmp_path, Path(str(directory.source)), capsys)
     assert code == 3
     assert "robot at 127.0.0.1" in said and "reach_slowly" in said and "may not run" in said
 
 
-async def test_a_node_with_an_older_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A node that was started with another services.toml refuses whoever has this one, and the check says so."""
+async def test_a_node_with_an_older_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A node that was started with another services.toml refuses whoever has this one, and the
+    check says so."""
     directory = directory_in(tmp_path)
     robot = RobotNode(directory)
     await robot.start()
     newer = tmp_path / "newer.toml"
     port = directory.nodes["robot"].port
-    newer.write_text(SERVICES.format(port=port).replace("[actions.reach]", "[actions.reach_far]"), encoding="utf-8")
+    newer.write_text(
+        SERVICES.format(port=port).replace("[actions.reach]", "[actions.reach_far]"),
+        encoding="utf-8",
+    )
     task = TASK.replace('"reach",', '"reach_far",')
     (tmp_path / "far.toml").write_text(task, encoding="utf-8")
     capsys.readouterr()

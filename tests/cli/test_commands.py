@@ -1,4 +1,5 @@
-"""The command line as a user meets it: help with an example everywhere, exit codes, one clear line for each fault."""
+"""The command line as a user meets it: help with an example everywhere, exit codes, one clear line
+for each fault."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import COMMANDS, main
+from petrobot.coordinator.cli import COMMANDS, main
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -20,8 +21,10 @@ ROOT = Path(__file__).parents[2]
 def petrobot(*arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
-    command = [sys.executable, "-m", "coordinator", *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "petrobot.coordinator", *arguments]
+    return subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS])
@@ -54,27 +57,69 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
         (["replay", "no_such_run"], "no run 'no_such_run'"),
         (["new", "action", "2fast"], "2fast"),
         (["calibrate", "--views", "nowhere"], "nowhere"),
-        (["simulate", "catch_ball", "--replicas", "0"], "--replicas: 0 is not a whole number of at least 1"),
-        (["simulate", "catch_ball", "--replicas", "ten"], "ten is not a whole number of at least 1"),
-        (["simulate", "catch_ball", "--horizon", "-1"], "--horizon: -1 is not a number of more than 0"),
-        (["simulate", "catch_ball", "--seed", "-1"], "--seed: -1 is not a whole number of at least 0"),
-        (["analyse", "catch_ball", "--states", "0"], "--states: 0 is not a whole number of at least 1"),
-        (["analyse", "catch_ball", "--seconds", "-1"], "--seconds: -1 is not a number of at least 0"),
-        (["analyse", "catch_ball", "--seconds", "nan"], "--seconds: nan is not a number of at least 0"),
-        (["analyse", "catch_ball", "--memory", "0"], "--memory: 0 is not a whole number of at least 1"),
-        (["campaign", "catch_ball", "--runs", "abc"], "--runs: abc is not a whole number of at least 1"),
-        (["campaign", "catch_ball", "--target", "2"], "--target: 2 is not a number of more than 0 and at most 1"),
-        (["learned", "show", "x.db", "--target", "7"], "--target: 7 is not a number of more than 0 and at most 1"),
+        (
+            ["simulate", "catch_ball", "--replicas", "0"],
+            "--replicas: 0 is not a whole number of at least 1",
+        ),
+        (
+            ["simulate", "catch_ball", "--replicas", "ten"],
+            "ten is not a whole number of at least 1",
+        ),
+        (
+            ["simulate", "catch_ball", "--horizon", "-1"],
+            "--horizon: -1 is not a number of more than 0",
+        ),
+        (
+            ["simulate", "catch_ball", "--seed", "-1"],
+            "--seed: -1 is not a whole number of at least 0",
+        ),
+        (
+            ["analyse", "catch_ball", "--states", "0"],
+            "--states: 0 is not a whole number of at least 1",
+        ),
+        (
+            ["analyse", "catch_ball", "--seconds", "-1"],
+            "--seconds: -1 is not a number of at least 0",
+        ),
+        (
+            ["analyse", "catch_ball", "--seconds", "nan"],
+            "--seconds: nan is not a number of at least 0",
+        ),
+        (
+            ["analyse", "catch_ball", "--memory", "0"],
+            "--memory: 0 is not a whole number of at least 1",
+        ),
+        (
+            ["campaign", "catch_ball", "--runs", "abc"],
+            "--runs: abc is not a whole number of at least 1",
+        ),
+        (
+            ["campaign", "catch_ball", "--target", "2"],
+            "--target: 2 is not a number of more than 0 and at most 1",
+        ),
+        (
+            ["learned", "show", "x.db", "--target", "7"],
+            "--target: 7 is not a number of more than 0 and at most 1",
+        ),
         (["learned", "show", "x.db", "--rho", "-1"], "--rho: -1 is not a number of at least 0"),
         (["token", "runs", "two"], "two changes nothing: write how many tokens"),
         (["run", "catch_ball", "--runs", "abc"], "--runs: abc is not a whole number of at least 1"),
         (["run", "catch_ball", "--keep", "0"], "--keep: 0 is not a whole number of at least 1"),
-        (["run", "catch_ball", "--target", "0"], "--target: 0 is not a number of more than 0 and at most 1"),
-        (["forecast", "catch_ball", "--replicates", "5"], "--replicates: 5 is not a whole number of at least 20"),
+        (
+            ["run", "catch_ball", "--target", "0"],
+            "--target: 0 is not a number of more than 0 and at most 1",
+        ),
+        (
+            ["forecast", "catch_ball", "--replicates", "5"],
+            "--replicates: 5 is not a whole number of at least 20",
+        ),
         (["nodes", "--timeout", "-1"], "--timeout: -1 is not a number of more than 0"),
         (["nodes", "--timeout", "0"], "--timeout: 0 is not a number of more than 0"),
         (["nodes", "--timeout", "inf"], "--timeout: inf is not a number of more than 0"),
-        (["up", "--lockstep", "--await-coordinator", "-1"], "--await-coordinator: -1 is not a number of at least 0"),
+        (
+            ["up", "--lockstep", "--await-coordinator", "-1"],
+            "--await-coordinator: -1 is not a number of at least 0",
+        ),
         (
             ["up", "--lockstep", "--await-coordinator", "soon"],
             "--await-coordinator: soon is not a number of at least 0",
@@ -82,7 +127,10 @@ def test_overview_and_unknown_command(capsys: pytest.CaptureFixture[str]) -> Non
     ],
 )
 def test_bad_input_is_exit_code_2_and_names_the_fault(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    arguments: list[str],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One clear line that names what was wrong."""
     monkeypatch.chdir(ROOT)
@@ -90,7 +138,9 @@ def test_bad_input_is_exit_code_2_and_names_the_fault(
     assert said in capsys.readouterr().err
 
 
-def test_nodes_that_are_not_there_are_exit_code_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nodes_that_are_not_there_are_exit_code_3(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`run` and `nodes` say which node does not answer."""
     services = tmp_path / "services.toml"
     text = (
@@ -99,7 +149,9 @@ def test_nodes_that_are_not_there_are_exit_code_3(tmp_path: Path, capsys: pytest
         .replace("services/cell.toml", str(ROOT / "services/cell.toml"))
     )
     for port in ("7300", "7301", "7302"):
-        text = text.replace(f"port = {port}", f"port = {int(port) - 6300}")  # nothing listens on ports this low
+        text = text.replace(
+            f"port = {port}", f"port = {int(port) - 6300}"
+        )  # nothing listens on ports this low
     services.write_text(text, encoding="utf-8")
     assert main(["nodes", "--services", str(services), "--timeout", "0.3"]) == 3
     assert "away" in capsys.readouterr().out
@@ -107,12 +159,25 @@ def test_nodes_that_are_not_there_are_exit_code_3(tmp_path: Path, capsys: pytest
 
 @pytest.mark.processes
 def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
-    """`petrobot node` is the node, not its parent: a signal that ends the command leaves nothing that holds the port."""
+    """`petrobot node` is the node, not its parent: a signal that ends the command leaves nothing
+    that holds the port."""
     [port] = free_ports(1)
     services = tmp_path / "services.toml"
-    services.write_text(f'schema = 1\n[nodes.n]\nhost = "127.0.0.1"\nport = {port}\n[services.memory]\nnode = "n"\n')
-    command = [sys.executable, "-m", "coordinator", "node", "n", "--services", str(services)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]) as node:
+    services.write_text(
+        f'schema = 1\n[nodes.n]\nhost = "127.0.0.1"\nport = {port}\n[services.memory]\nnode = "n"\n'
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "petrobot.coordinator",
+        "node",
+        "n",
+        "--services",
+        str(services),
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
+    ) as node:
         assert node.stdout is not None
         assert node.stdout.readline() == f"node n ready on 127.0.0.1:{port}, process {node.pid}\n"
         node.terminate()
@@ -121,9 +186,13 @@ def test_a_node_ends_with_its_command(tmp_path: Path) -> None:
         assert again.connect_ex(("127.0.0.1", port)) != 0
 
 
-@pytest.mark.parametrize("command", [("run", "catch_ball", "--mode", "lockstep"), ("serve",), ("resume", "last")])
+@pytest.mark.parametrize(
+    "command", [("run", "catch_ball", "--mode", "lockstep"), ("serve",), ("resume", "last")]
+)
 @pytest.mark.parametrize("port", ["99999", "-1", "web"])
-def test_what_is_no_port_is_refused(command: tuple[str, ...], port: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_port_is_refused(
+    command: tuple[str, ...], port: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It is not taken for another number."""
     assert main([*command, "--page-port", port]) == 2
     said = capsys.readouterr().err
@@ -134,11 +203,29 @@ def test_a_port_in_use_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixtur
     """One line with the remedy."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert main(["serve", "--page-port", str(port), "--tasks", str(tmp_path), "--journal", str(tmp_path)]) == 2
-    assert f"port {port}: Address already in use; choose another with --page-port" in capsys.readouterr().err
+        assert (
+            main(
+                [
+                    "serve",
+                    "--page-port",
+                    str(port),
+                    "--tasks",
+                    str(tmp_path),
+                    "--journal",
+                    str(tmp_path),
+                ]
+            )
+            == 2
+        )
+    assert (
+        f"port {port}: Address already in use; choose another with --page-port"
+        in capsys.readouterr().err
+    )
 
 
-def test_check_gives_its_findings_as_json(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_gives_its_findings_as_json(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The shipped task may run on the shipped nodes."""
     monkeypatch.chdir(ROOT)
     assert main(["check", "catch_ball", "--json", "-"]) == 0
@@ -147,9 +234,11 @@ def test_check_gives_its_findings_as_json(capsys: pytest.CaptureFixture[str], mo
     assert answer["task"] == "catch_ball"
 
 
-def test_a_task_without_error_branch_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_without_error_branch_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`check` and `run` both refuse it, naming place and remedy."""
-    from coordinator.cli.new import TASK
+    from petrobot.coordinator.cli.new import TASK
 
     path = tmp_path / "broken.toml"
     broken = TASK.replace("{name}", "broken").replace(
@@ -162,16 +251,23 @@ def test_a_task_without_error_branch_is_refused(tmp_path: Path, capsys: pytest.C
     assert "error" in said.out + said.err
 
 
-def test_a_task_that_can_deadlock_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without its honest end the skeleton can come to a dead marking: no file fault, but the state space tells."""
-    from coordinator.cli.new import TASK
+def test_a_task_that_can_deadlock_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without its honest end the skeleton can come to a dead marking: no file fault, but the state
+    space tells."""
+    from petrobot.coordinator.cli.new import TASK
 
     path = tmp_path / "stuck.toml"
     text = TASK.replace("{name}", "stuck")
     path.write_text(text, encoding="utf-8")
-    assert main(["check", str(path)]) == 2  # its actions are on no node of the shipped services.toml
+    assert (
+        main(["check", str(path)]) == 2
+    )  # its actions are on no node of the shipped services.toml
     services = tmp_path / "services.toml"
-    action = '[actions.{0}]\nrun = "services.action:success"\ntask = "{0}"\nnode = "robot"\n'
+    action = (
+        '[actions.{0}]\nrun = "petrobot.services.action:success"\ntask = "{0}"\nnode = "robot"\n'
+    )
     node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
     services.write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")
     assert main(["check", str(path), "--services", str(services)]) == 0
@@ -215,8 +311,20 @@ def test_new_writes_what_works(tmp_path: Path) -> None:
     for what, name in (("action", "wave"), ("task", "greet")):
         assert petrobot("new", what, name, cwd=tmp_path).returncode == 0
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}"}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, str(tmp_path)]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-c",
+        os.devnull,
+        str(tmp_path),
+    ]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout
     assert "4 passed" in done.stdout
     assert petrobot("new", "task", "greet", cwd=tmp_path).returncode == 2
@@ -228,19 +336,43 @@ def test_lockstep_run_writes_the_promised_file(tmp_path: Path) -> None:
     results = []
     for number in range(2):
         path = tmp_path / f"{number}.json"
-        arguments = ("catch_ball", "--mode", "lockstep", "--runs", "2", "--seed", "1", "--json", str(path))
+        arguments = (
+            "catch_ball",
+            "--mode",
+            "lockstep",
+            "--runs",
+            "2",
+            "--seed",
+            "1",
+            "--json",
+            str(path),
+        )
         done = petrobot("run", *arguments, "--quiet")
         assert done.returncode == 0, done.stderr
         results.append(json.loads(path.read_text(encoding="utf-8")))
-    for key in ("task", "mode", "seed", "regime", "runs", "caught", "throws", "wall_s", "sim_s", "firings"):
+    for key in (
+        "task",
+        "mode",
+        "seed",
+        "regime",
+        "runs",
+        "caught",
+        "throws",
+        "wall_s",
+        "sim_s",
+        "firings",
+    ):
         assert key in results[0]
-    assert all({"n", "speed", "caught", "miss_mm", "status"} <= set(throw) for throw in results[0]["throws"])
+    assert all(
+        {"n", "speed", "caught", "miss_mm", "status"} <= set(throw)
+        for throw in results[0]["throws"]
+    )
     assert len(results[0]["throws"]) == 2
     assert {**results[0], "wall_s": 0} == {**results[1], "wall_s": 0}
 
 
 PRESSING = """\
-from services.action import error, success
+from petrobot.services.action import error, success
 
 async def work(ctx, *, force=1.0):
     return success() if force < 5.0 else error("too_strong")
@@ -253,17 +385,22 @@ async def recover(ctx):
 def test_a_run_that_was_given_up_says_why(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An argument of a wrong type: its action, node and text stand in the terminal and in the JSON, and how to keep more."""
-    from coordinator.cli.new import TASK
+    """An argument of a wrong type: its action, node and text stand in the terminal and in the JSON,
+    and how to keep more."""
+    from petrobot.coordinator.cli.new import TASK
 
     monkeypatch.chdir(tmp_path)
-    broken = TASK.replace("{name}", "broken").replace("[places.work]", '[places.work]\nargs = { force = "x" }')
+    broken = TASK.replace("{name}", "broken").replace(
+        "[places.work]", '[places.work]\nargs = { force = "x" }'
+    )
     Path("pressing.py").write_text(PRESSING, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     Path("broken.toml").write_text(broken, encoding="utf-8")
     node = 'schema = 1\n[nodes.robot]\nhost = "127.0.0.1"\nport = 7399\n'
     action = '[actions.{0}]\nrun = "pressing:{0}"\ntask = "{0}"\nnode = "robot"\n'
-    Path("services.toml").write_text(node + action.format("work") + action.format("recover"), encoding="utf-8")
+    Path("services.toml").write_text(
+        node + action.format("work") + action.format("recover"), encoding="utf-8"
+    )
     assert main(["run", "broken.toml", "--mode", "lockstep", "--json", "out.json"]) == 1
     said = capsys.readouterr()
     work, recover = json.loads(Path("out.json").read_text(encoding="utf-8"))["last_errors"]
@@ -278,9 +415,11 @@ def test_a_run_that_was_given_up_says_why(
     assert "--journal" in said.err
 
 
-def test_a_task_of_ones_own_comes_before_a_shipped_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_task_of_ones_own_comes_before_a_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What the page saved under `tasks` is found by its bare name."""
-    from coordinator.cli.loading import SHIPPED, task_path
+    from petrobot.coordinator.cli.loading import SHIPPED, task_path
 
     monkeypatch.chdir(tmp_path)
     assert task_path("catch_ball") == SHIPPED / "catch_ball.toml"
@@ -289,32 +428,43 @@ def test_a_task_of_ones_own_comes_before_a_shipped_one(tmp_path: Path, monkeypat
     assert task_path("catch_ball") == Path("tasks/catch_ball.toml")
 
 
-def test_a_task_may_name_its_own_location_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """`services` of the task file is found from anywhere and gives way to --services; it survives writing and reading."""
-    from coordinator.cli.loading import SHIPPED, cell_path
-    from coordinator.taskfile import dumps, load, loads
+def test_a_task_may_name_its_own_location_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """`services` of the task file is found from anywhere and gives way to --services; it survives
+    writing and reading."""
+    from petrobot.coordinator.cli.loading import SHIPPED, cell_path
+    from petrobot.coordinator.taskfile import dumps, load, loads
 
     monkeypatch.chdir(tmp_path)
     task = load(SHIPPED / "follow_track.toml")
     assert loads(dumps(task)).services == task.services != ""
-    assert cell_path(None, "follow_track", task).resolve() == ROOT / "services" / "mobile" / "track.services.toml"
+    assert (
+        cell_path(None, "follow_track", task).resolve()
+        == ROOT / "services" / "mobile" / "track.services.toml"
+    )
     assert cell_path(Path("mine.toml"), "follow_track", task) == Path("mine.toml")
-    assert cell_path(None, "catch_ball", load(SHIPPED / "catch_ball.toml")) == ROOT / "services.toml"
+    assert (
+        cell_path(None, "catch_ball", load(SHIPPED / "catch_ball.toml")) == ROOT / "services.toml"
+    )
     assert main(["check", "follow_track"]) == 0
 
 
 def test_a_task_may_draw_its_own_pictures() -> None:
-    """`pictures` of the task file names a function that draws a result for the report; a name that leads nowhere is told."""
+    """`pictures` of the task file names a function that draws a result for the report; a name that
+    leads nowhere is told."""
     from dataclasses import replace
 
-    from coordinator.cli import CommandError
-    from coordinator.cli.loading import SHIPPED, pictures_of
-    from coordinator.taskfile import load
+    from petrobot.coordinator.cli import CommandError
+    from petrobot.coordinator.cli.loading import SHIPPED, pictures_of
+    from petrobot.coordinator.taskfile import load
 
     task = load(SHIPPED / "follow_track.toml")
     assert pictures_of(task, {"task": "follow_track"}) == {}, "nothing was scored"
     assert pictures_of(load(SHIPPED / "catch_ball.toml"), {}) == {}
-    assert list(pictures_of(replace(task, pictures="builtins:dict"), {"plan": "<svg/>"})) == ["plan"]
+    assert list(pictures_of(replace(task, pictures="builtins:dict"), {"plan": "<svg/>"})) == [
+        "plan"
+    ]
     for wrong in ("nowhere:draw", "coordinator:nothing"):
         with pytest.raises(CommandError, match="name a function"):
             pictures_of(replace(task, pictures=wrong), {})

@@ -1,5 +1,5 @@
-"""Every command that writes files, on a disk that is full and on one that is read-only: one line that says what, where and what to
-do, exit code 2, and no file that is empty or half written."""
+"""Every command that writes files, on a disk that is full and on one that is read-only: one line
+that says what, where and what to do, exit code 2, and no file that is empty or half written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.record.runfolder import RESULT
+from petrobot.coordinator.record.runfolder import RESULT
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
@@ -47,7 +47,9 @@ def _mounts() -> bool:
     """Whether this machine lets us have a disk of our own."""
     asked = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
     try:
-        return subprocess.run(asked, capture_output=True, timeout=LIMIT, check=False).returncode == 0
+        return (
+            subprocess.run(asked, capture_output=True, timeout=LIMIT, check=False).returncode == 0
+        )
     except OSError:
         return False
 
@@ -81,5 +83,7 @@ def test_a_disk_that_cannot_be_written_is_told_in_one_line(disk: str, tmp_path: 
         assert "Traceback" not in outcome["said"], where
         assert outcome["code"] == 2 and len(told) == 1 and said[-1] == told[0], where
         assert name in told[0] and "; " in told[0], where
-        assert any(word in told[0] for word in ("No space left", "Read-only", "is full", "unable to open")), where
+        assert any(
+            word in told[0] for word in ("No space left", "Read-only", "is full", "unable to open")
+        ), where
         assert [path for path in outcome["left"] if not path.endswith(".log")] == [], where

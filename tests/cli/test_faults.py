@@ -1,4 +1,5 @@
-"""What commands say of bad input: the file, where there is one its line, the key, and the remedy; never an exception's name."""
+"""What commands say of bad input: the file, where there is one its line, the key, and the remedy;
+never an exception's name."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import COMMANDS, main
-from coordinator.cli.new import TASK
+from petrobot.coordinator.cli import COMMANDS, main
+from petrobot.coordinator.cli.new import TASK
 
 SHIPPED = str(Path(__file__).parents[2] / "services.toml")
 WORK = TASK.replace("{name}", "work")
@@ -18,21 +19,27 @@ schema = 1
 host = "127.0.0.1"
 port = 7399
 [actions.work]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "work"
 node = "robot"
 [actions.recover]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "recover"
 node = "robot"
 """
-NO_CELL = "astray.toml:5: task.services: no such file: no.toml; name one relative to astray.toml, drop the key, or give --services"
+NO_CELL = (
+    "astray.toml:5: task.services: no such file: no.toml; name one relative to "
+    "astray.toml, drop the key, or give --services"
+)
 Petrobot = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def petrobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Petrobot:
-    """Runs a command where work.toml, services.toml and other files lie; gives code, standard output and errors."""
+def petrobot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Petrobot:
+    """Runs a command where work.toml, services.toml and other files lie; gives code, standard
+    output and errors."""
     monkeypatch.chdir(tmp_path)
     files: dict[str, str | bytes] = {
         "work.toml": WORK,
@@ -85,19 +92,41 @@ def petrobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
             "run work.toml --mode lockstep --mock mock.toml",
             "mock.toml:4: actions.recovre: services.toml has no such action",
         ),
-        ("check work.toml --services no.toml", "no.toml: No such file or directory; give --services a location file"),
-        ("campaign work.toml --mock no.toml", "no.toml: No such file or directory; give --mock a file of scripted"),
-        ("campaign work.toml --mock mock.toml", "(did you mean 'recover'?); name one of its actions, or drop it here"),
+        (
+            "check work.toml --services no.toml",
+            "no.toml: No such file or directory; give --services a location file",
+        ),
+        (
+            "campaign work.toml --mock no.toml",
+            "no.toml: No such file or directory; give --mock a file of scripted",
+        ),
+        (
+            "campaign work.toml --mock mock.toml",
+            "(did you mean 'recover'?); name one of its actions, or drop it here",
+        ),
         (
             "forecast --compare a b",
-            "a is no forecast: No such file or directory; give a file that `petrobot forecast --out",
+            "a is no forecast: No such file or directory; give a file that `petrobot "
+            "forecast --out",
         ),
         ("forecast --compare work.toml b", "work.toml is no forecast: it is no JSON"),
-        ("forecast --compare list.json b", "list.json is no forecast: a table with schema and sha256 is missing"),
+        (
+            "forecast --compare list.json b",
+            "list.json is no forecast: a table with schema and sha256 is missing",
+        ),
         ("forecast work.toml --estimates .", "campaign.json: the key 'regimes' is missing"),
-        ("campaign work.toml --learned nope", "no finished campaign: No such file or directory; give the folder of"),
-        ("campaign work.toml --learned .", "result.json: no result of a campaign: selector and policy are missing"),
-        ("campaign --resume work.toml", "work.toml holds no campaign: campaign.json is missing; give a folder that"),
+        (
+            "campaign work.toml --learned nope",
+            "no finished campaign: No such file or directory; give the folder of",
+        ),
+        (
+            "campaign work.toml --learned .",
+            "result.json: no result of a campaign: selector and policy are missing",
+        ),
+        (
+            "campaign --resume work.toml",
+            "work.toml holds no campaign: campaign.json is missing; give a folder that",
+        ),
     ],
 )
 def test_bad_input_names_file_key_and_remedy(command: str, said: str, petrobot: Petrobot) -> None:
@@ -120,12 +149,14 @@ def test_a_cell_that_was_not_given_is_named(petrobot: Petrobot) -> None:
 
 def test_an_action_that_translates_another_task_is_told(petrobot: Petrobot) -> None:
     """It may run all the same."""
-    Path("services.toml").write_text(CELL.replace('task = "work"', 'task = "wrok"'), encoding="utf-8")
+    Path("services.toml").write_text(
+        CELL.replace('task = "work"', 'task = "wrok"'), encoding="utf-8"
+    )
     code, out, _ = petrobot("check", "work.toml")
     assert code == 0
     assert (
-        "warning work.toml:13: primitive_tasks.work.alternatives: services.toml says that the action 'work' translates 'wrok'"
-        in out
+        "warning work.toml:13: primitive_tasks.work.alternatives: services.toml says that "
+        "the action 'work' translates 'wrok'" in out
     )
     assert "write task = 'work' in its [actions.work]" in out
 
@@ -139,9 +170,11 @@ def test_check_does_not_promise_what_analyse_does_not_do(petrobot: Petrobot) -> 
     assert "cut short (it has no end: the net is unbounded)" in out and "goes on longer" not in out
 
 
-def test_a_search_that_was_cut_short_may_go_on(petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_that_was_cut_short_may_go_on(
+    petrobot: Petrobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where a limit ended it, `analyse` has a larger one."""
-    monkeypatch.setattr("coordinator.cli.check.MOST_STATES", 4)
+    monkeypatch.setattr("petrobot.coordinator.cli.check.MOST_STATES", 4)
     out = petrobot("check", "work.toml")[1]
     assert "petrobot analyse goes on longer" in out
 
@@ -158,4 +191,7 @@ def test_exit_codes_are_told(petrobot: Petrobot) -> None:
     code, out, _ = petrobot("--help")
     assert code == 0
     told = out.partition("exit codes:")[2]
-    assert all(word in told for word in ("analyse refuses", "forecast disagrees", "operator's command", "3 a node"))
+    assert all(
+        word in told
+        for word in ("analyse refuses", "forecast disagrees", "operator's command", "3 a node")
+    )

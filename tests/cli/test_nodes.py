@@ -1,4 +1,5 @@
-"""`petrobot nodes` and `estop` against a node with a device and actions that need none: what is called a device, and how it is."""
+"""`petrobot nodes` and `estop` against a node with a device and actions that need none: what is
+called a device, and how it is."""
 
 from __future__ import annotations
 
@@ -11,10 +12,10 @@ from typing import Any
 import pytest
 import pytest_asyncio
 
-from coordinator.cli import main
-from services.comm.directory import Directory
-from services.node import GENERAL, Node
-from services.place import InlinePlace
+from petrobot.coordinator.cli import main
+from petrobot.services.comm.directory import Directory
+from petrobot.services.node import GENERAL, Node
+from petrobot.services.place import InlinePlace
 from tests.cli.cell import Arm, directory_in
 from tests.in_loop import NodeInLoop
 
@@ -29,7 +30,9 @@ async def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
     clock = asyncio.get_running_loop().time
     arm = InlinePlace(directory.actions, clock=clock, driver=Arm({}, None))
     places = {"arm": arm, GENERAL: InlinePlace(directory.actions, clock=clock)}
-    node = NodeInLoop(Node(directory, "robot", boot="b1", clock=clock, places=places), directory.address("robot"))
+    node = NodeInLoop(
+        Node(directory, "robot", boot="b1", clock=clock, places=places), directory.address("robot")
+    )
     await node.start()
     yield directory
     await node.close()
@@ -43,11 +46,15 @@ async def said(directory: Directory, capsys: pytest.CaptureFixture[str], *comman
     return capsys.readouterr().out
 
 
-async def test_a_node_is_no_device_of_its_own(directory: Directory, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_a_node_is_no_device_of_its_own(
+    directory: Directory, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its actions without a device answer under its name; a table of devices leaves that out."""
     stopped = json.loads(await said(directory, capsys, "estop", "--json", "-"))
     assert stopped["nodes"][0]["devices"] == {"arm": "stopped"}
-    status: dict[str, Any] = json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]["status"]
+    status: dict[str, Any] = json.loads(await said(directory, capsys, "nodes", "--json", "-"))[
+        "robot"
+    ]["status"]
     assert set(status["devices"]) == set(status["answers"]) == {"arm"}
     assert status["general"]["runs"] == []
 
@@ -57,10 +64,14 @@ async def test_stopped_devices_are_shown_until_they_are_cleared(
 ) -> None:
     """In the table with the remedy, and as data."""
     assert "stopped" not in await said(directory, capsys, "nodes")
-    assert "stopped" not in json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]
+    assert (
+        "stopped" not in json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]
+    )
     await said(directory, capsys, "estop")
     assert STOPPED in await said(directory, capsys, "nodes")
-    assert json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"]["stopped"] == ["arm"]
+    assert json.loads(await said(directory, capsys, "nodes", "--json", "-"))["robot"][
+        "stopped"
+    ] == ["arm"]
     await said(directory, capsys, "estop", "--clear")
     assert "stopped" not in await said(directory, capsys, "nodes")
 

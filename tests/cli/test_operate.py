@@ -1,4 +1,5 @@
-"""The operator's commands against a mission run that goes on: what they change, what they answer, and whom they refuse."""
+"""The operator's commands against a mission run that goes on: what they change, what they answer,
+and whom they refuse."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import COMMANDS, main
-from coordinator.engine import Mode
-from coordinator.hmi import house
-from coordinator.operator.door_file import DOOR, Door, door_open, find_door
-from coordinator.record.runfolder import JOURNAL, NoRunError
+from petrobot.coordinator.cli import COMMANDS, main
+from petrobot.coordinator.engine import Mode
+from petrobot.coordinator.hmi import house
+from petrobot.coordinator.operator.door_file import DOOR, Door, door_open, find_door
+from petrobot.coordinator.record.runfolder import JOURNAL, NoRunError
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 
@@ -131,7 +132,8 @@ async def test_abort_ends_the_run_in_error(petrobot: Terminal) -> None:
 
 
 async def test_emergency_stop_stops_latches_and_ends_the_run(petrobot: Terminal) -> None:
-    """The arm stops at once and obeys nobody until it is cleared, not even the task's own recovery."""
+    """The arm stops at once and obeys nobody until it is cleared, not even the task's own
+    recovery."""
     await petrobot.working()
     said = await petrobot("estop", "--json", "-")
     assert said.code == 0, said.err
@@ -169,7 +171,7 @@ async def test_one_operator_holds_the_controls(petrobot: Terminal) -> None:
 
 async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> None:
     """`--take` waits until the holder releases them to whoever asks."""
-    from coordinator.cli.operate.hand import connect
+    from petrobot.coordinator.cli.operate.hand import connect
 
     async with connect(find_door(folder=petrobot.runs), "ana") as ana:
         assert (await ana.command("take_controls"))["ok"]
@@ -182,7 +184,9 @@ async def test_controls_are_asked_for_and_handed_over(petrobot: Terminal) -> Non
         assert refused["code"] == "not_holder"
 
 
-async def test_controls_of_a_script_go_free(petrobot: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_controls_of_a_script_go_free(
+    petrobot: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One that took them over plain HTTP and is not heard of again."""
     import aiohttp
 
@@ -238,9 +242,17 @@ async def test_bad_input_is_exit_code_2_and_names_the_remedy(
 
 
 @pytest.mark.parametrize("name", STEERING)
-def test_without_a_run_every_command_says_so(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_run_every_command_says_so(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """One clear line and exit code 2."""
-    arguments = {"break": ["x"], "token": ["p", "+1"], "raise": ["e"], "force": ["p", "t"], "override": ["t", "a"]}
+    arguments = {
+        "break": ["x"],
+        "token": ["p", "+1"],
+        "raise": ["e"],
+        "force": ["p", "t"],
+        "override": ["t", "a"],
+    }
     assert main([name, *arguments.get(name, []), "--journal", str(tmp_path)]) == 2
     assert "goes on; begin one with `petrobot run`" in capsys.readouterr().err
 

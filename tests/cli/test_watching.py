@@ -1,4 +1,5 @@
-"""What operators see beside the net: pictures, devices and set points of nodes, only while somebody looks."""
+"""What operators see beside the net: pictures, devices and set points of nodes, only while somebody
+looks."""
 
 from __future__ import annotations
 
@@ -23,16 +24,24 @@ def verbs(terminal: Terminal) -> list[str]:
 
 
 async def test_pictures_and_states_come_while_somebody_looks(petrobot: Terminal) -> None:
-    """The newest picture as text that a page can show, joints and values of the device, the age of its set points."""
+    """The newest picture as text that a page can show, joints and values of the device, the age of
+    its set points."""
     petrobot.arm.sees, petrobot.arm.setpoint_age = b"not really a picture", 0.012
     feed = petrobot.operation.feed
     changes: list[dict[str, Any]] = []
     stop = petrobot.operation.subscribe(changes.append)
-    await petrobot.until(lambda: bool(feed.state["images"] and feed.state["setpoints"] and feed.state["devices"]))
+    await petrobot.until(
+        lambda: bool(feed.state["images"] and feed.state["setpoints"] and feed.state["devices"])
+    )
     stop()
     image = feed.state["images"]["arm"]
     assert b64decode(image["data"]) == petrobot.arm.sees
-    assert (image["mime"], image["width"], image["height"], image["age"]) == ("image/png", 2, 1, 0.5)
+    assert (image["mime"], image["width"], image["height"], image["age"]) == (
+        "image/png",
+        2,
+        1,
+        0.5,
+    )
     assert feed.state["devices"]["arm"]["joints"] == [0.0, 1.5]
     (time, age), *_ = feed.state["setpoints"]["way"]["samples"]
     assert age == 0.012 and time > 0.0
@@ -52,11 +61,14 @@ async def test_nobody_looks_nothing_is_asked(petrobot: Terminal) -> None:
 
 
 async def test_old_set_points_are_none(petrobot: Terminal) -> None:
-    """A stream that nobody sends is not shown as one that grows older and older; a device that sees nothing shows nothing."""
+    """A stream that nobody sends is not shown as one that grows older and older; a device that sees
+    nothing shows nothing."""
     petrobot.arm.setpoint_age = 3.0
     stop = petrobot.operation.subscribe(lambda change: None)
     feed = petrobot.operation.feed
-    await petrobot.until(lambda: feed.state["devices"].get("arm", {}).get("values", {}).get("setpoint_age") == 3.0)
+    await petrobot.until(
+        lambda: feed.state["devices"].get("arm", {}).get("values", {}).get("setpoint_age") == 3.0
+    )
     asked = verbs(petrobot)
     await petrobot.until(lambda: asked.count("picture") >= 2)
     stop()

@@ -9,10 +9,10 @@ from typing import Any, get_args
 import pytest
 from hypothesis import strategies as st
 
-from services.comm.codec import LIMITS
-from services.comm.link import Limits
-from services.comm.messages import Executed, Hello, Message, Tick, Welcome
-from services.comm.wire import Connection, Side
+from petrobot.services.comm.codec import LIMITS
+from petrobot.services.comm.link import Limits
+from petrobot.services.comm.messages import Executed, Hello, Message, Tick, Welcome
+from petrobot.services.comm.wire import Connection, Side
 from tests.waiting import Limit
 
 from .ends import Node
@@ -29,7 +29,9 @@ _plain = st.recursive(
     | st.floats(allow_nan=False)
     | st.text(max_size=10)
     | st.binary(max_size=10),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 _FIELDS: dict[str, st.SearchStrategy[Any]] = {
@@ -50,7 +52,12 @@ _FIELDS: dict[str, st.SearchStrategy[Any]] = {
 def messages_of(kinds: Iterable[type[Any]]) -> st.SearchStrategy[Any]:
     """Any message of these kinds."""
     return st.one_of(
-        [st.builds(cls, **{field.name: _FIELDS[str(field.type)] for field in dataclasses.fields(cls)}) for cls in kinds]
+        [
+            st.builds(
+                cls, **{field.name: _FIELDS[str(field.type)] for field in dataclasses.fields(cls)}
+            )
+            for cls in kinds
+        ]
     )
 
 
@@ -71,7 +78,8 @@ def plain_data() -> st.SearchStrategy[Any]:
 
 def new_pair(key: bytes | None) -> tuple[Connection, Connection]:
     client, server = (
-        Connection(side, SERVER, key=key, nonce=NONCES[side] if key else b"") for side in (Side.CLIENT, Side.SERVER)
+        Connection(side, SERVER, key=key, nonce=NONCES[side] if key else b"")
+        for side in (Side.CLIENT, Side.SERVER)
     )
     return client, server
 
@@ -93,7 +101,8 @@ def greet(client: Connection, server: Connection) -> bytes:
 
 @pytest.fixture
 def pair() -> Callable[[bytes | None], tuple[Connection, Connection]]:
-    """Makes a client's and a server's connection that have not spoken yet, with a key or without."""
+    """Makes a client's and a server's connection that have not spoken yet, with a key or
+    without."""
     return new_pair
 
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from services.comm import messages as m
-from services.comm.callee import Callee, Offer, Order
-from services.comm.caller import Caller, Notice
-from services.comm.client import Client
-from services.comm.codec import encode
-from services.comm.link import Link, Timing
-from services.comm.server import Server
-from services.comm.wire import Connection, Side
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, Offer, Order
+from petrobot.services.comm.caller import Caller, Notice
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.codec import encode
+from petrobot.services.comm.link import Link, Timing
+from petrobot.services.comm.server import Server
+from petrobot.services.comm.wire import Connection, Side
 
 QUICK = Timing(heartbeat=0.05, silence=0.2, handshake=0.3, backoff=(0.01, 0.05))
 HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 1)
@@ -30,7 +30,9 @@ def _echo(now: float, call: m.Call) -> m.Outcome:
 def _callee(name: str = "motion") -> Callee:
     offers = {
         "echo": Offer(inline=_echo),
-        "big": Offer(inline=lambda now, call: m.Outcome(call.id, "success", {"b": bytes(17 << 20)})),
+        "big": Offer(
+            inline=lambda now, call: m.Outcome(call.id, "success", {"b": bytes(17 << 20)})
+        ),
         "move": Offer(device="arm", orphan_time=0.1),
     }
     return Callee(name, "n1", offers)
@@ -67,7 +69,9 @@ class Coordinator:
         self.notices: list[Notice] = []
         self.told = asyncio.Event()
         self.caller = Caller("motion", hello)
-        self.client = Client(host, port, self.caller, on_notices=self._take, **{"timing": QUICK, **options})
+        self.client = Client(
+            host, port, self.caller, on_notices=self._take, **{"timing": QUICK, **options}
+        )
         self.client.start()
 
     def _take(self, now: float, notices: list[Notice]) -> None:
@@ -77,7 +81,10 @@ class Coordinator:
     async def notice(self, kind: type[Any], number: int = 1) -> Any:
         """The so-manieth notice of this kind."""
         async with asyncio.timeout(60.0):
-            while len(found := [notice for notice in self.notices if isinstance(notice, kind)]) < number:
+            while (
+                len(found := [notice for notice in self.notices if isinstance(notice, kind)])
+                < number
+            ):
                 self.told.clear()
                 await self.told.wait()
         return found[number - 1]
@@ -88,7 +95,8 @@ class Coordinator:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Wait until it holds: looked at again whenever a server, a client or a heart has done something."""
+    """Wait until it holds: looked at again whenever a server, a client or a heart has done
+    something."""
     stirred = asyncio.Event()
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in ((Server, "arm"), (Server, "gone"), (Client, "flush"), (Link, "_beat")):
@@ -109,7 +117,8 @@ def _and_then(method: Callable[..., Any], do: Callable[[], None]) -> Callable[..
 
 
 def frame(message: m.Message, server: str = "motion") -> bytes:
-    """A message as it goes over the wire to `server` without a key: HELLO of the opening, all others of an open connection."""
+    """A message as it goes over the wire to `server` without a key: HELLO of the opening, all
+    others of an open connection."""
     if isinstance(message, m.Hello):
         return Connection(Side.CLIENT, server).send(message)
     return framed(encode(message))

@@ -1,4 +1,5 @@
-"""Other processes that are killed, frozen or cut off: a node, a sender of set points, and the cable between.
+"""Other processes that are killed, frozen or cut off: a node, a sender of set points, and the cable
+between.
 
 python -m tests.comm.fault_parts node [PORT BOOT]      # prints its port
 python -m tests.comm.fault_parts sender PORT PERIOD
@@ -20,9 +21,9 @@ from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 
-from services.comm.callee import Callee, CancelRun, Offer, Order
-from services.comm.server import Server
-from services.comm.stream import StreamSender
+from petrobot.services.comm.callee import Callee, CancelRun, Offer, Order
+from petrobot.services.comm.server import Server
+from petrobot.services.comm.stream import StreamSender
 
 HOST = "127.0.0.1"
 ROOT = Path(__file__).parents[2]
@@ -142,7 +143,8 @@ async def be_node(port: int, boot: str) -> None:
 
 
 def be_sender(port: int, period: float) -> None:
-    """Sends one set point a period by absolute deadline, and stands by it: the number of periods since the beginning."""
+    """Sends one set point a period by absolute deadline, and stands by it: the number of periods
+    since the beginning."""
     sender = StreamSender("vision", STREAM, period, HOST, port, receiver="motion")
     due, number = time.monotonic(), 0
     while True:

@@ -1,6 +1,8 @@
-"""A client of the node protocol that knows nothing but docs/protocol.md: sockets and the standard library, no line of services.
+"""A client of the node protocol that knows nothing but docs/protocol.md: sockets and the standard
+library, no line of services.
 
-Its msgpack is its own, too (https://github.com/msgpack/msgpack/blob/master/spec.md): what it needs of it, written out.
+Its msgpack is its own, too (https://github.com/msgpack/msgpack/blob/master/spec.md): what it needs
+of it, written out.
 """
 
 from __future__ import annotations
@@ -17,8 +19,23 @@ from typing import Any
 
 from tests.waiting import Limit
 
-HELLO, WELCOME, REFUSE, CALL, ACCEPT, FEEDBACK, RESULT, RESULT_ACK, CANCEL, EVENT, EVENT_ACK, SUBSCRIBE = range(1, 13)
-COMMAND, ANSWER, PING, PONG, TICK, BYE, CHALLENGE, PROOF, STREAM_OPEN, SET_POINT, WITHDRAW = range(13, 24)
+(
+    HELLO,
+    WELCOME,
+    REFUSE,
+    CALL,
+    ACCEPT,
+    FEEDBACK,
+    RESULT,
+    RESULT_ACK,
+    CANCEL,
+    EVENT,
+    EVENT_ACK,
+    SUBSCRIBE,
+) = range(1, 13)
+COMMAND, ANSWER, PING, PONG, TICK, BYE, CHALLENGE, PROOF, STREAM_OPEN, SET_POINT, WITHDRAW = range(
+    13, 24
+)
 LIMIT = 60.0
 """Seconds that anything may take."""
 
@@ -33,20 +50,35 @@ def pack(value: Any) -> bytes:
         return bytes([value]) if 0 <= value < 128 else b"\xcf" + struct.pack(">Q", value)
     if isinstance(value, str):
         text = value.encode()
-        return (bytes([0xA0 | len(text)]) if len(text) < 32 else b"\xdb" + struct.pack(">I", len(text))) + text
+        return (
+            bytes([0xA0 | len(text)]) if len(text) < 32 else b"\xdb" + struct.pack(">I", len(text))
+        ) + text
     if isinstance(value, bytes):
         return b"\xc6" + struct.pack(">I", len(value)) + value
     if isinstance(value, Mapping):
         pairs = b"".join(pack(key) + pack(item) for key, item in value.items())
-        return (bytes([0x80 | len(value)]) if len(value) < 16 else b"\xdf" + struct.pack(">I", len(value))) + pairs
+        return (
+            bytes([0x80 | len(value)])
+            if len(value) < 16
+            else b"\xdf" + struct.pack(">I", len(value))
+        ) + pairs
     items = b"".join(pack(item) for item in value)
-    return (bytes([0x90 | len(value)]) if len(value) < 16 else b"\xdd" + struct.pack(">I", len(value))) + items
+    return (
+        bytes([0x90 | len(value)]) if len(value) < 16 else b"\xdd" + struct.pack(">I", len(value))
+    ) + items
 
 
 _NUMBERS = {
     0xCA: ">f", 0xCB: ">d", 0xCC: ">B", 0xCD: ">H", 0xCE: ">I", 0xCF: ">Q", 0xD0: ">b", 0xD1: ">h", 0xD2: ">i", 0xD3: ">q",
 }  # fmt: skip
-_SIZED = {0xC4: (1, "bin"), 0xC5: (2, "bin"), 0xC6: (4, "bin"), 0xD9: (1, "str"), 0xDA: (2, "str"), 0xDB: (4, "str")}
+_SIZED = {
+    0xC4: (1, "bin"),
+    0xC5: (2, "bin"),
+    0xC6: (4, "bin"),
+    0xD9: (1, "str"),
+    0xDA: (2, "str"),
+    0xDB: (4, "str"),
+}
 _SIZED |= {0xDC: (2, "array"), 0xDD: (4, "array"), 0xDE: (2, "map"), 0xDF: (4, "map")}
 
 
@@ -68,7 +100,11 @@ class Unpacking:
             return head if head < 0x80 else head - 256
         if head < 0xC0:
             kind, size = (
-                ("map", head & 15) if head < 0x90 else ("array", head & 15) if head < 0xA0 else ("str", head & 31)
+                ("map", head & 15)
+                if head < 0x90
+                else ("array", head & 15)
+                if head < 0xA0
+                else ("str", head & 31)
             )
             return self._sized(kind, size)
         if head in (0xC0, 0xC2, 0xC3):
@@ -154,12 +190,16 @@ class Foreign:
             assert end == struct.pack(">I", zlib.crc32(body))
         else:
             body, seal = body[:-16], body[-16:]
-            assert seal == hmac.digest(self.seal_in, struct.pack(">Q", self.heard) + body, "sha256")[:16]
+            assert (
+                seal
+                == hmac.digest(self.seal_in, struct.pack(">Q", self.heard) + body, "sha256")[:16]
+            )
             self.heard += 1
         return body
 
     def hear(self) -> list[Any]:
-        """The next message that is no heartbeat; a PING is answered as the page says. Raises TimeoutError."""
+        """The next message that is no heartbeat; a PING is answered as the page says. Raises
+        TimeoutError."""
         until = time.monotonic() + LIMIT
         while time.monotonic() < until:
             message = unpack(self.body())
@@ -205,7 +245,9 @@ class Foreign:
             return unpack(body)
         if self.key is None and body[1] == WELCOME:
             message = unpack(body)
-            assert message[7] == struct.pack(">I", zlib.crc32(hello + body[:-4])), "HELLO or WELCOME was changed"
+            assert message[7] == struct.pack(">I", zlib.crc32(hello + body[:-4])), (
+                "HELLO or WELCOME was changed"
+            )
             assert message[2] == node
             self.is_open = True
             return message
@@ -215,13 +257,17 @@ class Foreign:
         body = self.body()
         if body[1] == WELCOME:
             message = unpack(body)
-            assert message[7] == self._hmac(b"server\0" + transcript + body[:-32]), "the node does not know the key"
+            assert message[7] == self._hmac(b"server\0" + transcript + body[:-32]), (
+                "the node does not know the key"
+            )
             assert message[2] == node
             self.seal_out = self._hmac(b"client to server\0" + transcript)
             self.seal_in = self._hmac(b"server to client\0" + transcript)
             self.is_open = True
             return message
-        seal = hmac.digest(self._hmac(b"server to client\0" + transcript), bytes(8) + body[:-16], "sha256")[:16]
+        seal = hmac.digest(
+            self._hmac(b"server to client\0" + transcript), bytes(8) + body[:-16], "sha256"
+        )[:16]
         self.proven = body.endswith(seal)
         return unpack(body[:-16] if self.proven else body)
 

@@ -1,4 +1,5 @@
-"""Peers that do not behave, on real sockets: cut or refused, and good callers are served throughout."""
+"""Peers that do not behave, on real sockets: cut or refused, and good callers are served
+throughout."""
 
 from __future__ import annotations
 
@@ -9,11 +10,11 @@ import random
 
 import pytest
 
-from services.comm import messages as m
-from services.comm.caller import PeerLost
-from services.comm.codec import LIMITS
-from services.comm.link import Timing
-from services.comm.messages import Executed
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import PeerLost
+from petrobot.services.comm.codec import LIMITS
+from petrobot.services.comm.link import Timing
+from petrobot.services.comm.messages import Executed
 from tests.waiting import Limit
 
 from .ends import HELLO, Coordinator, Node, frame, read_all, until, welcome
@@ -45,7 +46,9 @@ async def test_a_node_that_is_silent_is_lost_at_once(open_node: Node) -> None:
     await server.wait_closed()
 
 
-@pytest.mark.parametrize("said", [b"", b"\x00", frame(HELLO)[:-1]], ids=["nothing", "a byte", "half a hello"])
+@pytest.mark.parametrize(
+    "said", [b"", b"\x00", frame(HELLO)[:-1]], ids=["nothing", "a byte", "half a hello"]
+)
 async def test_a_slow_handshake_is_cut(open_node: Node, said: bytes) -> None:
     reader, writer = await asyncio.open_connection(*open_node.server.address)
     writer.write(said)
@@ -81,7 +84,9 @@ async def test_one_that_does_not_read_is_cut_and_its_memory_given_back(open_node
 
 def _malformed(random_: random.Random) -> bytes:
     """A connection's worth of bytes that is no good."""
-    good = bytearray(frame(HELLO) if random_.random() < 0.5 else frame(m.Call("1", "echo", {"x": [1, 2]})))
+    good = bytearray(
+        frame(HELLO) if random_.random() < 0.5 else frame(m.Call("1", "echo", {"x": [1, 2]}))
+    )
     what = random_.randrange(6)
     if what == 0:
         return random_.randbytes(random_.randrange(1, 80))
@@ -138,7 +143,9 @@ async def _served_under_attack(frames: int) -> None:
     await coordinator.client.close()
     await node.server.close()
     gc.collect()
-    assert not [one for one in gc.get_objects() if type(one).__name__ == "_ServerLink"], "a connection was kept"
+    assert not [one for one in gc.get_objects() if type(one).__name__ == "_ServerLink"], (
+        "a connection was kept"
+    )
 
 
 async def test_malformed_frames_do_not_disturb_a_good_caller() -> None:

@@ -1,4 +1,5 @@
-"""The called end by itself: whom it welcomes, what it refuses, what it remembers, when it stops a run."""
+"""The called end by itself: whom it welcomes, what it refuses, what it remembers, when it stops a
+run."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.callee import Callee, CancelRun, Commanded, Keeping, Offer, StartRun
-from services.comm.messages import Executed
-from services.comm.results import FinishedIds
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, CancelRun, Commanded, Keeping, Offer, StartRun
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.results import FinishedIds
 
 COORD = m.Hello(2, 2, "coordinator", "coord", "c1", 3, "d1")
 
@@ -157,7 +158,11 @@ def test_an_id_of_another_caller_is_not_answered_with_his_result() -> None:
 def test_the_deadline_is_enforced_whatever_the_action_says(limited_by: str) -> None:
     callee = _callee()
     by_call = limited_by == "the call"
-    callee.receive(1.0, "coord", m.Call("1", "track" if by_call else "limited", {}, 2.0 if by_call else None, 3))
+    callee.receive(
+        1.0,
+        "coord",
+        m.Call("1", "track" if by_call else "limited", {}, 2.0 if by_call else None, 3),
+    )
     callee.orders()
     assert callee.due() == 3.0
     callee.advance(2.9)
@@ -208,7 +213,9 @@ def test_cancel_against_completion() -> None:
     callee.finish(0.2, "2", "error", cause="cancelled")
     assert _outcome(callee) == ("error", "cancelled", Executed.YES)
     callee.receive(0.3, "coord", m.Cancel("2", "again"))
-    assert _outcome(callee) == ("error", "cancelled", Executed.YES), "answered from the stored result"
+    assert _outcome(callee) == ("error", "cancelled", Executed.YES), (
+        "answered from the stored result"
+    )
 
 
 def test_a_cancel_that_overtakes_its_call_keeps_it_from_beginning() -> None:
@@ -251,7 +258,9 @@ def test_who_is_welcome(hello: m.Hello, code: str) -> None:
 def test_another_directory_may_be_allowed() -> None:
     callee = Callee("motion", "n1", OFFERS, directory="d1", any_directory=True)
     welcome = callee.link_up(0.0, "new", m.Hello(2, 2, "client", "new", "c", 0, "d2"))
-    assert isinstance(welcome, m.Welcome) and welcome.directory == "d1", "it still says which one it has"
+    assert isinstance(welcome, m.Welcome) and welcome.directory == "d1", (
+        "it still says which one it has"
+    )
 
 
 def test_a_caller_that_was_not_welcomed_runs_nothing() -> None:
@@ -282,7 +291,8 @@ def _called_and_acknowledged(callee: Callee, *ids: str) -> None:
 
 
 def test_ids_that_count_up_are_never_forgotten() -> None:
-    """Neither by number nor by age: a day and twice as many calls as an id was remembered for before."""
+    """Neither by number nor by age: a day and twice as many calls as an id was remembered for
+    before."""
     callee = _callee(keeping=Keeping(id_groups=100))
     _called_and_acknowledged(callee, *(f"m/work#{n}" for n in range(1, 400_000)))
     callee.advance(86_400.0)
@@ -301,17 +311,29 @@ def test_a_node_that_has_forgotten_ids_runs_no_call_that_may_be_among_them() -> 
         assert callee.answer_inline(0.0, "coord", again) is None
         for _ in range(2):  # and it is remembered that it was answered so
             callee.receive(0.0, "coord", again)
-            assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN) and callee.orders() == []
+            assert (
+                _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN)
+                and callee.orders() == []
+            )
     callee.receive(0.0, "coord", m.Call("work-3", "get", epoch=3))
     assert _outcome(callee)[0] == "success", "a first call is not among them"
     callee.receive(0.0, "coord", m.Cancel("work-1"))
-    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), "nothing is said not to have run"
+    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), (
+        "nothing is said not to have run"
+    )
     refused = m.Call("work-4", "move", epoch=2, again=True)
     callee.receive(0.0, "coord", refused)
-    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), "nor is it refused as not executed"
+    assert _outcome(callee) == ("error", "forgotten", Executed.UNKNOWN), (
+        "nor is it refused as not executed"
+    )
 
 
-@given(st.lists(st.tuples(st.sampled_from(["", "a", "a0", "a1", "#", "a/00"]), st.integers(0, 5_000)), max_size=60))
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["", "a", "a0", "a1", "#", "a/00"]), st.integers(0, 5_000)),
+        max_size=60,
+    )
+)
 def test_ids_in_groups_are_the_ids(ids: list[tuple[str, int]]) -> None:
     known, added = FinishedIds(1_000), set[str]()
     for text, number in ids:
@@ -320,7 +342,12 @@ def test_ids_in_groups_are_the_ids(ids: list[tuple[str, int]]) -> None:
             known.add(id_)
             added.add(id_)
     for text, number in ids:
-        for id_ in (f"{text}{number}", f"{text}{number + 1}", f"{text}0{number}", f"{text}{number + 4_096}"):
+        for id_ in (
+            f"{text}{number}",
+            f"{text}{number + 1}",
+            f"{text}0{number}",
+            f"{text}{number + 4_096}",
+        ):
             assert (id_ in known) == (id_ in added), id_
     assert known.complete
 
@@ -329,7 +356,11 @@ def test_what_cannot_be_sent_is_an_error_of_the_action() -> None:
     callee = _callee()
     callee.receive(0.0, "coord", m.Call("1", "track", epoch=3))
     outcome = callee.finish(1.0, "1", "success", {"image": object()})
-    assert (outcome.status, outcome.cause, outcome.executed) == ("error", "bad_result", Executed.YES)
+    assert (outcome.status, outcome.cause, outcome.executed) == (
+        "error",
+        "bad_result",
+        Executed.YES,
+    )
     assert "values.image" in outcome.text
 
 
@@ -350,7 +381,9 @@ def test_a_restarted_caller_counts_its_commands_anew() -> None:
     callee.orders()
     callee.answer(0.1, "k1", True, {"arm": "held"})
     callee.link_down(1.0, "coord")
-    assert isinstance(callee.link_up(2.0, "coord", m.Hello(2, 2, "coordinator", "coord", "c2", 4)), m.Welcome)
+    assert isinstance(
+        callee.link_up(2.0, "coord", m.Hello(2, 2, "coordinator", "coord", "c2", 4)), m.Welcome
+    )
     callee.messages()
     callee.receive(2.1, "coord", command)
     assert callee.orders() == [Commanded(command, "coord")] and callee.messages() == []
@@ -374,7 +407,11 @@ def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None
     assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.has_work
     callee.keep(1.0, "coord", outcome)
     assert callee.soonest == 1.0 + Keeping().results, "it is not kept for ever"
-    for call in (m.Call("1", "get", epoch=3), m.Call("2", "track", epoch=3), m.Call("3", "nowhere", epoch=3)):
+    for call in (
+        m.Call("1", "get", epoch=3),
+        m.Call("2", "track", epoch=3),
+        m.Call("3", "nowhere", epoch=3),
+    ):
         assert callee.answer_inline(2.0, "coord", call) is None
     assert callee.answer_inline(2.0, "coord", m.Call("4", "get", epoch=3, boot="n0")) is None
     callee.receive(2.0, "coord", m.Call("1", "get", epoch=3))
@@ -412,7 +449,9 @@ def test_the_deadline_of_a_held_run_stands_still(target: str) -> None:
     assert callee.orders() == [CancelRun("1", "deadline")]
 
 
-@pytest.mark.parametrize("answers", [{"arm": "cannot hold"}, {"camera": "held"}, {"motion": "held"}, {}])
+@pytest.mark.parametrize(
+    "answers", [{"arm": "cannot hold"}, {"camera": "held"}, {"motion": "held"}, {}]
+)
 def test_the_deadline_of_a_run_that_goes_on_is_kept_during_a_pause(answers: dict[str, str]) -> None:
     """A device that cannot hold, and a hold that another device answered."""
     callee = _callee(COORD)
@@ -464,14 +503,24 @@ def test_a_repeated_command_is_not_carried_out_again() -> None:
 
 
 def test_an_offer_for_some_roles_is_refused_to_others() -> None:
-    """Such as the ticket of a set-point stream: for nodes and coordinators, not for whoever may only look."""
-    offers = {"stream:points": Offer(inline=lambda _, call: m.Outcome(call.id, "success"), roles=frozenset(("node",)))}
+    """Such as the ticket of a set-point stream: for nodes and coordinators, not for whoever may
+    only look."""
+    offers = {
+        "stream:points": Offer(
+            inline=lambda _, call: m.Outcome(call.id, "success"), roles=frozenset(("node",))
+        )
+    }
     callee = Callee("motion", "n1", offers)
     for role, cause in (("client", "not_for_role"), ("stream", "not_for_role"), ("node", "")):
         callee.link_up(0.0, role, m.Hello(2, 2, role, role, "b"))
         callee.messages()
-        assert (callee.answer_inline(0.0, role, m.Call(f"{role}/1", "stream:points")) is None) is bool(cause)
+        assert (
+            callee.answer_inline(0.0, role, m.Call(f"{role}/1", "stream:points")) is None
+        ) is bool(cause)
         callee.receive(0.0, role, m.Call(f"{role}/2", "stream:points"))
         [(_, outcome)] = callee.messages()
         assert isinstance(outcome, m.Outcome)
-        assert (outcome.cause, outcome.executed) == (cause, m.Executed.NO if cause else m.Executed.YES)
+        assert (outcome.cause, outcome.executed) == (
+            cause,
+            m.Executed.NO if cause else m.Executed.YES,
+        )

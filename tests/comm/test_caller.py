@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from services.comm import messages as m
-from services.comm.caller import (
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import (
     Accepted,
     Answered,
     Caller,
@@ -19,9 +19,9 @@ from services.comm.caller import (
     PeerLost,
     Progress,
 )
-from services.comm.codec import LIMITS, encode
-from services.comm.messages import Executed
-from services.comm.plain import NotPlainError
+from petrobot.services.comm.codec import LIMITS, encode
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.plain import NotPlainError
 
 
 class _Waiter:
@@ -105,7 +105,9 @@ def test_a_repeated_result_is_acknowledged_again_and_told_once() -> None:
 
 
 @pytest.mark.parametrize("owns_boot", [False, True], ids=["any boot", "a boot of before"])
-def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_before(owns_boot: bool) -> None:
+def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_before(
+    owns_boot: bool,
+) -> None:
     call = m.Call("1", "move", boot="n0" if owns_boot else "")
     executed = Executed.UNKNOWN if owns_boot else Executed.NO
     away = _caller(up=False)
@@ -125,7 +127,8 @@ def test_a_call_that_never_leaves_was_not_executed_unless_it_may_have_left_befor
 
 @pytest.mark.parametrize("refused", [False, True], ids=["not there", "refuses"])
 def test_who_tries_again_at_once_waits_a_little(refused: bool) -> None:
-    """A task that repeats what failed must not go round as fast as the machine can: two calls end in each tenth of a second."""
+    """A task that repeats what failed must not go round as fast as the machine can: two calls end
+    in each tenth of a second."""
     caller, cause = _caller(up=False), "refused" if refused else "unreachable"
     if refused:
         caller.link_refused(0.0, m.Refuse("keys", "copy the key"))
@@ -242,7 +245,9 @@ def test_a_cancelled_call_that_never_ends_is_given_up() -> None:
     caller.receive(0.1, m.Accept("1"))
     caller.cancel(1.0, "1", "not wanted")
     caller.cancel(1.1, "1", "again")
-    assert [one for one in caller.messages(1.1) if isinstance(one, m.Cancel)] == [m.Cancel("1", "not wanted")]
+    assert [one for one in caller.messages(1.1) if isinstance(one, m.Cancel)] == [
+        m.Cancel("1", "not wanted")
+    ]
     caller.notices()
     caller.advance(6.0)
     assert _ends(caller.notices()) == [("1", "no_answer", Executed.UNKNOWN)]
@@ -259,7 +264,9 @@ def test_quick_calls_leave_nothing_behind() -> None:
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_the_same(lost: bool) -> None:
+def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_the_same(
+    lost: bool,
+) -> None:
     caller, waiter = _caller(), _Waiter(enough=True)
     caller.begin(0.0, "1", "get", {}, waiter=waiter)
     if lost:
@@ -300,7 +307,8 @@ def test_the_owner_says_how_long_stopping_may_take() -> None:
 
 @pytest.mark.parametrize("cancelled", [False, True])
 def test_a_held_run_is_not_waited_for_until_it_goes_on_or_is_cancelled(cancelled: bool) -> None:
-    """A deadline of 2 s and 5 s of patience, held from 1 s to 11 s: given up at 17 s; cancelled at 11 s: at 16 s."""
+    """A deadline of 2 s and 5 s of patience, held from 1 s to 11 s: given up at 17 s; cancelled at
+    11 s: at 16 s."""
     caller = _caller()
     caller.call(0.0, CALL)
     caller.receive(0.1, m.Accept("1"))
@@ -330,7 +338,9 @@ def test_a_call_cancelled_before_it_leaves_ends_at_once() -> None:
     assert caller.messages(0.2) == []
 
 
-def test_a_call_of_before_a_restart_is_cancelled_on_the_node_although_it_was_not_sent_again_yet() -> None:
+def test_a_call_of_before_a_restart_is_cancelled_on_the_node_although_it_was_not_sent_again_yet() -> (
+    None
+):
     caller = _caller(up=False)
     caller.connecting(0.0)
     caller.call(0.0, m.Call("1", "move", boot="n1"))
@@ -357,7 +367,10 @@ def test_after_a_restart_the_owner_settles_what_the_node_still_keeps() -> None:
     caller = _caller()
     caller.acknowledge(0.0, "done before")
     caller.disown(0.0, "given up before")
-    assert set(caller.messages()) == {m.ResultAck("done before"), m.Cancel("given up before", "disowned")}
+    assert set(caller.messages()) == {
+        m.ResultAck("done before"),
+        m.Cancel("given up before", "disowned"),
+    }
 
 
 def test_the_children_of_a_call_are_cancelled_with_it() -> None:
@@ -366,7 +379,10 @@ def test_the_children_of_a_call_are_cancelled_with_it() -> None:
         caller.call(0.0, m.Call(id_, "move", parent=parent))
     caller.messages(0.0)
     caller.cancel_children(0.1, "p", "its parent is over")
-    assert caller.messages(0.1) == [m.Cancel("1", "its parent is over"), m.Cancel("3", "its parent is over")]
+    assert caller.messages(0.1) == [
+        m.Cancel("1", "its parent is over"),
+        m.Cancel("3", "its parent is over"),
+    ]
 
 
 def test_commands_are_answered_come_what_may() -> None:
@@ -378,16 +394,23 @@ def test_commands_are_answered_come_what_may() -> None:
     assert caller.notices() == [Answered(m.Answer("a", True, {"arm": "held"}))]
     assert caller.due() == 2.0
     caller.advance(2.0)
-    assert caller.notices() == [Answered(m.Answer(id_, False, {"cause": "no_answer"})) for id_ in "bc"]
+    assert caller.notices() == [
+        Answered(m.Answer(id_, False, {"cause": "no_answer"})) for id_ in "bc"
+    ]
     caller.command(3.0, m.Command("d", "hold"))
     caller.link_down(3.1, "cut")
     caller.command(3.2, m.Command("e", "hold"))
     answers = [notice.answer for notice in caller.notices() if isinstance(notice, Answered)]
-    assert answers == [m.Answer("d", False, {"cause": "lost"}), m.Answer("e", False, {"cause": "unreachable"})]
+    assert answers == [
+        m.Answer("d", False, {"cause": "lost"}),
+        m.Answer("e", False, {"cause": "unreachable"}),
+    ]
 
 
 @pytest.mark.parametrize("auto_ack", [True, False])
-def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe(auto_ack: bool) -> None:
+def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe(
+    auto_ack: bool,
+) -> None:
     caller = _caller(auto_ack=auto_ack)
     events = [m.Event("caught", "barrier", n) for n in (1, 2, 2, 1)]
     for event in events:
@@ -398,7 +421,9 @@ def test_each_event_of_a_source_arrives_once_and_is_acknowledged_when_it_is_safe
         caller.acknowledge_event(0.1, events[1])
         assert caller.messages() == [m.EventAck("barrier", 2)]
         caller.receive(0.2, events[0])
-        assert caller.messages() == [m.EventAck("barrier", 1)], "its acknowledgement was lost: again"
+        assert caller.messages() == [m.EventAck("barrier", 1)], (
+            "its acknowledgement was lost: again"
+        )
     else:
         assert set(caller.messages()) == {m.EventAck("barrier", 1), m.EventAck("barrier", 2)}
     caller.link_up(1.0, _welcome("n2"))

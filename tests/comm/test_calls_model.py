@@ -1,4 +1,5 @@
-"""Caller and callee over a link that loses, repeats and delays, with reboots of both: at most once, and every call ends."""
+"""Caller and callee over a link that loses, repeats and delays, with reboots of both: at most once,
+and every call ends."""
 
 from __future__ import annotations
 
@@ -10,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.callee import Callee, CancelRun, Keeping, Offer, StartRun
-from services.comm.caller import Caller, Ended, Late, PeerBack
-from services.comm.messages import Executed
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, CancelRun, Keeping, Offer, StartRun
+from petrobot.services.comm.caller import Caller, Ended, Late, PeerBack
+from petrobot.services.comm.messages import Executed
 
 COORD = "coord"
 DEVICES = 2
@@ -27,7 +28,8 @@ class Run:
 
 @dataclass
 class World:
-    """A coordinator that writes down what it did, a node that runs what it is ordered to, and a link between them."""
+    """A coordinator that writes down what it did, a node that runs what it is ordered to, and a
+    link between them."""
 
     now: float = 0.0
     epoch: int = 1
@@ -53,7 +55,12 @@ class World:
         offers = {f"act{n}": Offer(device=f"arm{n}", orphan_time=1.0) for n in range(DEVICES)}
         offers["get"] = Offer(inline=self._inline)
         offers["flooded"] = Offer(inline=lambda now, call: m.Outcome(call.id, "success"))
-        return Callee("motion", f"n{self.boot}", offers, keeping=Keeping(results=3.0, result_count=4, id_groups=2))
+        return Callee(
+            "motion",
+            f"n{self.boot}",
+            offers,
+            keeping=Keeping(results=3.0, result_count=4, id_groups=2),
+        )
 
     def _new_caller(self) -> Caller:
         return Caller("motion", m.Hello(2, 2, "coordinator", COORD, f"c{self.epoch}", self.epoch))
@@ -67,7 +74,9 @@ class World:
 
     def call(self, service: str, seconds: float, deadline: float | None) -> None:
         call = m.Call(f"c{next(self.numbers)}", service, {"seconds": seconds}, deadline)
-        self.made[call.id] = m.Call(call.id, service, call.arguments, deadline, boot=self.known_boot)
+        self.made[call.id] = m.Call(
+            call.id, service, call.arguments, deadline, boot=self.known_boot
+        )
         self.caller.call(self.now, call)
 
     def cancel(self, which: int) -> None:
@@ -84,7 +93,8 @@ class World:
         self.caller.link_up(self.now, answer)
 
     def cut(self, lost: int, final: bool = False) -> None:
-        """Break the link; the newest messages of each direction are lost, the CALLs among them may still turn up later."""
+        """Break the link; the newest messages of each direction are lost, the CALLs among them may
+        still turn up later."""
         if not self.linked:
             return
         self.linked = False
@@ -111,7 +121,8 @@ class World:
         self.callee = self._new_callee()
 
     def restart_coordinator(self) -> None:
-        """kill -9 of the coordinator: what it wrote down is all that is left, and is asked for again under its ids."""
+        """kill -9 of the coordinator: what it wrote down is all that is left, and is asked for
+        again under its ids."""
         self.cut(1000)
         self.epoch += 1
         self.caller = self._new_caller()
@@ -122,7 +133,8 @@ class World:
                 self.caller.call(self.now, replace(call, boot=boot, again=True))
 
     def flood(self, calls: int) -> None:
-        """Another client calls, under ids that have nothing in common. No CALL of ours is on its way for that long."""
+        """Another client calls, under ids that have nothing in common. No CALL of ours is on its
+        way for that long."""
         self.stale.clear()
         self.callee.link_up(self.now, "flood", m.Hello(2, 2, "client", "flood", "f1"))
         for _ in range(calls):
@@ -170,7 +182,9 @@ class World:
             if run.ends <= self.now:
                 del self.runs[id_]
                 self.finished.add(id_)
-                self.callee.finish(self.now, id_, "success", {"seconds": run.call.arguments["seconds"]})
+                self.callee.finish(
+                    self.now, id_, "success", {"seconds": run.call.arguments["seconds"]}
+                )
 
     def _orders(self) -> None:
         for order in self.callee.orders():
@@ -178,7 +192,9 @@ class World:
                 self._start(order.call)
             elif isinstance(order, CancelRun) and order.id in self.runs:
                 del self.runs[order.id]
-                self.callee.finish(self.now, order.id, "error", cause="cancelled", text=order.reason)
+                self.callee.finish(
+                    self.now, order.id, "error", cause="cancelled", text=order.reason
+                )
 
     def _start(self, call: m.Call) -> None:
         if any(run.call.service == call.service for run in self.runs.values()):
@@ -209,8 +225,16 @@ _seconds = st.sampled_from([0.0, 0.1, 0.5, 1.0, 5.0])
 OPERATIONS = st.one_of(
     st.tuples(st.just("call"), _services, _seconds, st.none() | st.sampled_from([0.2, 1.0])),
     st.tuples(st.just("call"), _services, _seconds, st.none() | st.sampled_from([0.2, 1.0])),
-    st.tuples(st.just("pass_time"), st.sampled_from([0.1, 0.3, 1.0, 2.5]), st.sampled_from([0.0, 0.1, 0.4])),
-    st.tuples(st.just("pass_time"), st.sampled_from([0.1, 0.3, 1.0, 2.5]), st.sampled_from([0.0, 0.1, 0.4])),
+    st.tuples(
+        st.just("pass_time"),
+        st.sampled_from([0.1, 0.3, 1.0, 2.5]),
+        st.sampled_from([0.0, 0.1, 0.4]),
+    ),
+    st.tuples(
+        st.just("pass_time"),
+        st.sampled_from([0.1, 0.3, 1.0, 2.5]),
+        st.sampled_from([0.0, 0.1, 0.4]),
+    ),
     st.tuples(st.just("cancel"), st.integers(0, 9)),
     st.tuples(st.just("connect")),
     st.tuples(st.just("connect")),
@@ -239,16 +263,25 @@ def _check(world: World) -> None:
     assert world.ended.keys() == world.made.keys(), "a call did not end"
     for id_, outcome in world.ended.items():
         if outcome.executed is Executed.NO:
-            assert not world.started[id_], f"{id_} is said not to have run ({outcome.cause}), but it did"
+            assert not world.started[id_], (
+                f"{id_} is said not to have run ({outcome.cause}), but it did"
+            )
         if outcome.status == "success":
-            assert id_ in world.finished and outcome.values["seconds"] == world.made[id_].arguments["seconds"]
+            assert (
+                id_ in world.finished
+                and outcome.values["seconds"] == world.made[id_].arguments["seconds"]
+            )
         elif outcome.cause in ("lost", "rebooted", "not_accepted", "no_answer", "forgotten"):
             assert outcome.executed is Executed.UNKNOWN
     for outcome in world.late:
         known = world.ended[outcome.id]
-        assert known == outcome or known.executed is Executed.UNKNOWN, "only an unknown end may be told better later"
+        assert known == outcome or known.executed is Executed.UNKNOWN, (
+            "only an unknown end may be told better later"
+        )
     assert not world.callee.running() and not world.caller.under_way()
-    assert world.callee.link_up(world.now, COORD, world.caller.hello).runs == (), "a result was never acknowledged"  # type: ignore[union-attr]
+    answer = world.callee.link_up(world.now, COORD, world.caller.hello)
+    assert isinstance(answer, m.Welcome)
+    assert answer.runs == (), "a result was never acknowledged"
 
 
 @settings(max_examples=150)

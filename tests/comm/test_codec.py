@@ -11,14 +11,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from services.comm import codec
-from services.comm import messages as m
-from services.comm.canbus import Frame
-from services.comm.codec import LIMITS, MAX_CONTAINERS, MIB, ProtocolError, decode, encode
-from services.comm.frequent import NAME_LENGTH
-from services.comm.messages import Executed
-from services.comm.party import Envelope, Posted
-from services.comm.plain import DEPTH, NotPlainError, pack_array, plain, unpack_array
+from petrobot.services.comm import codec
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.codec import LIMITS, MAX_CONTAINERS, MIB, ProtocolError, decode, encode
+from petrobot.services.comm.frequent import NAME_LENGTH
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.party import Envelope, Posted
+from petrobot.services.comm.plain import DEPTH, NotPlainError, pack_array, plain, unpack_array
 
 from .conftest import KINDS, messages_of
 
@@ -26,23 +26,33 @@ ENVELOPE = Envelope("arm", "bus", "arm", "can", Frame(0x181, b"\x01\x02"))
 FRAMES = [
     (
         m.Hello(1, 2, "coordinator", "coord", "b0", 3, "d1", b"\x01\x02"),
-        "00 00 00 21 99 01 01 02 ab 63 6f 6f 72 64 69 6e 61 74 6f 72 a5 63 6f 6f 72 64 a2 62 30 03 a2 64 31 c4 02 01 02",
+        "00 00 00 21 99 01 01 02 ab 63 6f 6f 72 64 69 6e 61 74 6f 72 a5 63 6f 6f 72 64 a2 62 "
+        "30 03 a2 64 31 c4 02 01 02",
     ),
     (
         m.Welcome(1, "vision", "b1", ("track",), ("c1",), "d1", b"\x07"),
-        "00 00 00 1e 98 02 01 a6 76 69 73 69 6f 6e a2 62 31 91 a5 74 72 61 63 6b 91 a2 63 31 a2 64 31 c4 01 07",
+        "00 00 00 1e 98 02 01 a6 76 69 73 69 6f 6e a2 62 31 91 a5 74 72 61 63 6b 91 a2 63 31 "
+        "a2 64 31 c4 01 07",
     ),
-    (m.Refuse("version", "too old"), "00 00 00 12 93 03 a7 76 65 72 73 69 6f 6e a7 74 6f 6f 20 6f 6c 64"),
+    (
+        m.Refuse("version", "too old"),
+        "00 00 00 12 93 03 a7 76 65 72 73 69 6f 6e a7 74 6f 6f 20 6f 6c 64",
+    ),
     (
         m.Call("c1", "track", {"t": 1.5}, 2.0, 3, "b1", "p0", 7),
-        "00 00 00 28 99 04 a2 63 31 a5 74 72 61 63 6b 81 a1 74 cb 3f f8 00 00 00 00 00 00 cb 40 00 00 00 00 00 00 00 "
+        "00 00 00 28 99 04 a2 63 31 a5 74 72 61 63 6b 81 a1 74 cb 3f f8 00 00 00 00 00 00 cb "
+        "40 00 00 00 00 00 00 00 "
         "03 a2 62 31 a2 70 30 07",
     ),
     (m.Accept("c1"), "00 00 00 05 92 05 a2 63 31"),
-    (m.Feedback("c1", 0.5, {"n": 1}), "00 00 00 12 94 06 a2 63 31 cb 3f e0 00 00 00 00 00 00 81 a1 6e 01"),
+    (
+        m.Feedback("c1", 0.5, {"n": 1}),
+        "00 00 00 12 94 06 a2 63 31 cb 3f e0 00 00 00 00 00 00 81 a1 6e 01",
+    ),
     (
         m.Outcome("c1", "success", {"x": [1.0]}, "", "", Executed.YES, 0.25, 0.125),
-        "00 00 00 32 99 07 a2 63 31 a7 73 75 63 63 65 73 73 81 a1 78 91 cb 3f f0 00 00 00 00 00 00 a0 a0 "
+        "00 00 00 32 99 07 a2 63 31 a7 73 75 63 63 65 73 73 81 a1 78 91 cb 3f f0 00 00 00 00 "
+        "00 00 a0 a0 "
         "a3 79 65 73 cb 3f d0 00 00 00 00 00 00 cb 3f c0 00 00 00 00 00 00",
     ),
     (m.ResultAck("c1", ("c2",)), "00 00 00 09 93 08 a2 63 31 91 a2 63 32"),
@@ -53,13 +63,17 @@ FRAMES = [
     ),
     (m.EventAck("timer", 5), "00 00 00 09 93 0b a5 74 69 6d 65 72 05"),
     (m.Subscribe(("tick", "caught")), "00 00 00 0f 92 0c 92 a4 74 69 63 6b a6 63 61 75 67 68 74"),
-    (m.Command("k1", "hold", "arm", {}), "00 00 00 0f 95 0d a2 6b 31 a4 68 6f 6c 64 a3 61 72 6d 80"),
+    (
+        m.Command("k1", "hold", "arm", {}),
+        "00 00 00 0f 95 0d a2 6b 31 a4 68 6f 6c 64 a3 61 72 6d 80",
+    ),
     (m.Answer("k1", True, {"s": "held"}), "00 00 00 0e 94 0e a2 6b 31 c3 81 a1 73 a4 68 65 6c 64"),
     (m.Ping(1), "00 00 00 03 92 0f 01"),
     (m.Pong(1), "00 00 00 03 92 10 01"),
     (
         m.Tick(9, (Posted(10, 0, ENVELOPE),)),
-        "00 00 00 1f 93 11 09 91 97 0a 00 a3 61 72 6d a3 62 75 73 a3 61 72 6d a3 63 61 6e 92 cd 01 81 c4 02 01 02",
+        "00 00 00 1f 93 11 09 91 97 0a 00 a3 61 72 6d a3 62 75 73 a3 61 72 6d a3 63 61 6e 92 "
+        "cd 01 81 c4 02 01 02",
     ),
     (m.Bye("done"), "00 00 00 07 92 12 a4 64 6f 6e 65"),
     (m.Challenge(b"\x01\x02"), "00 00 00 06 92 13 c4 02 01 02"),
@@ -67,7 +81,8 @@ FRAMES = [
     (m.StreamOpen("cp", 0.04, "t"), "00 00 00 10 94 15 a2 63 70 cb 3f a4 7a e1 47 ae 14 7b a1 74"),
     (
         m.SetPoint(1, (1.0, -2.0), 0.0, 0.5),
-        "00 00 00 28 95 16 01 92 cb 3f f0 00 00 00 00 00 00 cb c0 00 00 00 00 00 00 00 cb 00 00 00 00 00 00 00 00 "
+        "00 00 00 28 95 16 01 92 cb 3f f0 00 00 00 00 00 00 cb c0 00 00 00 00 00 00 00 cb 00 "
+        "00 00 00 00 00 00 00 "
         "cb 3f e0 00 00 00 00 00 00",
     ),
     (m.Withdraw(), "00 00 00 02 91 17"),
@@ -106,10 +121,14 @@ def test_random_bytes_raise_nothing_but_protocol_error(body: bytes) -> None:
 
 
 @given(st.data())
-def test_changed_bytes_raise_nothing_but_protocol_error(messages: st.SearchStrategy[Any], data: st.DataObject) -> None:
+def test_changed_bytes_raise_nothing_but_protocol_error(
+    messages: st.SearchStrategy[Any], data: st.DataObject
+) -> None:
     body = bytearray(encode(data.draw(messages)))
     for _ in range(data.draw(st.integers(1, 3))):
-        body[data.draw(st.integers(2, max(2, len(body) - 1))) % len(body)] = data.draw(st.integers(0, 255))
+        body[data.draw(st.integers(2, max(2, len(body) - 1))) % len(body)] = data.draw(
+            st.integers(0, 255)
+        )
     try:
         message = decode(bytes(body))
     except ProtocolError:
@@ -155,20 +174,38 @@ def _call(**changes: Any) -> list[Any]:
         pytest.param(_call(arguments={1: 2}), "not msgpack", id="number as key"),
         pytest.param(_call(arguments={b"k": 2}), "key", id="bytes as key"),
         pytest.param(_call(arguments=_nested(DEPTH + 2)), "deeper", id="too deep"),
-        pytest.param(_call(arguments={"a": msgpack.ExtType(1, b"\x01\x00")}), "extension", id="extension"),
+        pytest.param(
+            _call(arguments={"a": msgpack.ExtType(1, b"\x01\x00")}), "extension", id="extension"
+        ),
         pytest.param(_call(arguments={"a": msgpack.Timestamp(1)}), "Timestamp", id="time stamp"),
         pytest.param(_call(id="x" * (NAME_LENGTH + 1)), "longer", id="long name"),
-        pytest.param([7, "c1", "success", {}, "", "", "perhaps", 0.0, 0.0], "yes, no", id="executed perhaps"),
+        pytest.param(
+            [7, "c1", "success", {}, "", "", "perhaps", 0.0, 0.0], "yes, no", id="executed perhaps"
+        ),
         pytest.param([12, ["tick", 1]], "array of str", id="number among names"),
         pytest.param([22, 1, [1.0, math.nan], 0.0, 0.0], "finite numbers", id="nan set point"),
         pytest.param([22, 1, [1.0, "2"], 0.0, 0.0], "finite numbers", id="text set point"),
         pytest.param([17, 3, [[4, 0, "a", "b", "c", "d"]]], "envelope", id="short envelope"),
-        pytest.param([17, 3, [[4, 0, 1, "b", "c", "d", None]]], "envelope", id="envelope to a number"),
-        pytest.param([17, 3, [[-4, 0, "a", "b", "c", "d", None]]], "2^63", id="envelope due before"),
-        pytest.param([17, 3, [[4, 0, "a", "b", "c", "d", msgpack.ExtType(9, b"")]]], "extension", id="extension 9"),
-        pytest.param([17, 3, [[4, 0, "a", "b", "c", "d", msgpack.ExtType(1, b"\x03\x00")]]], "array", id="dtype 3"),
         pytest.param(
-            [17, 3, [[4, 0, "a", "b", "c", "d", msgpack.ExtType(2, encode(m.Tick(1)))]]], "extension", id="tick in tick"
+            [17, 3, [[4, 0, 1, "b", "c", "d", None]]], "envelope", id="envelope to a number"
+        ),
+        pytest.param(
+            [17, 3, [[-4, 0, "a", "b", "c", "d", None]]], "2^63", id="envelope due before"
+        ),
+        pytest.param(
+            [17, 3, [[4, 0, "a", "b", "c", "d", msgpack.ExtType(9, b"")]]],
+            "extension",
+            id="extension 9",
+        ),
+        pytest.param(
+            [17, 3, [[4, 0, "a", "b", "c", "d", msgpack.ExtType(1, b"\x03\x00")]]],
+            "array",
+            id="dtype 3",
+        ),
+        pytest.param(
+            [17, 3, [[4, 0, "a", "b", "c", "d", msgpack.ExtType(2, encode(m.Tick(1)))]]],
+            "extension",
+            id="tick in tick",
         ),
     ],
 )
@@ -184,16 +221,37 @@ def test_wrong_fields_are_refused(fields: list[Any], says: str) -> None:
         (CALL[:3], m.Call("c1", "track")),
         ([*CALL[:4], 2], m.Call("c1", "track", {}, 2.0)),
         ([22, 1, [1, 2]], m.SetPoint(1, (1.0, 2.0))),
-        ([7, "c1", "error", {}, "x", "", "unknown", 1], m.Outcome("c1", "error", {}, "x", "", Executed.UNKNOWN, 1.0)),
+        (
+            [7, "c1", "error", {}, "x", "", "unknown", 1],
+            m.Outcome("c1", "error", {}, "x", "", Executed.UNKNOWN, 1.0),
+        ),
     ],
 )
-def test_trailing_fields_may_be_left_out_and_a_duration_may_be_whole(fields: list[Any], message: m.Message) -> None:
+def test_trailing_fields_may_be_left_out_and_a_duration_may_be_whole(
+    fields: list[Any], message: m.Message
+) -> None:
     found = decode(msgpack.packb(fields))
     assert found == message
     assert decode(encode(found)) == message
 
 
-_SCALARS = [None, True, 0, 1, -1, 2**63, 1.0, -1.0, math.nan, math.inf, "", "x", "no", "x" * 256, b""]
+_SCALARS = [
+    None,
+    True,
+    0,
+    1,
+    -1,
+    2**63,
+    1.0,
+    -1.0,
+    math.nan,
+    math.inf,
+    "",
+    "x",
+    "no",
+    "x" * 256,
+    b"",
+]
 _odd: st.SearchStrategy[Any] = st.sampled_from(
     [*_SCALARS, [], {}, {"a": [1]}, {1: 2}, {b"k": 1}, {"a": [{3: 4}]}],
 )
@@ -210,7 +268,10 @@ def test_the_quick_way_says_what_the_table_says(
     kind: int, odd: list[Any], use: list[bool], length: int, padding: int
 ) -> None:
     usual = CALL if kind == 4 else [7, "c1", "success", {}, "", "", "yes", 0.0, 0.0]
-    fields = [kind, *(new if used else old for new, used, old in zip(odd, use, usual[1:], strict=True))]
+    fields = [
+        kind,
+        *(new if used else old for new, used, old in zip(odd, use, usual[1:], strict=True)),
+    ]
     if type(fields[3]) is dict:
         fields[3] = {**fields[3], "padding": "." * padding}
     body = msgpack.packb(fields[:length])
@@ -233,8 +294,11 @@ def test_a_call_made_again_has_one_field_more_and_any_other_none() -> None:
 
 
 def test_a_provisional_result_has_one_field_more_and_any_other_none() -> None:
-    """So a side that does not know the field yet takes every result that is sure, byte for byte as before."""
-    sure, open_ = (m.Outcome("c1", "success", seconds=1.0, deferred=deferred) for deferred in (False, True))
+    """So a side that does not know the field yet takes every result that is sure, byte for byte as
+    before."""
+    sure, open_ = (
+        m.Outcome("c1", "success", seconds=1.0, deferred=deferred) for deferred in (False, True)
+    )
     assert encode(open_) == b"\x9a" + encode(sure)[1:] + b"\xc3" and encode(sure)[0] == 0x99
     assert (decode(encode(sure)), decode(encode(open_))) == (sure, open_)
     assert decode(b"\x9a" + encode(sure)[1:] + b"\xc2") == sure, "written out by whoever does"
@@ -259,7 +323,9 @@ def test_nesting_up_to_the_limit_passes(depth: int) -> None:
     assert plain(call.arguments) == call.arguments
 
 
-@pytest.mark.parametrize("kind", [m.Accept, m.Cancel, m.Refuse, m.Bye], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize(
+    "kind", [m.Accept, m.Cancel, m.Refuse, m.Bye], ids=lambda kind: kind.__name__
+)
 def test_a_body_above_its_kinds_limit_is_refused_both_ways(kind: type[Any]) -> None:
     long = "x" * LIMITS[kind.KIND]
     message = kind(*(long for _ in range(1 if kind in (m.Accept, m.Bye) else 2)))
@@ -279,11 +345,17 @@ def test_many_empty_containers_do_not_fill_the_memory(container: bytes) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [[[]] * 20_000, [None] * 140_000, [[None] * 70_000, [1] * 70_000], {str(n): n for n in range(22_000)}],
+    [
+        [[]] * 20_000,
+        [None] * 140_000,
+        [[None] * 70_000, [1] * 70_000],
+        {str(n): n for n in range(22_000)},
+    ],
     ids=["arrays", "values", "values in two", "a map"],
 )
 def test_what_takes_long_to_read_is_neither_sent_nor_taken(value: Any) -> None:
-    """Its sender is told, so that only its own call ends; who sends it nevertheless loses the connection."""
+    """Its sender is told, so that only its own call ends; who sends it nevertheless loses the
+    connection."""
     with pytest.raises(ProtocolError, match=r"too_large: a Call: more than"):
         encode(m.Call("c", "s", {"v": value}))
     with pytest.raises(ProtocolError, match=r"malformed: .*more than"):
@@ -364,7 +436,9 @@ def test_random_bytes_are_an_array_or_refused(data: bytes) -> None:
     assert pack_array(array) == data
 
 
-@pytest.mark.parametrize("array", [np.zeros(2, np.float32), np.zeros((1, 1, 1, 1, 1)), np.zeros(2, ">f8")])
+@pytest.mark.parametrize(
+    "array", [np.zeros(2, np.float32), np.zeros((1, 1, 1, 1, 1)), np.zeros(2, ">f8")]
+)
 def test_other_arrays_are_refused(array: np.ndarray[Any, Any]) -> None:
     with pytest.raises(NotPlainError):
         pack_array(array)
@@ -375,7 +449,9 @@ def test_an_envelope_may_carry_an_image_a_frame_or_a_message() -> None:
     frames = (Frame(1, b"a"), Frame(2, b""))
     call = m.Call("c1", "track", {"a": 1})
     sent = [("image", (image, 0.02)), ("can", frames), ("call", call), ("control", {"rate": 25.0})]
-    tick = m.Tick(3, tuple(Posted(4, n, Envelope("a", "b", "c", *one)) for n, one in enumerate(sent)))
+    tick = m.Tick(
+        3, tuple(Posted(4, n, Envelope("a", "b", "c", *one)) for n, one in enumerate(sent))
+    )
     back = decode(encode(tick))
     assert isinstance(back, m.Tick)
     bodies = [posted.envelope.body for posted in back.envelopes]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.callee import Callee, Offer
-from services.comm.caller import Caller, EventArrived
-from services.comm.events import KEPT, EventBoard
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, Offer
+from petrobot.services.comm.caller import Caller, EventArrived
+from petrobot.services.comm.events import KEPT, EventBoard
 
 
 def _node(*names: str, role: str = "coordinator") -> Callee:
@@ -106,11 +106,15 @@ def test_what_nobody_fetches_gives_way_and_is_counted() -> None:
     assert (board.lost, len(waiting), waiting[0].number) == (3, KEPT, 4)
 
 
-_steps = st.lists(st.sampled_from(["raise a", "raise b", "cut", "connect", "carry", "ack"]), max_size=40)
+_steps = st.lists(
+    st.sampled_from(["raise a", "raise b", "cut", "connect", "carry", "ack"]), max_size=40
+)
 
 
 @given(_steps, st.integers(0, 3))
-def test_every_latched_event_arrives_once_and_in_order_of_its_source(steps: list[str], lost: int) -> None:
+def test_every_latched_event_arrives_once_and_in_order_of_its_source(
+    steps: list[str], lost: int
+) -> None:
     callee = Callee("motion", "n1", {})
     caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "b"))
     caller.subscribe(0.0, ("a", "b"))
@@ -142,7 +146,9 @@ def test_every_latched_event_arrives_once_and_in_order_of_its_source(steps: list
             caller.link_down(0.0, "cut")
 
     def take() -> None:
-        arrived.extend(notice.event for notice in caller.notices() if isinstance(notice, EventArrived))
+        arrived.extend(
+            notice.event for notice in caller.notices() if isinstance(notice, EventArrived)
+        )
 
     for step in [*steps, "connect", "carry", "ack"]:
         if step.startswith("raise"):

@@ -1,4 +1,5 @@
-"""Certificates that end: read without a package for X.509, said once, made anew by the command, refused in words."""
+"""Certificates that end: read without a package for X.509, said once, made anew by the command,
+refused in words."""
 
 from __future__ import annotations
 
@@ -17,19 +18,19 @@ from cryptography import x509
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.certificates import CA_LIFE, LIFE, CertificateError, make_certificates
-from coordinator.cli import main
-from coordinator.mission.asking import ask_all
-from services.comm import expiry
-from services.comm import messages as m
-from services.comm.callee import Callee, Offer
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.credentials import Credentials
-from services.comm.directory import parse
-from services.comm.expiry import SOON, ending, ends_of
-from services.comm.orders import Order
-from services.comm.server import Server
+from petrobot.coordinator.certificates import CA_LIFE, LIFE, CertificateError, make_certificates
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.mission.asking import ask_all
+from petrobot.services.comm import expiry
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, Offer
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import Credentials
+from petrobot.services.comm.directory import parse
+from petrobot.services.comm.expiry import SOON, ending, ends_of
+from petrobot.services.comm.orders import Order
+from petrobot.services.comm.server import Server
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
@@ -43,7 +44,9 @@ def new_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(expiry, "_remedies", {})
 
 
-def made(folder: Path, left: timedelta, parties: tuple[str, ...] = ("coordinator", "vision")) -> Path:
+def made(
+    folder: Path, left: timedelta, parties: tuple[str, ...] = ("coordinator", "vision")
+) -> Path:
     """A cell's certificates of which there is so much left; the authority's lasts longer."""
     make_certificates(folder, parties, NOW - LIFE + left)
     return folder
@@ -52,7 +55,10 @@ def made(folder: Path, left: timedelta, parties: tuple[str, ...] = ("coordinator
 @pytest.mark.parametrize("left", [LIFE, timedelta(days=31), timedelta(0), -timedelta(days=400)])
 def test_the_end_is_read_as_cryptography_reads_it(tmp_path: Path, left: timedelta) -> None:
     for file in made(tmp_path, left).glob("*.pem"):
-        assert ends_of(file.read_text()) == x509.load_pem_x509_certificate(file.read_bytes()).not_valid_after_utc
+        assert (
+            ends_of(file.read_text())
+            == x509.load_pem_x509_certificate(file.read_bytes()).not_valid_after_utc
+        )
 
 
 def test_a_certificate_beyond_2049_tells_its_time_in_full(tmp_path: Path) -> None:
@@ -69,7 +75,12 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return ssl.PEM_cert_to_DER_cert((folder / "vision.pem").read_text())
 
 
-@given(body=st.binary(max_size=80), cut=st.integers(0, 200), at=st.integers(0, 200), byte=st.integers(0, 255))
+@given(
+    body=st.binary(max_size=80),
+    cut=st.integers(0, 200),
+    at=st.integers(0, 200),
+    byte=st.integers(0, 255),
+)
 def test_spoilt_certificates_are_a_value_error_or_a_time(
     real: bytes, body: bytes, cut: int, at: int, byte: int
 ) -> None:
@@ -84,7 +95,8 @@ def test_spoilt_certificates_are_a_value_error_or_a_time(
 
 
 @pytest.mark.parametrize(
-    "text", ["", "x" * 30, "-----BEGIN CERTIFICATE-----", "-----BEGIN CERTIFICATE-----\n!\n-----END"]
+    "text",
+    ["", "x" * 30, "-----BEGIN CERTIFICATE-----", "-----BEGIN CERTIFICATE-----\n!\n-----END"],
 )
 def test_what_is_no_certificate_is_a_value_error(text: str) -> None:
     with pytest.raises(ValueError, match="no certificate that can be read"):
@@ -107,19 +119,27 @@ def test_what_is_said_a_month_before_and_after(tmp_path: Path, left: timedelta, 
     file = made(tmp_path, left) / "vision.pem"
     text = ending(file, NOW, "do this")
     assert (
-        (says in text and f"{NOW + left:%Y-%m-%d %H:%M} UTC" in text and text.endswith("do this")) if says else not text
+        (says in text and f"{NOW + left:%Y-%m-%d %H:%M} UTC" in text and text.endswith("do this"))
+        if says
+        else not text
     )
     assert not says or text.startswith(f"{file}: this certificate")
 
 
-def test_each_end_is_said_once_and_with_the_files_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_end_is_said_once_and_with_the_files_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = made(tmp_path / "keys", timedelta(days=9))
     proves = Credentials("vision", None, folder)
     proves.server()
     proves.client()
     said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and said[0].startswith(f"{folder / 'vision.pem'}: this certificate ends in ")
-    assert "`petrobot keys --tls keys`" in said[0] and "copy vision.pem and vision.key here" in said[0]
+    assert len(said) == 1 and said[0].startswith(
+        f"{folder / 'vision.pem'}: this certificate ends in "
+    )
+    assert (
+        "`petrobot keys --tls keys`" in said[0] and "copy vision.pem and vision.key here" in said[0]
+    )
     expiry.look_again(NOW + 8 * DAY)
     assert capsys.readouterr().err == "", "it was said"
     expiry.look_again(NOW + 10 * DAY)
@@ -153,31 +173,43 @@ def test_the_command_makes_anew_what_ends_soon_and_nothing_else(tmp_path: Path) 
     folder = made(tmp_path, 20 * DAY, ("vision",))
     make_certificates(folder, ["motion"], NOW - 100 * DAY)
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert sorted(make_certificates(folder, ["motion", "vision"], NOW)) == ["vision.key", "vision.pem"]
+    assert sorted(make_certificates(folder, ["motion", "vision"], NOW)) == [
+        "vision.key",
+        "vision.pem",
+    ]
     after = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert {name for name in after if after[name] != before.get(name)} == {"vision.pem", "vision.key"}
+    assert {name for name in after if after[name] != before.get(name)} == {
+        "vision.pem",
+        "vision.key",
+    }
     assert set(after) == set(before), "no half-made file is left"
     assert ends_of(after["vision.pem"].decode()) == NOW + LIFE
     assert (folder / "vision.key").stat().st_mode & 0o777 == 0o600
     assert Credentials("vision", None, folder).server() is not None, "key and certificate fit"
 
 
-def test_no_certificate_outlives_the_authority_and_one_that_ends_is_replaced_as_a_whole(tmp_path: Path) -> None:
+def test_no_certificate_outlives_the_authority_and_one_that_ends_is_replaced_as_a_whole(
+    tmp_path: Path,
+) -> None:
     make_certificates(tmp_path, ["vision"], NOW)
     make_certificates(tmp_path, ["motion"], NOW + CA_LIFE - LIFE / 2)
     assert ends_of((tmp_path / "motion.pem").read_text()) == NOW + CA_LIFE
-    with pytest.raises(CertificateError, match=r"ca\.pem: the authority ends soon.*name of another folder"):
+    with pytest.raises(
+        CertificateError, match=r"ca\.pem: the authority ends soon.*name of another folder"
+    ):
         make_certificates(tmp_path, ["arm"], NOW + CA_LIFE - SOON)
     assert not (tmp_path / "arm.pem").exists()
 
 
-# --- over real connections --------------------------------------------------------------------------------------------------
+# --- over real connections --------------------------------------------------------------------
 
 
 @asynccontextmanager
 async def node(folder: Path) -> AsyncIterator[Server]:
     """A node named vision that shows its certificate."""
-    server = Server(Callee("vision", "v1", {"echo": Offer()}), tls=Credentials("vision", None, folder).server())
+    server = Server(
+        Callee("vision", "v1", {"echo": Offer()}), tls=Credentials("vision", None, folder).server()
+    )
     await server.start("127.0.0.1", 0)
     try:
         yield server
@@ -188,7 +220,7 @@ async def node(folder: Path) -> AsyncIterator[Server]:
 async def test_a_node_that_lives_long_looks_each_day(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.comm.server.DAY", 0.001)
+    monkeypatch.setattr("petrobot.services.comm.server.DAY", 0.001)
     looked: list[datetime] = []
     again = asyncio.Event()
 
@@ -197,7 +229,7 @@ async def test_a_node_that_lives_long_looks_each_day(
         if len(looked) == 3:
             again.set()
 
-    monkeypatch.setattr("services.comm.server.look_again", look)
+    monkeypatch.setattr("petrobot.services.comm.server.look_again", look)
     async with asyncio.timeout(60.0), node(made(tmp_path, LIFE)):
         await again.wait()
 
@@ -213,12 +245,17 @@ async def test_ended_certificates_are_named_as_the_reason(
     async with asyncio.timeout(60.0), node(folder) as server:
         capsys.readouterr()
         proves = Credentials("coordinator", None, folder)
-        client = Client(*server.address, Caller("vision", HELLO, auto_ack=True), tls=proves.client())
+        client = Client(
+            *server.address, Caller("vision", HELLO, auto_ack=True), tls=proves.client()
+        )
         client.start()
         assert (await client.call("echo")).status == "error"
         await client.close()
     if node_left < own_left:
-        assert "the certificate of vision, or its authority's, has ended; make it anew" in client.trouble
+        assert (
+            "the certificate of vision, or its authority's, has ended; make it anew"
+            in client.trouble
+        )
     else:
         assert "has ended" in client.trouble
         assert f"{folder / 'coordinator.pem'}: this certificate ended on" in capsys.readouterr().err
@@ -233,14 +270,19 @@ async def test_nodes_shows_when_the_certificate_ends_that_a_node_really_shows(
         make_certificates(folder, ["vision"], NOW)
         places = tmp_path / "services.toml"
         port = server.address[1]
-        text = f'schema = 1\n[nodes.vision]\nhost = "127.0.0.1"\nport = {port}\n[keys]\ncertificates = "keys"\n'
+        text = (
+            'schema = 1\n[nodes.vision]\nhost = "127.0.0.1"\nport = '
+            f'{port}\n[keys]\ncertificates = "keys"\n'
+        )
         places.write_text(text, encoding="utf-8")
         server.callee.directory = ""
         answering = asyncio.create_task(_answer(server))
         answer = (await ask_all(parse(text, places), 5.0))["vision"]
         assert datetime.fromisoformat(answer["certificate_ends"]) == NOW + 12 * DAY
         capsys.readouterr()
-        assert await asyncio.to_thread(main, ["nodes", "--services", str(places), "--json", "-"]) == 0
+        assert (
+            await asyncio.to_thread(main, ["nodes", "--services", str(places), "--json", "-"]) == 0
+        )
         shown = json.loads(capsys.readouterr().out)
         assert datetime.fromisoformat(shown["vision"]["certificate_ends"]) == NOW + 12 * DAY
         assert await asyncio.to_thread(main, ["nodes", "--services", str(places)]) == 0

@@ -1,6 +1,8 @@
-"""Real processes killed (kill -9), frozen (SIGSTOP) and cut off: what is known of them, in which order, and what holds.
+"""Real processes killed (kill -9), frozen (SIGSTOP) and cut off: what is known of them, in which
+order, and what holds.
 
-How long it takes stands in tests/bench/faults.py; here is what must be so however busy the machine is.
+How long it takes stands in tests/bench/faults.py; here is what must be so however busy the machine
+is.
 """
 
 from __future__ import annotations
@@ -14,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from services.comm import messages as m
-from services.comm.caller import Accepted, Caller, Ended, Late, Notice, PeerBack, PeerLost
-from services.comm.client import Client
-from services.comm.messages import Executed
-from services.comm.stream import Incoming, StreamReceiver
-from services.comm.under_way import Patience
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Accepted, Caller, Ended, Late, Notice, PeerBack, PeerLost
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.stream import Incoming, StreamReceiver
+from petrobot.services.comm.under_way import Patience
 
 from .fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
 
@@ -84,8 +86,8 @@ async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
 
 
 async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> None:
-    """It does not wait for the 2 s that a broken link has to come back; a process that takes the port is another boot, which is
-    not sent the call again."""
+    """It does not wait for the 2 s that a broken link has to come back; a process that takes the
+    port is another boot, which is not sent the call again."""
     with part("node") as process:
         port = int(await asyncio.to_thread(first_line, process))
         told = Told(port)
@@ -94,7 +96,10 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         told.caller._patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
         process.kill()
         ended = (await told.until(Ended)).outcome
-    assert (ended.cause, ended.executed) == ("lost", Executed.UNKNOWN) and "nothing listens" in ended.text
+    assert (ended.cause, ended.executed) == (
+        "lost",
+        Executed.UNKNOWN,
+    ) and "nothing listens" in ended.text
     assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
     told.caller.call(told.client.now(), m.Call("2", "move"))
     told.client.flush()
@@ -108,11 +113,14 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         told.client.flush()
         await told.until(Accepted, 2)
         await told.client.close()
-    assert told.order().count("Ended") >= 2, "the first two once each; the third goes on until its caller leaves"
+    assert told.order().count("Ended") >= 2, (
+        "the first two once each; the third goes on until its caller leaves"
+    )
 
 
 async def test_a_broken_link_to_a_node_that_lives_keeps_its_run() -> None:
-    """The connection is reset, the port still takes connections: the same boot is found again, and the run goes on."""
+    """The connection is reset, the port still takes connections: the same boot is found again, and
+    the run goes on."""
     with part("node") as process:
         told = Told(int(await asyncio.to_thread(first_line, process)))
         await told.begin()
@@ -135,13 +143,16 @@ async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -
         back = await told.until(PeerBack, 2)
         assert back.same_boot and back.runs == ("1",), "it never noticed, and the run goes on"
         late = (await told.until(Late)).outcome
-        assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), "recorded, and moves nothing"
+        assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), (
+            "recorded, and moves nothing"
+        )
         assert told.order().count("Ended") == 1
         await told.client.close()
 
 
 class Watch:
-    """A sink that notes when values came and when they were withdrawn, on the receiver's clock (s)."""
+    """A sink that notes when values came and when they were withdrawn, on the receiver's clock
+    (s)."""
 
     def __init__(self) -> None:
         self.arrived: list[float] = []
@@ -160,20 +171,27 @@ class Watch:
         return bool(self.arrived) and (not self.withdrawn or self.arrived[-1] > self.withdrawn[-1])
 
 
-def poll_until(receiver: StreamReceiver, watch: Watch, holds: Callable[[], bool], period: float) -> None:
-    """Poll as a servo loop does. At no poll may a value count that came longer ago than three periods."""
+def poll_until(
+    receiver: StreamReceiver, watch: Watch, holds: Callable[[], bool], period: float
+) -> None:
+    """Poll as a servo loop does. At no poll may a value count that came longer ago than three
+    periods."""
     end = time.monotonic() + LIMIT
     while not holds():
         select.select([], [], [], period / 10)
         watch.now = time.monotonic()
         receiver.poll()
-        assert not watch.valid or watch.now - watch.arrived[-1] <= 3 * period, "too old, and it still counts"
+        assert not watch.valid or watch.now - watch.arrived[-1] <= 3 * period, (
+            "too old, and it still counts"
+        )
         assert watch.now < end, "it did not come to pass"
 
 
 @pytest.mark.parametrize("fault", Fault, ids=lambda one: one.value)
 @pytest.mark.parametrize("period", [0.004, 0.04])
-def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(fault: Fault, period: float) -> None:
+def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(
+    fault: Fault, period: float
+) -> None:
     watch = Watch()
     receiver = StreamReceiver("motion", {STREAM: Incoming(period, watch)}, clock=lambda: watch.now)
     cable = Cable(receiver.address[1])

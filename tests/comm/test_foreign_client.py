@@ -1,7 +1,9 @@
-"""docs/protocol.md is enough to talk to a node: a client written from the page alone, against real node processes.
+"""docs/protocol.md is enough to talk to a node: a client written from the page alone, against real
+node processes.
 
-The location file is a real one, read by `python -m services`: a node with the global memory, actions in worker processes, a
-device that takes a set-point stream, and a timer; once on loopback without, once with a shared key.
+The location file is a real one, read by `python -m petrobot.services`: a node with the global
+memory, actions in worker processes, a device that takes a set-point stream, and a timer; once on
+loopback without, once with a shared key.
 """
 
 from __future__ import annotations
@@ -85,7 +87,14 @@ def launched(folder: Path, key: bytes | None) -> tuple[subprocess.Popen[str], tu
     (folder / "services.toml").write_text(text, encoding="utf-8")
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "node" / "outside")])
     process = subprocess.Popen(
-        [sys.executable, "-m", "services", "hub", "--services", str(folder / "services.toml")],
+        [
+            sys.executable,
+            "-m",
+            "petrobot.services",
+            "hub",
+            "--services",
+            str(folder / "services.toml"),
+        ],
         stdout=subprocess.PIPE,
         text=True,
         cwd=ROOT,
@@ -97,7 +106,9 @@ def launched(folder: Path, key: bytes | None) -> tuple[subprocess.Popen[str], tu
 
 
 @pytest.fixture(scope="module", params=[None, bytes(range(32))], ids=["no key", "shared key"])
-def process(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hub]:
+def process(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Hub]:
     """A node that all tests of this page share."""
     node, address = launched(tmp_path_factory.mktemp("hub"), request.param)
     yield Hub(address, request.param, [])
@@ -114,7 +125,9 @@ def hub(process: Hub) -> Iterator[Hub]:
     process.opened.clear()
 
 
-def result_of(client: Foreign, id_: str, service: str, arguments: dict[str, Any], *more: Any) -> list[Any]:
+def result_of(
+    client: Foreign, id_: str, service: str, arguments: dict[str, Any], *more: Any
+) -> list[Any]:
     """CALL to RESULT, acknowledged."""
     client.say(f.CALL, id_, service, arguments, *more)
     result = client.expect(f.RESULT, id_)
@@ -128,7 +141,11 @@ def test_the_bytes_of_the_page() -> None:
     client.seal_out, client.is_open = b"", True
     assert client.frame(pack((f.PING, 1))) == bytes.fromhex("00000007 92 0f 01 f1 49 99 d5")
     call = client.frame(pack((f.CALL, "c1", "track", {"t": 1.5}, 2.0, 3, "b1", "p0", 7)))
-    page = (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8").split("parent `p0`, seed 7:\n```\n")[1]
+    page = (
+        (ROOT / "docs" / "protocol.md")
+        .read_text(encoding="utf-8")
+        .split("parent `p0`, seed 7:\n```\n")[1]
+    )
     shown = [line.partition("  ")[0] for line in page.split("```")[0].splitlines()]
     assert call == bytes.fromhex(" ".join(shown))
 
@@ -144,7 +161,14 @@ def test_hello_and_welcome(hub: Hub) -> None:
 def test_a_service_answered_on_the_spot_sends_a_result_without_accept(hub: Hub) -> None:
     client = hub.coordinator()
     name = f"at {hub.count}"
-    client.say(f.CALL, f"{name}/1", "memory.put", {"name": name, "value": [1, 2.5, b"b", None, {"x": True}]}, 1.0, 1)
+    client.say(
+        f.CALL,
+        f"{name}/1",
+        "memory.put",
+        {"name": name, "value": [1, 2.5, b"b", None, {"x": True}]},
+        1.0,
+        1,
+    )
     kind, id_, status, values, cause, text, executed, seconds, cpu = client.hear()
     assert (kind, id_, status, values, cause, text, executed) == (
         f.RESULT, f"{name}/1", "success", {"version": 1}, "", "", "yes",
@@ -156,7 +180,8 @@ def test_a_service_answered_on_the_spot_sends_a_result_without_accept(hub: Hub) 
 
 
 def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
-    """A known id is answered from what is known: its stored result, and `forgotten` once that was acknowledged."""
+    """A known id is answered from what is known: its stored result, and `forgotten` once that was
+    acknowledged."""
     client = hub.coordinator()
     id_ = f"once {hub.count}"
     client.say(f.CALL, id_, "add", {"a": 2, "b": 3}, 5.0, 1)
@@ -171,7 +196,8 @@ def test_an_action_accept_result_and_at_most_once(hub: Hub) -> None:
 
 
 def test_what_was_lost_with_the_link_is_listed_and_given_again(hub: Hub) -> None:
-    """WELCOME names the runs that go on or are not acknowledged; the same CALL brings ACCEPT or the result."""
+    """WELCOME names the runs that go on or are not acknowledged; the same CALL brings ACCEPT or the
+    result."""
     client = hub.coordinator()
     name = f"foreign{hub.count}"
     client.say(f.CALL, f"{name}/done", "add", {"a": 1}, 5.0, 1)
@@ -215,7 +241,9 @@ def test_cancel_and_deadline(hub: Hub) -> None:
         ("add", (1.0, 1, "another boot"), "rebooted", "unknown"),
     ],
 )
-def test_what_is_refused_is_a_result(hub: Hub, service: str, more: tuple[Any, ...], cause: str, executed: str) -> None:
+def test_what_is_refused_is_a_result(
+    hub: Hub, service: str, more: tuple[Any, ...], cause: str, executed: str
+) -> None:
     client = hub.coordinator()
     result = result_of(client, f"{cause} {hub.count}", service, {"a": 1}, *more)
     assert result[2:7:2] == ["error", cause, executed] and result[5]
@@ -244,7 +272,8 @@ def test_heartbeats(hub: Hub) -> None:
 
 
 def test_events_and_commands(hub: Hub) -> None:
-    """Pulses of a timer; latched events of the memory, sent until they are acknowledged; a command and its answer."""
+    """Pulses of a timer; latched events of the memory, sent until they are acknowledged; a command
+    and its answer."""
     client = hub.coordinator()
     name = f"value {hub.count}"
     client.say(f.SUBSCRIBE, ["beat"])
@@ -262,7 +291,8 @@ def test_events_and_commands(hub: Hub) -> None:
 
 
 def test_set_points(hub: Hub) -> None:
-    """The service of the stream says where to and gives the ticket; the device follows what is sent, and stops with WITHDRAW."""
+    """The service of the stream says where to and gives the ticket; the device follows what is
+    sent, and stops with WITHDRAW."""
     client = hub.coordinator()
     there = result_of(client, f"stream {hub.count}", "stream:points", {}, None, 1)[3]
     stream = Foreign((there["host"], there["port"]), hub.key)
@@ -287,7 +317,7 @@ def test_set_points(hub: Hub) -> None:
     client.say(f.BYE)
 
 
-# --- what breaks the protocol -----------------------------------------------------------------------------------------------
+# --- what breaks the protocol -----------------------------------------------------------------
 
 
 OPENING: list[tuple[str, Callable[[Foreign], None]]] = [
@@ -307,27 +337,45 @@ OPEN: list[tuple[str, Callable[[Foreign], None]]] = [
     ("malformed", lambda one: one.say(f.CALL, "1", "add", {}, None, 0, "", "", 0, 0)),
     ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\x01\x01"))),
     ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xc4\x01a\x01"))),
-    ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xa1t\xd6\xff\x00\x00\x00\x01"))),
-    ("malformed", lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xa1x" + b"\x91" * 33 + b"\xc0"))),
+    (
+        "malformed",
+        lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xa1t\xd6\xff\x00\x00\x00\x01")),
+    ),
+    (
+        "malformed",
+        lambda one: one.raw(one.frame(b"\x94\x04\xa11\xa3add\x81\xa1x" + b"\x91" * 33 + b"\xc0")),
+    ),
     ("malformed", lambda one: one.raw(one.frame(pack((f.PING, 1)) + b"\xc0"))),
-    ("too_large", lambda one: one.raw(struct.pack(">I", 33 + (16 if one.key else 4)) + b"\x92\x0f")),
+    (
+        "too_large",
+        lambda one: one.raw(struct.pack(">I", 33 + (16 if one.key else 4)) + b"\x92\x0f"),
+    ),
     ("unknown_kind", lambda one: one.say(0)),
     ("out_of_turn", lambda one: one.say(f.RESULT, "1", "success")),
     ("out_of_turn", lambda one: one.say(f.HELLO, 2, 2, "client", "x", "y")),
 ]
 
 
-@pytest.mark.parametrize(("code", "do"), OPENING, ids=lambda value: value if isinstance(value, str) else "")
-def test_a_bad_frame_while_opening_is_refused_by_its_code(hub: Hub, code: str, do: Callable[[Foreign], None]) -> None:
+@pytest.mark.parametrize(
+    ("code", "do"), OPENING, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_a_bad_frame_while_opening_is_refused_by_its_code(
+    hub: Hub, code: str, do: Callable[[Foreign], None]
+) -> None:
     client = hub.knock()
     do(client)
     assert f.unpack(client.body())[:2] == [f.REFUSE, code]
     assert client.socket.recv(1) == b""
 
 
-@pytest.mark.parametrize(("code", "do"), OPEN, ids=lambda value: value if isinstance(value, str) else "")
-def test_a_bad_frame_while_open_is_refused_by_its_code(hub: Hub, code: str, do: Callable[[Foreign], None]) -> None:
-    """Sealed like every frame of an open connection. What came before it was done, and its result is there for who comes back."""
+@pytest.mark.parametrize(
+    ("code", "do"), OPEN, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_a_bad_frame_while_open_is_refused_by_its_code(
+    hub: Hub, code: str, do: Callable[[Foreign], None]
+) -> None:
+    """Sealed like every frame of an open connection. What came before it was done, and its result
+    is there for who comes back."""
     client, name = hub.coordinator(), f"foreign{hub.count}"
     call: tuple[Any, ...] = (f.CALL, f"{name}/before", "memory.list", {}, None, 1)
     client.raw(client.frame(pack(call)))
@@ -355,17 +403,29 @@ def test_names_epochs_and_directories(hub: Hub) -> None:
     """One process a name; a replaced coordinator is told so; another location file is refused."""
     first = hub.knock()
     assert first.open("coordinator", "chief", "boot 1", epoch=5)[0] == f.WELCOME
-    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=5)[:2] == [f.REFUSE, "name_taken"]
-    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=4)[:2] == [f.REFUSE, "old_epoch"]
+    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=5)[:2] == [
+        f.REFUSE,
+        "name_taken",
+    ]
+    assert hub.knock().open("coordinator", "chief", "boot 2", epoch=4)[:2] == [
+        f.REFUSE,
+        "old_epoch",
+    ]
     assert hub.knock().open("coordinator", "chief", "boot 2", epoch=6)[0] == f.WELCOME
-    assert hub.knock().open("client", "elsewhere", directory="0" * 64)[:2] == [f.REFUSE, "directory"]
+    assert hub.knock().open("client", "elsewhere", directory="0" * 64)[:2] == [
+        f.REFUSE,
+        "directory",
+    ]
 
 
 def test_keys_that_do_not_fit(hub: Hub) -> None:
     """Each refusal by its code, whichever side has which key."""
     wrong = Foreign(hub.address, None if hub.key is not None else bytes(32))
     hub.opened.append(wrong)
-    assert wrong.open("client", "w")[:2] == [f.REFUSE, "key_needed" if hub.key is not None else "no_key_here"]
+    assert wrong.open("client", "w")[:2] == [
+        f.REFUSE,
+        "key_needed" if hub.key is not None else "no_key_here",
+    ]
     if hub.key is not None:
         other = Foreign(hub.address, bytes(32))
         hub.opened.append(other)
@@ -376,7 +436,10 @@ def test_another_node_than_the_wanted_one_refuses(hub: Hub) -> None:
     """A refusal after the proof of the key is sealed: nobody in between can have said it."""
     client = hub.knock()
     refusal = client.open("client", "lost", node="motion")
-    assert refusal[:2] == [f.REFUSE, "wrong_node"] and "this is hub, motion was asked for" in refusal[2]
+    assert (
+        refusal[:2] == [f.REFUSE, "wrong_node"]
+        and "this is hub, motion was asked for" in refusal[2]
+    )
     assert client.proven is (hub.key is not None)
 
 

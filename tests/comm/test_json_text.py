@@ -1,4 +1,5 @@
-"""JSON for other readers: no value makes a text that a strict reader refuses, and nothing else writes such texts."""
+"""JSON for other readers: no value makes a text that a strict reader refuses, and nothing else
+writes such texts."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm.json_text import finite, json_text
+from petrobot.services.comm.json_text import finite, json_text
 
 ROOT = Path(__file__).parents[2]
 BETWEEN_OWN_PROCESSES = {
@@ -43,7 +44,9 @@ def strict(text: str) -> Any:
 
 
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(max_size=3)
-VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner))
+VALUES = st.recursive(
+    LEAVES, lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(), inner)
+)
 
 
 @given(VALUES)
@@ -52,13 +55,22 @@ def test_every_value_is_read_by_a_strict_reader(value: Any) -> None:
     strict(json_text(value, indent=2, ensure_ascii=False))
 
 
-@given(st.recursive(st.integers(-9, 9) | st.floats(allow_nan=False, allow_infinity=False), st.lists))
+@given(
+    st.recursive(st.integers(-9, 9) | st.floats(allow_nan=False, allow_infinity=False), st.lists)
+)
 def test_finite_values_are_written_as_ever(value: Any) -> None:
     assert json_text(value) == json.dumps(value)
     assert finite(value) == value
 
 
-BAD = {"inf": inf, "-inf": -inf, "nan": nan, "float64": np.float64(inf), "float32": np.float32(nan), "long": 10**5000}
+BAD = {
+    "inf": inf,
+    "-inf": -inf,
+    "nan": nan,
+    "float64": np.float64(inf),
+    "float32": np.float32(nan),
+    "long": 10**5000,
+}
 
 
 @pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
@@ -92,8 +104,11 @@ def test_nothing_else_writes_json() -> None:
             calls = [
                 node.lineno
                 for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-                if isinstance(node, ast.Attribute) and node.attr in ("dumps", "dump", "json_response")
+                if isinstance(node, ast.Attribute)
+                and node.attr in ("dumps", "dump", "json_response")
                 if isinstance(node.value, ast.Name) and node.value.id in ("json", "web")
             ]
             name = path.relative_to(ROOT).as_posix()
-            assert not calls or name in own, f"{name}:{calls[0]}: write JSON with services.comm.json_text.json_text"
+            assert not calls or name in own, (
+                f"{name}:{calls[0]}: write JSON with services.comm.json_text.json_text"
+            )

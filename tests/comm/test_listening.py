@@ -1,4 +1,5 @@
-"""An address that a node cannot have: file, key and remedy are told before any device is touched."""
+"""An address that a node cannot have: file, key and remedy are told before any device is
+touched."""
 
 from __future__ import annotations
 
@@ -8,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from services.__main__ import main
-from services.comm.cell import CellError
-from services.comm.directory import Directory, DirectoryError, parse
-from services.comm.listening import cannot_listen, listening, refuse_unusable
-from services.comm.lockstep import Member
+from petrobot.services.__main__ import main
+from petrobot.services.comm.cell import CellError
+from petrobot.services.comm.directory import Directory, DirectoryError, parse
+from petrobot.services.comm.listening import cannot_listen, listening, refuse_unusable
+from petrobot.services.comm.lockstep import Member
 from tests.ports import free_ports
 
 PLACES = """\
@@ -42,29 +43,45 @@ def directory_in(folder: Path, host: str, port: int) -> Directory:
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        (OSError(errno.EADDRINUSE, "in use"), "nodes.left.port: 7301 is in use on 10.0.0.7; end the process"),
+        (
+            OSError(errno.EADDRINUSE, "in use"),
+            "nodes.left.port: 7301 is in use on 10.0.0.7; end the process",
+        ),
         (OSError(errno.EACCES, "denied"), "nodes.left.port: 7301 may not be used by this user"),
-        (OSError(errno.EADDRNOTAVAIL, "no"), "nodes.left.host: 10.0.0.7 is no address of this host"),
+        (
+            OSError(errno.EADDRNOTAVAIL, "no"),
+            "nodes.left.host: 10.0.0.7 is no address of this host",
+        ),
         (
             socket.gaierror(socket.EAI_NONAME, "unknown"),
             "nodes.left.host: 10.0.0.7 is no address and no known name (unknown)",
         ),
-        (OSError(errno.ENETDOWN, "down"), "nodes.left.host: cannot listen on 10.0.0.7:7301: down; correct"),
-        (OSError("of no number"), "nodes.left.host: cannot listen on 10.0.0.7:7301: of no number; correct"),
+        (
+            OSError(errno.ENETDOWN, "down"),
+            "nodes.left.host: cannot listen on 10.0.0.7:7301: down; correct",
+        ),
+        (
+            OSError("of no number"),
+            "nodes.left.host: cannot listen on 10.0.0.7:7301: of no number; correct",
+        ),
     ],
 )
 def test_each_reason_names_its_key_and_a_remedy(fault: OSError, said: str) -> None:
     assert cannot_listen("nodes.left", "10.0.0.7", 7301, fault).startswith(said)
 
 
-def test_a_node_whose_port_is_taken_touches_no_device(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_node_whose_port_is_taken_touches_no_device(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its first process may be moving them."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         directory = directory_in(tmp_path, "127.0.0.1", port)
         assert main(["left", "--services", str(directory.source)]) == 2
     said = capsys.readouterr().err
-    assert said.startswith(f"python -m services left: {directory.source}: nodes.left.port: {port} is in use")
+    assert said.startswith(
+        f"python -m petrobot.services left: {directory.source}: nodes.left.port: {port} is in use"
+    )
     assert said.count("\n") == 1
 
 
@@ -72,10 +89,14 @@ def test_a_foreign_address_is_the_hosts_fault(tmp_path: Path) -> None:
     """192.0.2.0/24 belongs to nobody (RFC 5737)."""
     directory = directory_in(tmp_path, "192.0.2.1", 7301)
     with pytest.raises(
-        DirectoryError, match=r"services\.toml: nodes\.left\.host: 192\.0\.2\.1 is no address of this host"
+        DirectoryError,
+        match=r"services\.toml: nodes\.left\.host: 192\.0\.2\.1 is no address of this host",
     ):
         refuse_unusable(directory, "left")
-    with pytest.raises(DirectoryError, match=r"nodes\.left\.port: 7301 is in use"), listening(directory, "left"):
+    with (
+        pytest.raises(DirectoryError, match=r"nodes\.left\.port: 7301 is in use"),
+        listening(directory, "left"),
+    ):
         raise OSError(errno.EADDRINUSE, "in use")
 
 
@@ -86,7 +107,9 @@ def test_an_address_that_is_free_may_be_had(tmp_path: Path) -> None:
     socket.create_server(("127.0.0.1", port)).close()
 
 
-@pytest.mark.parametrize(("name", "key"), [("left", "nodes.left.port"), ("coordinator", "coordinator.port")])
+@pytest.mark.parametrize(
+    ("name", "key"), [("left", "nodes.left.port"), ("coordinator", "coordinator.port")]
+)
 def test_a_member_of_a_lock_step_cell_says_so_too(name: str, key: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -1,4 +1,5 @@
-"""Lock step: one order whatever the placement, in one process, in threads and in processes; and how a cell ends."""
+"""Lock step: one order whatever the placement, in one process, in threads and in processes; and how
+a cell ends."""
 
 from __future__ import annotations
 
@@ -17,10 +18,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.cell import Cell, CellError, Delays
-from services.comm.lockstep import Member, PartyLostError
-from services.comm.party import TICK, Envelope, Party, Posted
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.cell import Cell, CellError, Delays
+from petrobot.services.comm.lockstep import Member, PartyLostError
+from petrobot.services.comm.party import TICK, Envelope, Party, Posted
 from tests.waiting import Limit
 
 from .ends import frame
@@ -34,7 +35,9 @@ _word = st.tuples(st.sampled_from(NAMES), st.sampled_from(["can", "call", "image
 _script = st.dictionaries(st.integers(0, TICKS).map(str), st.lists(_word, max_size=3), max_size=6)
 SCRIPTS = st.fixed_dictionaries(dict.fromkeys(NAMES, _script))
 DELAYS = st.dictionaries(
-    st.sampled_from(["can", "image", "motion.toy/sim.toy", "vision.toy/coordinator.toy"]), st.integers(1, 5), max_size=4
+    st.sampled_from(["can", "image", "motion.toy/sim.toy", "vision.toy/coordinator.toy"]),
+    st.integers(1, 5),
+    max_size=4,
 )
 
 
@@ -89,7 +92,14 @@ def test_one_process_and_a_mesh_hear_the_same(scripts: Any, delays: Any, key: by
 
     def member(name: str) -> Callable[[], tuple[str, int]]:
         def run() -> tuple[str, int]:
-            one = Member(name, [toys[name]], addresses, delays=Delays(delays), key=key, listener=listeners[name])
+            one = Member(
+                name,
+                [toys[name]],
+                addresses,
+                delays=Delays(delays),
+                key=key,
+                listener=listeners[name],
+            )
             one.open()
             return one.run(max_ticks=TICKS if name == NAMES[0] else None), one.tick
 
@@ -129,7 +139,10 @@ def test_one_process_and_four_hear_the_same(seed: int) -> None:
     for n, name in enumerate(NAMES):
         scripts[name] = {
             str(tick): [
-                (NAMES[(tick * 3 + n + k + seed) % 4], ["can", "call", "image", "control"][(tick + k) % 4])
+                (
+                    NAMES[(tick * 3 + n + k + seed) % 4],
+                    ["can", "call", "image", "control"][(tick + k) % 4],
+                )
                 for k in range((tick + n) % 3)
             ]
             for tick in range(ticks)
@@ -140,7 +153,9 @@ def test_one_process_and_four_hear_the_same(seed: int) -> None:
         listener.close()
     arguments = [json.dumps(one) for one in (ticks, addresses, scripts, delays)]
     processes = [
-        subprocess.Popen([sys.executable, str(TOY), name, *arguments], stdout=subprocess.PIPE, cwd=TOY.parents[2])
+        subprocess.Popen(
+            [sys.executable, str(TOY), name, *arguments], stdout=subprocess.PIPE, cwd=TOY.parents[2]
+        )
         for name in NAMES
     ]
     heard = {}
@@ -191,17 +206,32 @@ def test_envelopes_arrive_in_the_order_of_tick_source_and_sequence() -> None:
     b = Post("b")
     cell = Cell([Post("c", sends), b], Delays({"image": 2}))
     assert cell.run(lambda: cell.tick == 4, 100)
-    assert b.got == [(2, "z", "slow"), (2, "a", "x"), (2, "z", "first"), (2, "z", "second"), (3, "a", "y")]
+    assert b.got == [
+        (2, "z", "slow"),
+        (2, "a", "x"),
+        (2, "z", "first"),
+        (2, "z", "second"),
+        (3, "a", "y"),
+    ]
     assert b.ticks == [0.0, TICK, 2 * TICK, 3 * TICK]
 
 
-@given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from("pqrs"), st.integers(0, 99)), max_size=12), st.data())
-def test_moving_an_endpoint_to_another_party_changes_nothing(words: Any, data: st.DataObject) -> None:
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 5), st.sampled_from("pqrs"), st.integers(0, 99)), max_size=12
+    ),
+    st.data(),
+)
+def test_moving_an_endpoint_to_another_party_changes_nothing(
+    words: Any, data: st.DataObject
+) -> None:
     homes = {name: data.draw(st.sampled_from(["c", "d", "b"])) for name in "pqrs"}
     heard = []
     for placed in (dict.fromkeys("pqrs", "c"), homes):
         posts = {
-            party: Post(party, [(t, _envelope(who, n)) for t, who, n in words if placed[who] == party])
+            party: Post(
+                party, [(t, _envelope(who, n)) for t, who, n in words if placed[who] == party]
+            )
             for party in "bcd"
         }
         Cell(list(posts.values())).run(lambda: False, 9)
@@ -235,10 +265,19 @@ def test_bodies_arrive_as_from_another_process_and_are_nobody_elses() -> None:
     ("posts", "says"),
     [
         ([Post("b"), Post("b")], "two parties are named b"),
-        ([Post("c", [(0, _envelope("z", object()))]), Post("b")], "z sends there on control what no envelope carries"),
+        (
+            [Post("c", [(0, _envelope("z", object()))]), Post("b")],
+            "z sends there on control what no envelope carries",
+        ),
         ([Post("c", [(0, _envelope("z", {1: 2}))]), Post("b")], "a key of a map is not a str"),
-        ([Post("c", [(0, _envelope("z", 1, party="nobody"))])], "party nobody, which is not in the cell"),
-        ([Post("c", [(0, _envelope("z", 1))]), Post("b", [(0, _envelope("z", 1))])], "both send as z"),
+        (
+            [Post("c", [(0, _envelope("z", 1, party="nobody"))])],
+            "party nobody, which is not in the cell",
+        ),
+        (
+            [Post("c", [(0, _envelope("z", 1))]), Post("b", [(0, _envelope("z", 1))])],
+            "both send as z",
+        ),
     ],
 )
 def test_mistakes_of_parties_are_named(posts: list[Party], says: str) -> None:
@@ -280,7 +319,10 @@ def test_all_have_run_the_same_ticks_when_one_ends_the_cell() -> None:
 
 def test_large_images_both_ways_at_once_do_not_block_the_cell() -> None:
     image = np.arange(3_000_000, dtype=np.uint8).reshape(1500, 2000)
-    posts = [Post(me, [(t, _envelope(f"{me}.cam", image, party=you)) for t in range(6)]) for me, you in ("ab", "ba")]
+    posts = [
+        Post(me, [(t, _envelope(f"{me}.cam", image, party=you)) for t in range(6)])
+        for me, you in ("ab", "ba")
+    ]
     assert _two(*posts) == ["until", "a: until"]
     for post in posts:
         assert [tick for tick, _, _ in post.got] == [1, 2, 3, 4, 5, 6]
@@ -315,14 +357,22 @@ def _join(address: tuple[str, int], name: str = "b", directory: str = "") -> soc
         pytest.param(None, r"no end of tick 0 for 0\.3 s: lost", id="silent"),
         pytest.param(b"", "its process ended without a word", id="gone"),
         pytest.param(frame(m.Tick(1)), "tick 1 came after tick -1", id="tick left out"),
-        pytest.param(b"\x00\x00\x00\x02\xff\xff", "it broke the protocol: bad_check", id="random bytes"),
-        pytest.param(frame(m.Ping(1)), "a Ping has no place in lock step", id="another kind"),
-        pytest.param(frame(m.Refuse("failed", "it failed: no luck")), "b: it failed: no luck", id="failed"),
         pytest.param(
-            frame(m.Tick(0, (Posted(0, 0, _envelope("z", 1, party="a")),))), "does not belong here", id="due at once"
+            b"\x00\x00\x00\x02\xff\xff", "it broke the protocol: malformed", id="random bytes"
+        ),
+        pytest.param(frame(m.Ping(1)), "a Ping has no place in lock step", id="another kind"),
+        pytest.param(
+            frame(m.Refuse("failed", "it failed: no luck")), "b: it failed: no luck", id="failed"
         ),
         pytest.param(
-            frame(m.Tick(0, (Posted(1, 0, _envelope("z", 1, party="q")),))), "does not belong here", id="not for a"
+            frame(m.Tick(0, (Posted(0, 0, _envelope("z", 1, party="a")),))),
+            "does not belong here",
+            id="due at once",
+        ),
+        pytest.param(
+            frame(m.Tick(0, (Posted(1, 0, _envelope("z", 1, party="q")),))),
+            "does not belong here",
+            id="not for a",
         ),
     ],
 )
@@ -340,7 +390,13 @@ def test_a_member_that_does_not_keep_step_is_lost(rest: bytes | None, says: str)
                 pass
 
     def own() -> str:
-        member = Member("a", [Post("a")], addresses, listener=listeners["a"], patience=0.3 if rest is None else 60.0)
+        member = Member(
+            "a",
+            [Post("a")],
+            addresses,
+            listener=listeners["a"],
+            patience=0.3 if rest is None else 60.0,
+        )
         member.open()
         return member.run()
 
@@ -392,7 +448,14 @@ def test_members_with_different_directories_do_not_form_a_cell() -> None:
     listeners, addresses = _listeners(["a", "b"])
 
     def member(name: str, directory: str) -> Callable[[], None]:
-        return Member(name, [Post(name)], addresses, listener=listeners[name], directory=directory, joining=2.0).open
+        return Member(
+            name,
+            [Post(name)],
+            addresses,
+            listener=listeners[name],
+            directory=directory,
+            joining=2.0,
+        ).open
 
     a, b = _in_threads([member("a", "d1"), member("b", "d2")])
     assert isinstance(b, CellError) and "different services.toml" in str(b)

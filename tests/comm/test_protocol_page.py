@@ -8,27 +8,36 @@ from pathlib import Path
 
 import pytest
 
-from services.comm import messages as m
-from services.comm.codec import LIMITS
-from services.comm.link import Timing
-from services.comm.results import Keeping
-from services.comm.under_way import Patience
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.codec import LIMITS
+from petrobot.services.comm.link import Timing
+from petrobot.services.comm.results import Keeping
+from petrobot.services.comm.under_way import Patience
 
 from .conftest import KINDS
 from .ends import frame
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
-ROWS = {int(row[1]): row for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)}
+ROWS = {
+    int(row[1]): row
+    for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)
+}
 UNITS = {"B": 1, "KiB": 1024, "MiB": 1024 * 1024}
 SERVICES = Path(m.__file__).parents[1]
-CODE = "\n".join(path.read_text(encoding="utf-8") for path in [*SERVICES.glob("comm/*.py"), *SERVICES.glob("*.py")])
+CODE = "\n".join(
+    path.read_text(encoding="utf-8")
+    for path in [*SERVICES.glob("comm/*.py"), *SERVICES.glob("*.py")]
+)
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_the_table_of_messages(kind: type[m.Message]) -> None:
     row = ROWS[kind.KIND]
     fields = [field.name for field in dataclasses.fields(kind)]
-    assert re.findall(r"(\w+) (?:str|int|dur|bool|bytes|map|\*text\*|\[\w+\])(?=[ ,)]|$)", row[4]) == fields
+    assert (
+        re.findall(r"(\w+) (?:str|int|dur|bool|bytes|map|\*text\*|\[\w+\])(?=[ ,)]|$)", row[4])
+        == fields
+    )
     required = [
         field.name
         for field in dataclasses.fields(kind)
@@ -48,14 +57,25 @@ def test_the_example() -> None:
 
 def test_the_codes_and_causes_are_the_codes() -> None:
     tables = re.findall(r"^\| ([a-z_, ]+) \|", PAGE, re.M)
-    named = {name for row in tables for name in row.split(", ")} - {"opening", "open", "closing", "closed", "state"}
+    named = {name for row in tables for name in row.split(", ")} - {
+        "opening",
+        "open",
+        "closing",
+        "closed",
+        "state",
+    }
     named -= {"code", "cause", "kind", "busy"}
     assert len(named) > 30
     assert [name for name in sorted(named) if f'"{name}"' not in CODE] == []
 
 
 def test_the_times() -> None:
-    assert (Timing().heartbeat, Timing().silence, Timing().handshake, Timing().user_timeout) == (0.25, 1.0, 2.0, 1.5)
+    assert (Timing().heartbeat, Timing().silence, Timing().handshake, Timing().user_timeout) == (
+        0.25,
+        1.0,
+        2.0,
+        1.5,
+    )
     assert (Patience().reconnect, Patience().accept, Patience().stop) == (2.0, 1.0, 5.0)
     assert (Keeping().results, Keeping().result_count, Keeping().lease) == (600.0, 1_000, 2.0)
     assert Keeping().id_groups == 100_000

@@ -1,4 +1,5 @@
-"""Lock step with a member that dies and comes back: the others wait where they stand, no tick is run twice or left out."""
+"""Lock step with a member that dies and comes back: the others wait where they stand, no tick is
+run twice or left out."""
 
 from __future__ import annotations
 
@@ -9,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from services.comm.lockstep import Member, PartyLostError
-from services.comm.party import TICK
+from petrobot.services.comm.lockstep import Member, PartyLostError
+from petrobot.services.comm.party import TICK
 from tests.comm.toy_party import Toy
 from tests.ports import free_ports
 
@@ -44,7 +45,8 @@ class _Mortal:
         self.toy = _Counting(MORTAL)
 
     def live(self, death: int | None, told: Collection[str], until: int, rejoins: bool) -> str:
-        """One life: join, run, and die at the tick `death` or end the cell when `until` ticks are over."""
+        """One life: join, run, and die at the tick `death` or end the cell when `until` ticks are
+        over."""
         member = Member(MORTAL, [self.toy], self._addresses, key=self._key, rejoins=rejoins)
         member.open()
 
@@ -65,15 +67,22 @@ class _Mortal:
 
 @pytest.mark.parametrize("key", [None, b"k" * 32])
 @pytest.mark.parametrize("told", [(), ("arm",), ("motion", "vision"), NODES])
-def test_a_member_that_dies_comes_back_to_where_the_others_are(told: Collection[str], key: bytes | None) -> None:
-    """Killed twice, each time with its last Tick sent to some of its peers only; then it ends the cell."""
+def test_a_member_that_dies_comes_back_to_where_the_others_are(
+    told: Collection[str], key: bytes | None
+) -> None:
+    """Killed twice, each time with its last Tick sent to some of its peers only; then it ends the
+    cell."""
     listeners = {name: socket.create_server(("127.0.0.1", 0)) for name in NODES}
-    addresses = {name: one.getsockname() for name, one in listeners.items()} | {MORTAL: ("127.0.0.1", free_ports(1)[0])}
+    addresses = {name: one.getsockname() for name, one in listeners.items()} | {
+        MORTAL: ("127.0.0.1", free_ports(1)[0])
+    }
     toys = {name: _Counting(name) for name in NODES}
     ends: dict[str, Any] = {}
 
     def survive(name: str) -> None:
-        one = Member(name, [toys[name]], addresses, key=key, listener=listeners[name], returning={MORTAL})
+        one = Member(
+            name, [toys[name]], addresses, key=key, listener=listeners[name], returning={MORTAL}
+        )
         one.open()
         ends[name] = one.run(), one.tick
 
@@ -92,7 +101,8 @@ def test_a_member_that_dies_comes_back_to_where_the_others_are(told: Collection[
     assert all(toy.ticks == list(range(30)) for toy in toys.values())
     ran = mortal.toy.ticks
     assert ran == sorted(ran)
-    # A peer that had not read its word yet when the connection broke never heard it: that tick is run again, and no other.
+    # A peer that had not read its word yet when the connection broke never heard it: that tick is
+    # run again, and no other.
     again = {tick for tick in ran if ran.count(tick) > 1}
     assert again <= {7, 15} and all(ran.count(tick) <= 2 for tick in ran)
     assert len(ran) >= 30 - 2 * 3
@@ -105,7 +115,14 @@ def test_one_that_does_not_come_back_is_lost_after_its_absence() -> None:
     failures: list[Any] = []
 
     def survive() -> None:
-        one = Member("motion", [Toy("motion", {})], addresses, listener=listener, returning={MORTAL}, absence=0.2)
+        one = Member(
+            "motion",
+            [Toy("motion", {})],
+            addresses,
+            listener=listener,
+            returning={MORTAL},
+            absence=0.2,
+        )
         one.open()
         try:
             one.run()
@@ -117,4 +134,8 @@ def test_one_that_does_not_come_back_is_lost_after_its_absence() -> None:
     with pytest.raises(_Killed):
         _Mortal(addresses, None).live(5, ("motion",), 100, rejoins=False)
     thread.join(60.0)
-    assert not thread.is_alive() and failures and failures[0].startswith("coordinator: nobody answers on 127.0.0.1")
+    assert (
+        not thread.is_alive()
+        and failures
+        and failures[0].startswith("coordinator: nobody answers on 127.0.0.1")
+    )

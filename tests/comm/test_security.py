@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm.security import (
+from petrobot.services.comm.security import (
     KeyFileError,
     KeyNeededError,
     Seal,
@@ -91,7 +91,8 @@ def test_a_key_of_another_user_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_key_file_is_looked_at_and_read_in_one_piece(tmp_path: Path) -> None:
-    """What is checked is what is read: whoever changes the name in between changes nothing. A pipe does not hold anyone up."""
+    """What is checked is what is read: whoever changes the name in between changes nothing. A pipe
+    does not hold anyone up."""
     good, other = tmp_path / "cell.key", tmp_path / "other.key"
     key = new_key()
     write_key(good, key)

@@ -1,4 +1,5 @@
-"""The machines on real sockets: calls, commands and events, liveness, and callers that are refused."""
+"""The machines on real sockets: calls, commands and events, liveness, and callers that are
+refused."""
 
 from __future__ import annotations
 
@@ -6,11 +7,11 @@ import asyncio
 
 import pytest
 
-from services.comm import messages as m
-from services.comm.callee import CancelRun, StartRun
-from services.comm.caller import Answered, Ended, PeerBack, PeerLost
-from services.comm.messages import Executed
-from services.comm.security import KeyNeededError
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import CancelRun, StartRun
+from petrobot.services.comm.caller import Answered, Ended, PeerBack, PeerLost
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.security import KeyNeededError
 
 from .ends import Coordinator, Node, until
 
@@ -80,7 +81,9 @@ async def test_cancelling_the_future_cancels_the_call(open_node: Node) -> None:
     await coordinator.client.close()
 
 
-async def test_a_result_or_a_call_too_large_for_a_frame_ends_that_call_alone(node: Node, key: bytes | None) -> None:
+async def test_a_result_or_a_call_too_large_for_a_frame_ends_that_call_alone(
+    node: Node, key: bytes | None
+) -> None:
     coordinator = node.client(key=key)
     assert await coordinator.client.connected(60.0)
     huge, too_big, fine = await asyncio.gather(
@@ -147,7 +150,8 @@ async def test_other_hosts_cannot_connect_without_a_key(host: str) -> None:
 async def test_a_refused_caller_is_told_why_and_its_calls_end(
     open_node: Node, hello: m.Hello, key: bytes | None, cause: str, code: str
 ) -> None:
-    """At once where nothing could prove the refusal; with a key one that is not proven ends nothing, and is tried again."""
+    """At once where nothing could prove the refusal; with a key one that is not proven ends
+    nothing, and is tried again."""
     coordinator = open_node.client(hello, key=key)
     outcome = await coordinator.client.call("echo")
     assert (outcome.cause, outcome.executed) == (cause, Executed.NO)
@@ -161,13 +165,17 @@ async def test_a_wrong_key_is_told_to_both(key: bytes | None) -> None:
     coordinator = node.client(key=key)
     outcome = await coordinator.client.call("echo")
     assert outcome.cause == ("unreachable" if key else "refused")
-    assert ("unauthenticated refusal: wrong_key" if key else "refuses the connection: key_needed") in outcome.text
+    assert (
+        "unauthenticated refusal: wrong_key" if key else "refuses the connection: key_needed"
+    ) in outcome.text
     assert set(node.server.faults) == {"wrong_key" if key else "key_needed"}
     await coordinator.client.close()
     await node.server.close()
 
 
-async def test_a_second_process_of_a_name_is_refused_and_a_newer_epoch_takes_over(open_node: Node) -> None:
+async def test_a_second_process_of_a_name_is_refused_and_a_newer_epoch_takes_over(
+    open_node: Node,
+) -> None:
     first = open_node.client()
     assert await first.client.connected(60.0)
     second = open_node.client(m.Hello(2, 2, "coordinator", "coord", "c2", 1))

@@ -1,7 +1,9 @@
-"""The shipped cell's vision node, launched from the shipped location file, under everything that a stranger can send to it.
+"""The shipped cell's vision node, launched from the shipped location file, under everything that a
+stranger can send to it.
 
-Malformed frames by the thousand, handshakes that drip, lengths and nestings beyond all limits, bodies that never end: a good
-caller on one connection is answered throughout, a new one is let in, and the node keeps neither memory nor sockets.
+Malformed frames by the thousand, handshakes that drip, lengths and nestings beyond all limits,
+bodies that never end: a good caller on one connection is answered throughout, a new one is let in,
+and the node keeps neither memory nor sockets.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from services.comm import messages as m
+from petrobot.services.comm import messages as m
 from tests.comm import foreign as f
 from tests.comm.ends import frame, framed, head
 from tests.comm.foreign import Foreign, pack
@@ -68,9 +70,9 @@ class Vision:
 
 @pytest.fixture(scope="module")
 def vision(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Vision]:
-    """`python -m services vision` on the shipped services.toml, with free ports."""
+    """`python -m petrobot.services vision` on the shipped services.toml, with free ports."""
     file = services_file(tmp_path_factory.mktemp("cell"))
-    command = [sys.executable, "-m", "services", "vision", "--services", str(file)]
+    command = [sys.executable, "-m", "petrobot.services", "vision", "--services", str(file)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout is not None
     said = process.stdout.readline()
@@ -118,7 +120,8 @@ def malformed(random_: random.Random) -> bytes:
 
 
 def attack(vision: Vision, connections: int) -> None:
-    """So many connections that are no good; the good caller asks ten times a second and is answered each time."""
+    """So many connections that are no good; the good caller asks ten times a second and is answered
+    each time."""
     random_ = random.Random(connections)
     good = vision.good("good")
     ask(good)
@@ -157,7 +160,8 @@ def test_a_hundred_thousand_malformed_frames(vision: Vision) -> None:
 
 
 def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
-    """Two hundred connections that say a byte of HELLO now and then: each is cut after its 2 s, a good caller gets in at once."""
+    """Two hundred connections that say a byte of HELLO now and then: each is cut after its 2 s, a
+    good caller gets in at once."""
     hello = _hello("drip")
     drips = [vision.stranger() for _ in range(200)]
     for at in range(4):
@@ -181,13 +185,26 @@ def test_dripping_handshakes_keep_nobody_out(vision: Vision) -> None:
         (head(16 * MIB + 5) + b"\x99\x04", "too_large"),
         (framed(b"\x94\x04\xa11\xa1s" + b"\x81\xa1a" * 5_000 + b"\xc0"), "malformed"),
         (framed(b"\x94\x04\xa11\xa1s\x81\xa1a" + b"\x91" * 5_000 + b"\xc0"), "malformed"),
-        (framed(b"\x94\x04\xa11\xa1s\x81\xa1a\xdd\x00\x0f\x42\x40" + b"\x90" * 1_000_000), "malformed"),
+        (
+            framed(b"\x94\x04\xa11\xa1s\x81\xa1a\xdd\x00\x0f\x42\x40" + b"\x90" * 1_000_000),
+            "malformed",
+        ),
         (framed(b"\x94\x04\xa11\xa1s\x81\xa1a\xdd\xff\xff\xff\xff\x01"), "malformed"),
         (framed(b"\x94\x04\xa11\xa1s\x81\xa1a\xc6\xff\xff\xff\xff\x01"), "malformed"),
     ],
-    ids=["4 GiB", "16 MiB and a byte", "maps", "arrays", "a million arrays", "2^32 items", "2^32 bytes"],
+    ids=[
+        "4 GiB",
+        "16 MiB and a byte",
+        "maps",
+        "arrays",
+        "a million arrays",
+        "2^32 items",
+        "2^32 bytes",
+    ],
 )
-def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(vision: Vision, body: bytes, code: str) -> None:
+def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(
+    vision: Vision, body: bytes, code: str
+) -> None:
     good = vision.good("steady")
     before = vision.size()
     for number in range(10):
@@ -202,7 +219,8 @@ def test_what_is_beyond_all_limits_is_refused_and_costs_nothing(vision: Vision, 
 
 
 def test_bodies_that_never_end_are_bounded(vision: Vision) -> None:
-    """Twelve callers, each with a call of 2 MiB of which the last byte never comes: the good one is answered all the while."""
+    """Twelve callers, each with a call of 2 MiB of which the last byte never comes: the good one is
+    answered all the while."""
     good, open_ = vision.good("patient"), []
     for number in range(12):
         one = vision.good(f"endless {number}")

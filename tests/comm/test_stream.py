@@ -6,16 +6,17 @@ import math
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.security import KeyNeededError
-from services.comm.stream import Incoming, Inlet, StreamReceiver, StreamSender
-from services.comm.stream_line import Lateness
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.security import KeyNeededError
+from petrobot.services.comm.stream import Incoming, Inlet, StreamReceiver, StreamSender
+from petrobot.services.comm.stream_line import Lateness
 
 from .ends import frame, framed
 
@@ -70,8 +71,13 @@ def test_what_was_held_up_on_its_way_is_as_old_as_it_is() -> None:
     assert sink.got[7:] == [None]
 
 
-@given(st.lists(st.tuples(st.floats(0.001, 0.1), st.floats(0.0, 0.5)), min_size=1, max_size=50), st.floats(-1e3, 1e3))
-def test_lateness_is_the_delay_beyond_the_quickest(steps: list[tuple[float, float]], offset: float) -> None:
+@given(
+    st.lists(st.tuples(st.floats(0.001, 0.1), st.floats(0.0, 0.5)), min_size=1, max_size=50),
+    st.floats(-1e3, 1e3),
+)
+def test_lateness_is_the_delay_beyond_the_quickest(
+    steps: list[tuple[float, float]], offset: float
+) -> None:
     lateness, elapsed, quickest, arrived = Lateness(), 0.0, float("inf"), float("-inf")
     for step, delay in steps:
         elapsed += step
@@ -104,7 +110,9 @@ def receiver(sink: Sink, key: bytes | None) -> Iterator[StreamReceiver]:
 
 @pytest.fixture
 def sender(receiver: StreamReceiver, key: bytes | None) -> Iterator[StreamSender]:
-    one = StreamSender("vision", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key)
+    one = StreamSender(
+        "vision", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key
+    )
     yield one
     one.close()
 
@@ -117,7 +125,9 @@ def _until(condition: Callable[[], bool], *steps: Callable[[], object]) -> None:
             step()
 
 
-def test_a_stream_from_its_first_value_to_its_end(sink: Sink, receiver: StreamReceiver, sender: StreamSender) -> None:
+def test_a_stream_from_its_first_value_to_its_end(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+) -> None:
     assert not sender.send((0.0,)), "not connected yet: dropped, a newer one follows"
     _until(lambda: sender.up, sender.advance, receiver.poll)
     assert sender.send((1.0, 2.0), held=0.08) and sender.send((3.0, 4.0))
@@ -132,7 +142,9 @@ def test_a_stream_from_its_first_value_to_its_end(sink: Sink, receiver: StreamRe
     assert len(receiver.sockets()) == 1 and receiver.faults == 0
 
 
-def test_a_sender_that_is_gone_stands_by_nothing(sink: Sink, receiver: StreamReceiver, sender: StreamSender) -> None:
+def test_a_sender_that_is_gone_stands_by_nothing(
+    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     assert sender._line is not None
     sender._line.sock.close()
@@ -146,7 +158,9 @@ def test_a_receiver_that_comes_back_is_found_again(
     host, port = receiver.address
     receiver.close()
     _until(lambda: not sender.up, lambda: sender.send((2.0,)))
-    again = StreamReceiver("motion", {"catch_point": Incoming(0.04, sink, "t1")}, host=host, port=port, key=key)
+    again = StreamReceiver(
+        "motion", {"catch_point": Incoming(0.04, sink, "t1")}, host=host, port=port, key=key
+    )
     _until(lambda: sink.got[-1] is not None, lambda: sender.send((3.0,)), again.poll)
     again.close()
 
@@ -155,8 +169,14 @@ def test_the_newest_sender_of_a_stream_takes_it_over(
     sink: Sink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
-    other = StreamSender("vision2", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key)
-    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (2.0,), lambda: other.send((2.0,)), receiver.poll)
+    other = StreamSender(
+        "vision2", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=key
+    )
+    _until(
+        lambda: sink.got[-1] is not None and sink.got[-1][0] == (2.0,),
+        lambda: other.send((2.0,)),
+        receiver.poll,
+    )
     assert len(receiver.sockets()) == 2
     other.close()
 
@@ -171,9 +191,17 @@ def test_the_newest_sender_of_a_stream_takes_it_over(
     ],
 )
 def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
-    sink: Sink, receiver: StreamReceiver, key: bytes | None, stream: str, period: float, ticket: str, code: str
+    sink: Sink,
+    receiver: StreamReceiver,
+    key: bytes | None,
+    stream: str,
+    period: float,
+    ticket: str,
+    code: str,
 ) -> None:
-    sender = StreamSender("vision", stream, period, *receiver.address, receiver="motion", ticket=ticket, key=key)
+    sender = StreamSender(
+        "vision", stream, period, *receiver.address, receiver="motion", ticket=ticket, key=key
+    )
     _until(lambda: bool(sender.refusal), lambda: sender.send((1.0,)), receiver.poll)
     assert sender.refusal.startswith(code) and not sender.up
     assert receiver.faults >= 1 and sink.got == []
@@ -184,9 +212,19 @@ def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
 def test_a_sender_without_the_key_is_refused(sink: Sink, receiver: StreamReceiver) -> None:
     for wrong in (None, b"x" * 32):
         sender = StreamSender(
-            "vision", "catch_point", 0.04, *receiver.address, receiver="motion", ticket="t1", key=wrong
+            "vision",
+            "catch_point",
+            0.04,
+            *receiver.address,
+            receiver="motion",
+            ticket="t1",
+            key=wrong,
         )
-        _until(lambda one=sender: bool(one.refusal), lambda one=sender: one.send((1.0,)), receiver.poll)  # type: ignore[misc]
+        _until(
+            lambda one=sender: bool(one.refusal),  # type: ignore[misc]
+            partial(sender.send, (1.0,)),
+            receiver.poll,
+        )
         assert "key" in sender.refusal
         sender.close()
     assert sink.got == []
@@ -196,7 +234,9 @@ OPENING = frame(m.Hello(2, 2, "stream", "vision", "b"))
 MALFORMED = [
     pytest.param([b"\x00\x00\x00\x05hello"], id="random bytes"),
     pytest.param([OPENING, frame(m.SetPoint(1, (1.0,)))], id="no STREAM_OPEN"),
-    pytest.param([OPENING, frame(m.StreamOpen("catch_point", 0.04, "t1")), b"\xff" * 9], id="bad set point"),
+    pytest.param(
+        [OPENING, frame(m.StreamOpen("catch_point", 0.04, "t1")), b"\xff" * 9], id="bad set point"
+    ),
     pytest.param([OPENING, framed(msgpack.packb([m.SetPoint.KIND, 1, [math.nan]]))], id="nan"),
 ]
 
@@ -211,7 +251,11 @@ def test_malformed_set_points_end_their_connection_alone(
             sock.sendall(data)
             _until(lambda: receiver.faults > 0 or _is_served(receiver), receiver.poll)
         _until(lambda: receiver.faults == 1 and len(receiver.sockets()) == 1, receiver.poll)
-    _until(lambda: bool(sink.got) and sink.got[-1] is not None, lambda: sender.send((1.0,)), receiver.poll)
+    _until(
+        lambda: bool(sink.got) and sink.got[-1] is not None,
+        lambda: sender.send((1.0,)),
+        receiver.poll,
+    )
 
 
 def _is_served(receiver: StreamReceiver) -> bool:
@@ -237,7 +281,11 @@ def test_a_receiver_that_stands_still_never_blocks_its_sender_and_sees_the_newes
     for n in range(20_000):
         sender.send((float(n),))
     assert sender.dropped > 0
-    _until(lambda: sink.got[-1] is not None and sink.got[-1][0] == (-1.0,), receiver.poll, lambda: sender.send((-1.0,)))
+    _until(
+        lambda: sink.got[-1] is not None and sink.got[-1][0] == (-1.0,),
+        receiver.poll,
+        lambda: sender.send((-1.0,)),
+    )
     assert len(sink.got) < 5_000
 
 

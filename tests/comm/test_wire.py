@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.codec import LIMITS, decode, encode
-from services.comm.security import Keys
-from services.comm.wire import Connection, ProtocolError, Side, State, negotiate
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.codec import LIMITS, decode, encode
+from petrobot.services.comm.security import Keys
+from petrobot.services.comm.wire import Connection, ProtocolError, Side, State, negotiate
 from tests.waiting import Limit
 
 from .conftest import KEY, KINDS, NONCES, SERVER, greet, messages_of, new_pair
@@ -40,8 +40,21 @@ FROM_CLIENT = {
     m.SetPoint,
     m.Withdraw,
 }
-FROM_SERVER = {m.Accept, m.Feedback, m.Outcome, m.Event, m.Answer, m.Ping, m.Pong, m.Tick, m.Bye, m.Refuse}
-SPOKEN = messages_of(sorted(FROM_CLIENT - {m.Bye, m.Refuse, m.Ping, m.Pong}, key=lambda kind: kind.__name__))
+FROM_SERVER = {
+    m.Accept,
+    m.Feedback,
+    m.Outcome,
+    m.Event,
+    m.Answer,
+    m.Ping,
+    m.Pong,
+    m.Tick,
+    m.Bye,
+    m.Refuse,
+}
+SPOKEN = messages_of(
+    sorted(FROM_CLIENT - {m.Bye, m.Refuse, m.Ping, m.Pong}, key=lambda kind: kind.__name__)
+)
 
 
 def _cut(data: bytes, cuts: list[int]) -> list[bytes]:
@@ -90,14 +103,18 @@ def test_an_open_connection_reads_a_body_as_decode_does(data: st.DataObject, sea
     """Whole frames of the kinds that make up nearly all traffic are read without `decode`."""
     kind = data.draw(st.sampled_from((m.Call, m.Outcome)))
     body = bytearray(encode(data.draw(messages_of([kind]))))
-    for place, byte in data.draw(st.lists(st.tuples(st.integers(2, 10_000), st.integers(0, 255)), max_size=2)):
+    for place, byte in data.draw(
+        st.lists(st.tuples(st.integers(2, 10_000), st.integers(0, 255)), max_size=2)
+    ):
         body[min(place, len(body) - 1)] = byte
     _assert_read_alike(kind, bytes(body), KEY if sealed else None)
 
 
 @pytest.mark.parametrize("kind", [m.Call, m.Outcome])
 @pytest.mark.parametrize("length", [200, 239, 240, 255, 256, 300])
-def test_a_long_name_is_measured_on_an_open_connection(kind: type[Any], length: int, key: bytes | None) -> None:
+def test_a_long_name_is_measured_on_an_open_connection(
+    kind: type[Any], length: int, key: bytes | None
+) -> None:
     body = encode(kind("x", "y"))
     assert body.count(b"\xa1x") == 1
     _assert_read_alike(
@@ -139,10 +156,19 @@ def test_byte_by_byte_handshake_and_call(key: bytes | None, pair: Pair) -> None:
         towards_client = b""
         towards_server += client.data_to_send()
     assert [type(message) for message in seen] == [m.Hello, m.Welcome, m.Call]
-    assert client.state is State.OPEN and server.state is State.OPEN and client.version == server.version == 2
+    assert (
+        client.state is State.OPEN
+        and server.state is State.OPEN
+        and client.version == server.version == 2
+    )
 
 
-@given(st.lists(st.binary(max_size=60), max_size=5), st.sampled_from([None, KEY]), st.sampled_from(Side), st.booleans())
+@given(
+    st.lists(st.binary(max_size=60), max_size=5),
+    st.sampled_from([None, KEY]),
+    st.sampled_from(Side),
+    st.booleans(),
+)
 def test_random_bytes_raise_nothing_but_protocol_error(
     pieces: list[bytes], key: bytes | None, side: Side, opened: bool
 ) -> None:
@@ -206,11 +232,15 @@ SAMPLES: dict[type[Any], Any] = {
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_each_side_of_an_open_connection_says_its_own_kinds_only(kind: type[Any], open_pair: Pair) -> None:
+def test_each_side_of_an_open_connection_says_its_own_kinds_only(
+    kind: type[Any], open_pair: Pair
+) -> None:
     for speaker, kinds in ((0, FROM_CLIENT), (1, FROM_SERVER)):
         ends = open_pair(None)
         if kind in kinds:
-            assert ends[1 - speaker].receive_data(ends[speaker].send(SAMPLES[kind])) == [SAMPLES[kind]]
+            assert ends[1 - speaker].receive_data(ends[speaker].send(SAMPLES[kind])) == [
+                SAMPLES[kind]
+            ]
             continue
         with pytest.raises(ProtocolError, match="out_of_turn"):
             ends[speaker].send(SAMPLES[kind])
@@ -223,15 +253,23 @@ def _raw(message: m.Message) -> bytes:
     return len(body).to_bytes(4, "big") + body
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not m.Hello], ids=lambda kind: kind.__name__)
-def test_a_server_takes_nothing_but_hello_first(kind: type[Any], key: bytes | None, pair: Pair) -> None:
+@pytest.mark.parametrize(
+    "kind", [kind for kind in KINDS if kind is not m.Hello], ids=lambda kind: kind.__name__
+)
+def test_a_server_takes_nothing_but_hello_first(
+    kind: type[Any], key: bytes | None, pair: Pair
+) -> None:
     _, server = pair(key)
     with pytest.raises(ProtocolError, match="out_of_turn"):
         server.receive_data(_raw(SAMPLES[kind]))
 
 
-@pytest.mark.parametrize("kind", [m.Call, m.Hello, m.Welcome, m.Ping], ids=lambda kind: kind.__name__)
-def test_a_server_with_a_key_takes_nothing_but_the_proof_second(kind: type[Any], pair: Pair) -> None:
+@pytest.mark.parametrize(
+    "kind", [m.Call, m.Hello, m.Welcome, m.Ping], ids=lambda kind: kind.__name__
+)
+def test_a_server_with_a_key_takes_nothing_but_the_proof_second(
+    kind: type[Any], pair: Pair
+) -> None:
     client, server = pair(KEY)
     assert server.receive_data(client.send(HELLO)) == []
     with pytest.raises(ProtocolError, match="out_of_turn"):
@@ -252,7 +290,9 @@ def test_nothing_follows_a_last_word(open_pair: Pair) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_a_frame_above_its_kinds_limit_is_refused_from_its_first_bytes(kind: type[Any], open_pair: Pair) -> None:
+def test_a_frame_above_its_kinds_limit_is_refused_from_its_first_bytes(
+    kind: type[Any], open_pair: Pair
+) -> None:
     client, server = open_pair(None)
     receiver = server if kind in FROM_CLIENT else client
     if kind not in FROM_CLIENT | FROM_SERVER:
@@ -265,7 +305,9 @@ def test_a_frame_above_its_kinds_limit_is_refused_from_its_first_bytes(kind: typ
 def test_a_large_hello_is_refused_from_its_first_bytes(key: bytes | None, pair: Pair) -> None:
     _, server = pair(key)
     with pytest.raises(ProtocolError, match="too_large"):
-        server.receive_data((LIMITS[m.Hello.KIND] + 1).to_bytes(4, "big") + bytes([0x99, m.Hello.KIND]))
+        server.receive_data(
+            (LIMITS[m.Hello.KIND] + 1).to_bytes(4, "big") + bytes([0x99, m.Hello.KIND])
+        )
 
 
 def test_a_refusal_reaches_a_client_that_is_opening(key: bytes | None, pair: Pair) -> None:
@@ -312,8 +354,12 @@ KEYS = [
 def test_keys_that_do_not_fit_are_refused_by_the_server(
     client_key: bytes | None, server_key: bytes | None, code: str
 ) -> None:
-    client = Connection(Side.CLIENT, SERVER, key=client_key, nonce=NONCES[Side.CLIENT] if client_key else b"")
-    server = Connection(Side.SERVER, SERVER, key=server_key, nonce=NONCES[Side.SERVER] if server_key else b"")
+    client = Connection(
+        Side.CLIENT, SERVER, key=client_key, nonce=NONCES[Side.CLIENT] if client_key else b""
+    )
+    server = Connection(
+        Side.SERVER, SERVER, key=server_key, nonce=NONCES[Side.SERVER] if server_key else b""
+    )
     with pytest.raises(ProtocolError, match=code):
         server.receive_data(client.send(HELLO))
         client.receive_data(server.data_to_send())
@@ -363,7 +409,9 @@ def test_a_changed_welcome_breaks_its_proof(pair: Pair) -> None:
         client.receive_data(welcome.replace(b"track", b"trick"))
 
 
-def test_a_recorded_session_cannot_be_played_again(pair: Pair, shake_hands: Callable[..., bytes]) -> None:
+def test_a_recorded_session_cannot_be_played_again(
+    pair: Pair, shake_hands: Callable[..., bytes]
+) -> None:
     client, server = pair(KEY)
     recorded = shake_hands(client, server) + client.send(m.Call("c1", "move"))
     again = Connection(Side.SERVER, SERVER, key=KEY, nonce=b"t" * 32)
@@ -406,20 +454,24 @@ def test_a_connection_with_a_key_needs_a_nonce() -> None:
         Connection(Side.CLIENT, SERVER, key=KEY)
 
 
-def test_a_message_that_is_too_large_leaves_the_connection_as_it_was(key: bytes | None, open_pair: Pair) -> None:
+def test_a_message_that_is_too_large_leaves_the_connection_as_it_was(
+    key: bytes | None, open_pair: Pair
+) -> None:
     client, server = open_pair(key)
     with pytest.raises(ProtocolError, match="too_large"):
         client.send(m.Cancel("c1", "x" * 5000))
     assert server.receive_data(client.send(m.Ping(1))) == [m.Ping(1)]
 
 
-# --- who is meant -----------------------------------------------------------------------------------------------------------
+# --- who is meant -----------------------------------------------------------------------------
 
 
 def test_a_server_of_another_name_refuses_and_seals_its_refusal(key: bytes | None) -> None:
     client = Connection(Side.CLIENT, "motion", key=key, nonce=NONCES[Side.CLIENT] if key else b"")
     server = Connection(Side.SERVER, "vision", key=key, nonce=NONCES[Side.SERVER] if key else b"")
-    with pytest.raises(ProtocolError, match="wrong_node: this is vision, motion was asked for") as fault:
+    with pytest.raises(
+        ProtocolError, match="wrong_node: this is vision, motion was asked for"
+    ) as fault:
         server.receive_data(client.send(HELLO))
         client.receive_data(server.data_to_send())
         server.receive_data(client.data_to_send())
@@ -427,7 +479,9 @@ def test_a_server_of_another_name_refuses_and_seals_its_refusal(key: bytes | Non
     assert isinstance(refusal, m.Refuse) and refusal.code == "wrong_node" and client.proven
 
 
-def test_a_welcome_of_another_name_is_refused_though_its_proof_is_good(key: bytes | None, pair: Pair) -> None:
+def test_a_welcome_of_another_name_is_refused_though_its_proof_is_good(
+    key: bytes | None, pair: Pair
+) -> None:
     """A server that has the key, or none, and does not look at whom HELLO asks for."""
     client, server = pair(key)
     if server.receive_data(client.send(HELLO)) == []:
@@ -461,7 +515,9 @@ def test_a_refusal_without_the_seal_is_not_proven(when: str, sealed: bool, pair:
         with pytest.raises(ProtocolError, match="malformed"):
             client.receive_data(len(body).to_bytes(4, "big") + body)
         return
-    assert client.receive_data(len(body).to_bytes(4, "big") + body) == [m.Refuse("old_epoch", "go away")]
+    assert client.receive_data(len(body).to_bytes(4, "big") + body) == [
+        m.Refuse("old_epoch", "go away")
+    ]
     assert not client.proven and client.state is State.CLOSED
 
 
@@ -481,7 +537,7 @@ def test_two_keys_are_accepted_while_one_takes_the_place_of_the_other() -> None:
             assert client.receive_data(server.send(m.Ping(2))) == [m.Ping(2)]
 
 
-# --- bits that are changed on their way -----------------------------------------------------------------------------------
+# --- bits that are changed on their way -------------------------------------------------------
 
 
 def _conversation(key: bytes | None) -> list[tuple[Side, bytes]]:
@@ -500,7 +556,10 @@ def _conversation(key: bytes | None) -> list[tuple[Side, bytes]]:
         (Side.SERVER, server.send(m.Accept("c1"))),
         (Side.SERVER, server.send(m.Outcome("c1", "success", {"x": 1}))),
     ]
-    said += [(Side.CLIENT, client.send(m.SetPoint(1, (0.5, 1.5)))), (Side.CLIENT, client.send(m.Ping(1)))]
+    said += [
+        (Side.CLIENT, client.send(m.SetPoint(1, (0.5, 1.5)))),
+        (Side.CLIENT, client.send(m.Ping(1))),
+    ]
     said += [
         (Side.SERVER, server.send(m.Event("button", "desk", 1, {"down": True}))),
         (Side.SERVER, server.send(m.Pong(1))),
@@ -508,8 +567,11 @@ def _conversation(key: bytes | None) -> list[tuple[Side, bytes]]:
     return said
 
 
-def _play(said: list[tuple[Side, bytes]], key: bytes | None) -> tuple[dict[Side, list[m.Message]], bool]:
-    """What the owners of two fresh ends are given when these bytes arrive, and whether a fault was noticed."""
+def _play(
+    said: list[tuple[Side, bytes]], key: bytes | None
+) -> tuple[dict[Side, list[m.Message]], bool]:
+    """What the owners of two fresh ends are given when these bytes arrive, and whether a fault was
+    noticed."""
     ends = dict(zip((Side.CLIENT, Side.SERVER), new_pair(key), strict=True))
     ends[Side.CLIENT].send(HELLO)
     got: dict[Side, list[m.Message]] = {Side.CLIENT: [], Side.SERVER: []}
@@ -528,14 +590,18 @@ def _play(said: list[tuple[Side, bytes]], key: bytes | None) -> tuple[dict[Side,
     return got, False
 
 
-def _assert_noticed(said: list[tuple[Side, bytes]], number: int, changed: bytes, key: bytes | None) -> None:
+def _assert_noticed(
+    said: list[tuple[Side, bytes]], number: int, changed: bytes, key: bytes | None
+) -> None:
     got, noticed = _play([*said[:number], (said[number][0], changed), *said[number + 1 :]], key)
     right, _ = _play(said, key)
     for side, messages in got.items():
         its = [message for message in messages if not isinstance(message, m.Refuse)]
         assert its == right[side][: len(its)], "a wrong value was delivered"
     waits = any(len(got[side]) < len(right[side]) for side in Side)
-    assert noticed or waits, "an incomplete frame is not heard, so the limit on silence ends the connection"
+    assert noticed or waits, (
+        "an incomplete frame is not heard, so the limit on silence ends the connection"
+    )
 
 
 def test_any_one_changed_bit_of_a_conversation_is_noticed(key: bytes | None) -> None:

@@ -1,4 +1,5 @@
-"""A party whose every word depends on all it has heard so far, and a process that runs one as a member of a cell.
+"""A party whose every word depends on all it has heard so far, and a process that runs one as a
+member of a cell.
 
 Run as a script: `toy_party.py NAME TICKS ADDRESSES SCRIPTS DELAYS` (JSON), prints what it heard.
 """
@@ -13,17 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from services.comm.canbus import Frame
-from services.comm.lockstep import Delays, Member
-from services.comm.messages import Call
-from services.comm.party import TICK, Envelope
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.lockstep import Delays, Member
+from petrobot.services.comm.messages import Call
+from petrobot.services.comm.party import TICK, Envelope
 
 Script = Mapping[str, Sequence[tuple[str, str]]]
 """What to say, by tick: (party, channel)."""
 
 
 class Toy:
-    """Says what its script names at each tick, about a digest of what it heard; answers every third thing it hears."""
+    """Says what its script names at each tick, about a digest of what it heard; answers every third
+    thing it hears."""
 
     def __init__(self, name: str, script: Script, endpoint: str = "") -> None:
         self.name = name
@@ -49,7 +51,9 @@ class Toy:
         return out
 
     def _say(self, party: str, channel: str) -> None:
-        self._out.append(Envelope(party, self.endpoint, f"{party}.toy", channel, self._body(channel)))
+        self._out.append(
+            Envelope(party, self.endpoint, f"{party}.toy", channel, self._body(channel))
+        )
 
     def _body(self, channel: str) -> Any:
         digest = self._digest.digest()
@@ -69,9 +73,14 @@ def _text(body: Any) -> str:
 
 
 def main() -> None:
-    name, ticks, addresses, scripts, delays = sys.argv[1], *(json.loads(argument) for argument in sys.argv[2:])
+    name, ticks, addresses, scripts, delays = (
+        sys.argv[1],
+        *(json.loads(argument) for argument in sys.argv[2:]),
+    )
     toy = Toy(name, scripts[name])
-    member = Member(name, [toy], {peer: tuple(at) for peer, at in addresses.items()}, delays=Delays(delays))
+    member = Member(
+        name, [toy], {peer: tuple(at) for peer, at in addresses.items()}, delays=Delays(delays)
+    )
     member.open()
     why = member.run(max_ticks=ticks if name == min(addresses) else None)
     print(json.dumps({"why": why, "ticks": member.tick, "heard": toy.heard}))

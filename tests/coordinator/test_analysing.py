@@ -1,4 +1,5 @@
-"""The designer's analysis in a process of its own: what it says, and how it ends when it takes too long."""
+"""The designer's analysis in a process of its own: what it says, and how it ends when it takes too
+long."""
 
 from __future__ import annotations
 
@@ -14,19 +15,25 @@ from pathlib import Path
 
 import pytest
 
-from coordinator import analysing
-from coordinator.analysing import Apart, RefusedError, Superseded, analyse_apart, analysed
+from petrobot.coordinator import analysing
+from petrobot.coordinator.analysing import Apart, RefusedError, Superseded, analyse_apart, analysed
 from tests.waiting import until
 
-CATCH_BALL = (Path(analysing.__file__).parent / "tasks" / "catch_ball.toml").read_text(encoding="utf-8")
+CATCH_BALL = (Path(analysing.__file__).parent / "tasks" / "catch_ball.toml").read_text(
+    encoding="utf-8"
+)
 
 
 @pytest.mark.processes
 async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
     answer = await analyse_apart(CATCH_BALL, "catch_ball.toml")
     assert answer["complete"] is True
-    assert {"bounded", "sound", "controllable"} <= {verdict["name"] for verdict in answer["verdicts"]}
-    assert set(answer["heat"]) >= {"locate_ball", "track_ball"}, "the last line is the fullest: with the forecast"
+    assert {"bounded", "sound", "controllable"} <= {
+        verdict["name"] for verdict in answer["verdicts"]
+    }
+    assert set(answer["heat"]) >= {"locate_ball", "track_ball"}, (
+        "the last line is the fullest: with the forecast"
+    )
 
 
 @pytest.mark.processes
@@ -35,7 +42,9 @@ async def test_a_text_that_is_no_task_is_refused_with_its_fault() -> None:
         await analyse_apart("schema = 1\n[task]\n", "drawn.toml")
 
 
-def test_a_search_that_ran_out_of_time_leaves_verdicts_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_that_ran_out_of_time_leaves_verdicts_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(analysing, "SECONDS", 0.0)
     monkeypatch.setattr(analysing, "STATES", 1 << 40)
     answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml")
@@ -48,14 +57,19 @@ def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
     """Not wall-clock time: a machine that is busy with a mission changes no verdict."""
     spinning = (
         "from itertools import repeat\n"
-        "from coordinator import analysing\n"
+        "from petrobot.coordinator import analysing\n"
         "analysing.HARD_END = 0\n"
-        "analysing.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else {'said': 1}\n"
+        "analysing.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else "
+        "{'said': 1}\n"
         "analysing.main()\n"
     )
     order = b'{"work": "analysis", "given": {"text": "", "filename": "drawn.toml"}}\n'
     ended = subprocess.run(
-        [sys.executable, "-c", spinning], input=order, capture_output=True, check=False, timeout=240.0
+        [sys.executable, "-c", spinning],
+        input=order,
+        capture_output=True,
+        check=False,
+        timeout=240.0,
     )
     assert ended.returncode == -signal.SIGXCPU
     assert ended.stdout == b'{"said": 1}\n', "what was known before is told"
@@ -63,10 +77,15 @@ def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("said", ['{"said": 1}', ""])
-async def test_one_that_does_not_end_is_given_up(said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_one_that_does_not_end_is_given_up(
+    said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It gets no processor time, or hangs: what it has said by then counts."""
     mute = tmp_path / "mute"
-    mute.write_text(f"#!/bin/sh\n{f'echo {said!r}' if said else ':'}\nexec tail -f /dev/null\n", encoding="ascii")
+    mute.write_text(
+        f"#!/bin/sh\n{f'echo {said!r}' if said else ':'}\nexec tail -f /dev/null\n",
+        encoding="ascii",
+    )
     mute.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(mute))
     monkeypatch.setattr(analysing, "PATIENCE", 1.0)
@@ -109,8 +128,12 @@ async def test_it_stands_below_all_others_and_away_from_the_keyboard(apart: Apar
 
 @pytest.mark.processes
 async def test_a_newer_drawing_takes_the_place_of_the_older_one(apart: Apart) -> None:
-    """Running or waiting, the older ones are given up at once; those of other desks and other work are not."""
-    endless = {"text": CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "filename": "catch_ball.toml"}
+    """Running or waiting, the older ones are given up at once; those of other desks and other work
+    are not."""
+    endless = {
+        "text": CATCH_BALL.replace("tokens = 4", "tokens = 4000"),
+        "filename": "catch_ball.toml",
+    }
     first = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
     await until(lambda: apart.process is not None, "its process to start")
     other = asyncio.create_task(apart.do("findings", FINDINGS, "desk 2"))

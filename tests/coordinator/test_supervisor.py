@@ -1,4 +1,5 @@
-"""The keeper of node processes: ready in order, dead ones started again with a growing pause, none left behind."""
+"""The keeper of node processes: ready in order, dead ones started again with a growing pause, none
+left behind."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.supervisor import LaunchError, Program, Supervisor
+from petrobot.coordinator.supervisor import LaunchError, Program, Supervisor
 from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
@@ -41,9 +42,13 @@ async def until_said(said: list[str], count: int) -> None:
             await beat(0.01)
 
 
-async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor(tmp_path: Path) -> None:
+async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor(
+    tmp_path: Path,
+) -> None:
     said: list[str] = []
-    async with Supervisor([program("a", STEADY), program("b", STEADY)], tmp_path, notice=said.append) as keeper:
+    async with Supervisor(
+        [program("a", STEADY), program("b", STEADY)], tmp_path, notice=said.append
+    ) as keeper:
         before = keeper.process_ids()
         os.kill(before["a"], signal.SIGKILL)
         await until_said(said, 1)
@@ -65,20 +70,28 @@ async def test_one_that_keeps_dying_is_started_more_and_more_slowly(tmp_path: Pa
     assert pauses == [0.5, 1.0, 2.0]
 
 
-async def test_without_respawn_a_dead_one_stays_dead_and_the_end_of_all_is_noticed(tmp_path: Path) -> None:
+async def test_without_respawn_a_dead_one_stays_dead_and_the_end_of_all_is_noticed(
+    tmp_path: Path,
+) -> None:
     """As for the members of a lock-step cell."""
-    async with Supervisor([program("a", BRIEF), program("b", BRIEF)], tmp_path, respawn=False) as keeper:
+    async with Supervisor(
+        [program("a", BRIEF), program("b", BRIEF)], tmp_path, respawn=False
+    ) as keeper:
         async with asyncio.timeout(60.0):
             await keeper.ended()
         assert keeper.process_ids() == {} and keeper.starts("a") == 1
 
 
 async def test_one_that_does_not_come_up_is_named_with_the_end_of_its_log(tmp_path: Path) -> None:
-    with pytest.raises(LaunchError, match=r"node a ended; its log .*a\.log ends with:\nno device at can0"):
+    with pytest.raises(
+        LaunchError, match=r"node a ended; its log .*a\.log ends with:\nno device at can0"
+    ):
         await Supervisor([program("a", FAULTY), program("b", STEADY)], tmp_path).__aenter__()
     with pytest.raises(LaunchError) as again:
         await Supervisor([program("a", FAULTY)], tmp_path).__aenter__()
-    assert str(again.value).count("no device at can0") == 1, "what an earlier start left in the log is not its end"
+    assert str(again.value).count("no device at can0") == 1, (
+        "what an earlier start left in the log is not its end"
+    )
 
 
 async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:
@@ -99,7 +112,10 @@ async def test_one_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> Non
 async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(tmp_path: Path) -> None:
     """Its child holds its output open, and goes on talking."""
     talker = "while echo alive; do sleep 0.05; done"
-    leaver = f"import subprocess; print(subprocess.Popen(['sh', '-c', {talker!r}]).pid, flush=True); {STEADY}"
+    leaver = (
+        f"import subprocess; print(subprocess.Popen(['sh', '-c', {talker!r}]).pid, "
+        f"flush=True); {STEADY}"
+    )
     said: list[str] = []
     try:
         async with Supervisor([program("a", leaver)], tmp_path, notice=said.append) as keeper:

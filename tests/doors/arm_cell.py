@@ -1,4 +1,5 @@
-"""The arm's part of the catching cell for tests of the emergency stop: simulated drives on a bus, the motion node, and an ear."""
+"""The arm's part of the catching cell for tests of the emergency stop: simulated drives on a bus,
+the motion node, and an ear."""
 
 from __future__ import annotations
 
@@ -9,11 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from services.comm import canopen
-from services.comm.can_stream import connect
-from services.comm.canbus import Frame
-from services.comm.cia402 import RECEIVED, SENT, Command, State, command_of, state_of
-from services.comm.directory import Directory, parse
+from petrobot.services.comm import canopen
+from petrobot.services.comm.can_stream import connect
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.cia402 import RECEIVED, SENT, Command, State, command_of, state_of
+from petrobot.services.comm.directory import Directory, parse
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -26,13 +27,13 @@ schema = 1
 [nodes.laboratory]
 host = "127.0.0.1"
 port = {laboratory}
-sim = "sim.laboratory:make_laboratory"
+sim = "petrobot.sim.laboratory:make_laboratory"
 [nodes.motion]
 host = "127.0.0.1"
 port = {motion}
 [devices.arm]
 node = "motion"
-driver = "services.motion.arm:Arm"
+driver = "petrobot.services.motion.arm:Arm"
 interface = "petrobot_stream"
 channel = "tcp://127.0.0.1:{bus}"
 stream = "catch_point"
@@ -41,12 +42,12 @@ stream_period = 0.02
 to = "arm"
 period = 0.02
 [actions.sweep]
-run = "services.motion.actions:empty_and_home"
+run = "petrobot.services.motion.actions:empty_and_home"
 task = "move"
 device = "arm"
 args = {{ always = true, speed = {speed}, timeout = 100.0 }}
 [actions.ready]
-run = "services.motion.actions:reset_and_home"
+run = "petrobot.services.motion.actions:reset_and_home"
 task = "make_ready"
 device = "arm"
 [services.laboratory_prepare]
@@ -114,7 +115,11 @@ def cell_in(folder: Path, speed: float = SLOW) -> Directory:
     laboratory, motion, bus = free_ports(3)
     path = folder / "services.toml"
     text = SERVICES.format(
-        laboratory=laboratory, motion=motion, bus=bus, cell=ROOT / "services" / "cell.toml", speed=speed
+        laboratory=laboratory,
+        motion=motion,
+        bus=bus,
+        cell=ROOT / "services" / "cell.toml",
+        speed=speed,
     )
     path.write_text(text, encoding="utf-8")
     (folder / "sweeping.toml").write_text(TASK, encoding="utf-8")
@@ -122,7 +127,8 @@ def cell_in(folder: Path, speed: float = SLOW) -> Directory:
 
 
 class Ear:
-    """Listens on the bus in a thread of its own: what the master orders, what the drives say, and when (monotonic s)."""
+    """Listens on the bus in a thread of its own: what the master orders, what the drives say, and
+    when (monotonic s)."""
 
     def __init__(self, directory: Directory) -> None:
         self._line = connect(directory.devices["arm"].config["channel"])
@@ -154,11 +160,16 @@ class Ear:
         """Wait until what has been heard fits. Raises TimeoutError."""
         with self._changed:
             if not self._changed.wait_for(lambda: holds(self), timeout):
-                raise TimeoutError(f"commands {self.commands}, states {self.states}, NMT {self.nmt}")
+                raise TimeoutError(
+                    f"commands {self.commands}, states {self.states}, NMT {self.nmt}"
+                )
 
     def moving(self) -> bool:
         """Whether the drives are enabled and have moved by 0.02 rad since `forget`."""
-        far = [abs(self.positions[n] - self._origin.get(n, self.positions[n])) > 20_000 for n in self.positions]
+        far = [
+            abs(self.positions[n] - self._origin.get(n, self.positions[n])) > 20_000
+            for n in self.positions
+        ]
         return self.all_in(State.OPERATION_ENABLED) and any(far)
 
     def all_in(self, state: State) -> bool:

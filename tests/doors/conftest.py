@@ -1,4 +1,5 @@
-"""A node's server in a process of its own, a stranger's raw connection to it, and a good client beside."""
+"""A node's server in a process of its own, a stranger's raw connection to it, and a good client
+beside."""
 
 from __future__ import annotations
 
@@ -16,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from coordinator.certificates import make_certificates
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.codec import decode, encode
-from services.comm.credentials import Credentials
-from services.comm.wire import Connection, Side
+from petrobot.coordinator.certificates import make_certificates
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.codec import decode, encode
+from petrobot.services.comm.credentials import Credentials
+from petrobot.services.comm.wire import Connection, Side
 from tests.comm.ends import framed
 from tests.waiting import Limit, beat
 
@@ -35,7 +36,8 @@ KEPT = 1 << 16
 
 
 def frame(message: m.Message) -> bytes:
-    """A message as a frame without a key; HELLO as of a client that has none, unless it has an `auth` of its own."""
+    """A message as a frame without a key; HELLO as of a client that has none, unless it has an
+    `auth` of its own."""
     body = encode(message)
     if isinstance(message, m.Hello | m.Welcome | m.Challenge | m.Proof):
         if isinstance(message, m.Hello) and not message.auth:
@@ -50,7 +52,9 @@ class Victim:
     def __init__(self, settings: dict[str, Any]) -> None:
         self.settings = settings
         command = [sys.executable, str(SCRIPT), json.dumps(settings)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
         assert self.process.stdout is not None
         self.port = int(self.process.stdout.readline())
         self.host = str(settings.get("host", "127.0.0.1"))
@@ -62,7 +66,8 @@ class Victim:
         return self.host, self.port
 
     def about(self, deep: bool = False) -> dict[str, Any]:
-        """What it counts: faults, opening, connected, fds; with `deep` also its links that are in memory."""
+        """What it counts: faults, opening, connected, fds; with `deep` also its links that are in
+        memory."""
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write("deep\n" if deep else "?\n")
         self.process.stdin.flush()
@@ -88,7 +93,9 @@ class Victim:
         if "key" in self.settings:
             more.setdefault("key", bytes.fromhex(self.settings["key"]))
         if "folder" in self.settings:
-            more.setdefault("tls", Credentials("coordinator", None, Path(self.settings["folder"])).client())
+            more.setdefault(
+                "tls", Credentials("coordinator", None, Path(self.settings["folder"])).client()
+            )
         return Client(*self.address, Caller("vision", hello, auto_ack=True), **more)
 
     @asynccontextmanager
@@ -166,7 +173,8 @@ class Stranger:
             await self.writer.drain()
 
     async def hears(self) -> m.Message:
-        """The next message of the server on an open connection without a key, its check not looked at."""
+        """The next message of the server on an open connection without a key, its check not looked
+        at."""
         body = await self._body()
         return decode(body[:-4])
 
@@ -180,7 +188,9 @@ class Stranger:
 
     async def open(self, key: bytes | None, hello: m.Hello = HELLO) -> Connection:
         """Shake hands properly; gives the connection, to make sealed frames with."""
-        connection = Connection(Side.CLIENT, "vision", key=key, nonce=os.urandom(32) if key else b"")
+        connection = Connection(
+            Side.CLIENT, "vision", key=key, nonce=os.urandom(32) if key else b""
+        )
         await self.say(connection.send(hello))
         limit = Limit("the handshake")
         while connection.version == 0 and limit.left():
@@ -193,12 +203,17 @@ class Stranger:
         return connection
 
     async def refused(self) -> str:
-        """The code of the REFUSE that comes, after which the server hangs up; empty if it hangs up without a word."""
+        """The code of the REFUSE that comes, after which the server hangs up; empty if it hangs up
+        without a word."""
         code = self.refusal
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
             while True:
                 body = await self._body()
-                for end in (len(body), len(body) - 4, len(body) - 16):  # of the opening, checked or sealed
+                for end in (
+                    len(body),
+                    len(body) - 4,
+                    len(body) - 16,
+                ):  # of the opening, checked or sealed
                     with contextlib.suppress(Exception):
                         message = decode(body[:end])
                         if isinstance(message, m.Refuse):
@@ -236,6 +251,8 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def many_files() -> Iterator[None]:
     """As many open files as the system lets us have."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard if hard != resource.RLIM_INFINITY else 65_536, hard))
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE, (hard if hard != resource.RLIM_INFINITY else 65_536, hard)
+    )
     yield
     resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

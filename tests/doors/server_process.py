@@ -1,4 +1,5 @@
-"""A server of the node protocol as a process of its own, so that its memory can be measured: `python server_process.py JSON`.
+"""A server of the node protocol as a process of its own, so that its memory can be measured:
+`python server_process.py JSON`.
 
 Prints its port; each line on standard input is answered by one line of JSON about it.
 """
@@ -14,11 +15,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from services.comm.callee import Callee, Keeping, Offer
-from services.comm.credentials import Credentials
-from services.comm.link import Limits, Timing
-from services.comm.messages import Call, Outcome
-from services.comm.server import Server
+from petrobot.services.comm.callee import Callee, Keeping, Offer
+from petrobot.services.comm.credentials import Credentials
+from petrobot.services.comm.link import Limits, Timing
+from petrobot.services.comm.messages import Call, Outcome
+from petrobot.services.comm.server import Server
 
 
 def echo(now: float, call: Call) -> Outcome:
@@ -33,7 +34,11 @@ def big(now: float, call: Call) -> Outcome:
 
 def build(settings: dict[str, Any]) -> Server:
     """The server that the settings describe."""
-    offers = {"echo": Offer(inline=echo), "big": Offer(inline=big), "tune": Offer(scope="local", inline=echo)}
+    offers = {
+        "echo": Offer(inline=echo),
+        "big": Offer(inline=big),
+        "tune": Offer(scope="local", inline=echo),
+    }
     callee = Callee("vision", "v1", offers, keeping=Keeping(**settings.get("keeping", {})))
     key = bytes.fromhex(settings["key"]) if "key" in settings else None
     proves = Credentials("vision", key, Path(settings["folder"]) if "folder" in settings else None)
@@ -42,7 +47,8 @@ def build(settings: dict[str, Any]) -> Server:
 
 
 def about(server: Server, deep: bool) -> dict[str, Any]:
-    """What a test asks for; `deep` looks for links that nobody holds on to but the garbage collector."""
+    """What a test asks for; `deep` looks for links that nobody holds on to but the garbage
+    collector."""
     gc.collect() if deep else None
     links = [one for one in gc.get_objects() if type(one).__name__ == "_ServerLink"] if deep else []
     fds = len(list(Path("/proc/self/fd").iterdir()))
@@ -58,7 +64,9 @@ async def main(settings: dict[str, Any]) -> None:
     await server.start(settings.get("host", "127.0.0.1"), 0)
     print(server.address[1], flush=True)
     reader = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
+    )
     while question := await reader.readline():
         print(json.dumps(about(server, b"deep" in question)), flush=True)
     await server.close()

@@ -1,4 +1,5 @@
-"""Attacks on a node's door over real sockets: refused in clear words or cut off, memory bounded, a good client served."""
+"""Attacks on a node's door over real sockets: refused in clear words or cut off, memory bounded, a
+good client served."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.comm import messages as m
-from services.comm.wire import Connection, ProtocolError, Side
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.wire import Connection, ProtocolError, Side
 from tests.comm.ends import head
 from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
 from tests.waiting import Limit, beat
@@ -34,7 +35,7 @@ TOLERATED = 24 * MIB
 """By how much the victim's resident set may grow while it is attacked."""
 
 
-# --- handshakes and frames that are no good ------------------------------------------------------------------------------
+# --- handshakes and frames that are no good ---------------------------------------------------
 
 
 async def wrong_key(stranger: Stranger) -> None:
@@ -59,7 +60,8 @@ async def newer_version(stranger: Stranger) -> None:
 
 
 async def downgraded_version(stranger: Stranger) -> None:
-    """Somebody between the two changes the versions of an honest HELLO: the proof is of another transcript."""
+    """Somebody between the two changes the versions of an honest HELLO: the proof is of another
+    transcript."""
     honest = Connection(Side.CLIENT, "vision", key=KEY, nonce=bytes(32))
     hello = honest.send(m.Hello(1, 4, "client", "ana", "a1"))
     await stranger.say(hello.replace(struct.pack("BB", 1, 4), struct.pack("BB", 1, 2), 1))
@@ -137,7 +139,13 @@ async def deep_message(stranger: Stranger) -> None:
 
 async def many_containers(stranger: Stranger) -> None:
     """A million empty arrays: 1 MB on the wire, 70 in memory if they were all made."""
-    await sealed(stranger, b"\x94\x04\xa3m/1\xa4echo\x81\xa1a" + b"\xdd" + (10**6).to_bytes(4, "big") + b"\x90" * 10**6)
+    await sealed(
+        stranger,
+        b"\x94\x04\xa3m/1\xa4echo\x81\xa1a"
+        + b"\xdd"
+        + (10**6).to_bytes(4, "big")
+        + b"\x90" * 10**6,
+    )
 
 
 async def strange_extension(stranger: Stranger) -> None:
@@ -167,7 +175,8 @@ ATTACKS: list[tuple[Callable[[Stranger], Awaitable[None]], str]] = [
 
 
 async def test_every_attack_is_refused_in_clear_words(victim: Start) -> None:
-    """One after the other against one server: the code is the right one, its memory stays, the good client notices nothing."""
+    """One after the other against one server: the code is the right one, its memory stays, the good
+    client notices nothing."""
     server = victim(key=KEY.hex())
     async with server.good_client() as good:
         codes: dict[str, str] = {}
@@ -183,7 +192,8 @@ async def test_every_attack_is_refused_in_clear_words(victim: Start) -> None:
 
 
 async def test_a_recorded_session_opens_nothing(victim: Start) -> None:
-    """All that a good client said, replayed to the same server and to another boot of it: its challenge is another one."""
+    """All that a good client said, replayed to the same server and to another boot of it: its
+    challenge is another one."""
     for server in (victim(key=KEY.hex()), victim(key=KEY.hex())):
         session = await Stranger.at(server)
         connection = await session.open(KEY, STRANGE)
@@ -197,7 +207,8 @@ async def test_a_recorded_session_opens_nothing(victim: Start) -> None:
 
 
 async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
-    """A stranger who plays a recorded server to a client: the client hears another nonce's proof, and trusts nothing."""
+    """A stranger who plays a recorded server to a client: the client hears another nonce's proof,
+    and trusts nothing."""
     server = victim(key=KEY.hex())
     session = await Stranger.at(server)
     await session.open(KEY, STRANGE)
@@ -230,12 +241,13 @@ async def test_what_a_server_said_is_no_proof_of_its_key(victim: Start) -> None:
     await fake.wait_closed()
 
 
-# --- too many, too slow, too fast ------------------------------------------------------------------------------------------
+# --- too many, too slow, too fast -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("keyed", [False, True], ids=["plain", "sealed"])
 async def test_slow_loris(victim: Start, keyed: bool) -> None:
-    """Two hundred connections that drip a HELLO byte by byte: none lasts, none keeps the good client out."""
+    """Two hundred connections that drip a HELLO byte by byte: none lasts, none keeps the good
+    client out."""
     server = victim(timing={"handshake": 0.5}, **({"key": KEY.hex()} if keyed else {}))
     hello = frame(m.Hello(2, 2, "client", "mallory", "m1", auth=AUTH if keyed else b""))
 
@@ -278,8 +290,8 @@ async def _second(server: Victim) -> Any:
 
 
 BOUNDED_FILES = 64 + 2 * 128 + 2 * 64 + 40
-"""Strangers that are waited for, those that one turn of the loop takes from the socket's queue and those that it closes, and
-what a process has open anyway."""
+"""Strangers that are waited for, those that one turn of the loop takes from the socket's queue and
+those that it closes, and what a process has open anyway."""
 CROWD = """
 import json, resource, select, socket, sys
 host, port, count = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
@@ -311,9 +323,16 @@ async def crowd_at(server: Victim, count: int) -> Any:
 
 
 @pytest.mark.parametrize("door", ["plain", "sealed", "TLS"])
-async def test_ten_thousand_connections(victim: Start, door: str, certificates: Path, many_files: None) -> None:
-    """Connections, descriptors and memory stay bounded; who was there is served all the time, and a newcomer gets in."""
-    how: dict[str, Any] = {"plain": {}, "sealed": {"key": KEY.hex()}, "TLS": {"folder": str(certificates)}}[door]
+async def test_ten_thousand_connections(
+    victim: Start, door: str, certificates: Path, many_files: None
+) -> None:
+    """Connections, descriptors and memory stay bounded; who was there is served all the time, and a
+    newcomer gets in."""
+    how: dict[str, Any] = {
+        "plain": {},
+        "sealed": {"key": KEY.hex()},
+        "TLS": {"folder": str(certificates)},
+    }[door]
     server = victim(**how)
     async with server.good_client() as good, crowd_at(server, 10_000) as crowd:
         assert crowd.stdout is not None
@@ -331,7 +350,8 @@ async def test_ten_thousand_connections(victim: Start, door: str, certificates: 
 
 
 async def test_who_fails_too_often_is_not_listened_to(victim: Start) -> None:
-    """Guessing keys from one address: after some failures it is cut before it says a word; other addresses are served."""
+    """Guessing keys from one address: after some failures it is cut before it says a word; other
+    addresses are served."""
     limits = {"handshakes": 0.001, "handshakes_at_once": 10, "spare_loopback": False}
     server = victim(key=KEY.hex(), limits=limits)
     async with server.good_client() as good:
@@ -349,7 +369,8 @@ async def test_who_fails_too_often_is_not_listened_to(victim: Start) -> None:
 
 
 async def test_a_flood_of_messages_is_held_back(victim: Start) -> None:
-    """A caller who sends far more than it may is sent away, one who sends a bit more is kept waiting; the others go on."""
+    """A caller who sends far more than it may is sent away, one who sends a bit more is kept
+    waiting; the others go on."""
     server = victim(limits={"messages": 500.0, "messages_at_once": 1_000})
     usual = victim(limits={"messages": 60_000.0, "messages_at_once": 1_000})
     for one, stays in ((server, False), (usual, True)):
@@ -384,7 +405,8 @@ async def _flood(stranger: Stranger, burst: bytes, times: int) -> None:
 
 
 async def test_results_that_nobody_fetches_do_not_fill_the_memory(victim: Start) -> None:
-    """A caller who acknowledges nothing: what is kept for it is bounded by bytes, not by number alone."""
+    """A caller who acknowledges nothing: what is kept for it is bounded by bytes, not by number
+    alone."""
     server = victim(keeping={"result_bytes": 8 * MIB})
     async with server.good_client() as good:
         stranger = await Stranger.at(server)
@@ -397,7 +419,9 @@ async def test_results_that_nobody_fetches_do_not_fill_the_memory(victim: Start)
         stranger.said = stranger.heard = b""
         await stranger.say(frame(m.Call("m/79", "big", {"bytes": 1})))
         kept = await stranger.hears()
-        assert isinstance(kept, m.Outcome) and len(kept.values["b"]) == MIB // 2, "the newest is still there"
+        assert isinstance(kept, m.Outcome) and len(kept.values["b"]) == MIB // 2, (
+            "the newest is still there"
+        )
         await stranger.say(frame(m.Call("m/0", "big", {"bytes": 1})))
         forgotten = await stranger.hears()
         assert isinstance(forgotten, m.Outcome) and forgotten.cause == "forgotten"
@@ -406,12 +430,14 @@ async def test_results_that_nobody_fetches_do_not_fill_the_memory(victim: Start)
     assert server.grown() < 8 * MIB + TOLERATED
 
 
-# --- random bytes ----------------------------------------------------------------------------------------------------------
+# --- random bytes -----------------------------------------------------------------------------
 
 
 def random_bytes(chance: random.Random) -> bytes:
     """A connection's worth of bytes: noise, or a good beginning with some of it changed."""
-    good = bytearray(frame(STRANGE) + frame(m.Call("m/1", "echo", {"x": [1, 2, {"y": "z"}]})) + frame(m.Ping(1)))
+    good = bytearray(
+        frame(STRANGE) + frame(m.Call("m/1", "echo", {"x": [1, 2, {"y": "z"}]})) + frame(m.Ping(1))
+    )
     if chance.random() < 0.3:
         return chance.randbytes(chance.randrange(1, 400))
     for _ in range(chance.randrange(1, 6)):
@@ -449,7 +475,9 @@ async def test_random_bytes_for_minutes(victim: Start, keyed: bool) -> None:
     server = victim(**({"key": KEY.hex()} if keyed else {}))
     end = time.monotonic() + 120.0
     async with server.good_client() as good:
-        sent = await asyncio.gather(*(_bombard(server, lambda _: time.monotonic() > end, s) for s in range(4)))
+        sent = await asyncio.gather(
+            *(_bombard(server, lambda _: time.monotonic() > end, s) for s in range(4))
+        )
         assert sum(sent) > 1_000
         await good.still_served()
         assert server.about(deep=True)["links"] == 1
@@ -457,7 +485,8 @@ async def test_random_bytes_for_minutes(victim: Start, keyed: bool) -> None:
 
 
 def feed(data: bytes) -> None:
-    """Both ends of the protocol, in every state that a stranger can reach, given these bytes; nothing but ProtocolError."""
+    """Both ends of the protocol, in every state that a stranger can reach, given these bytes;
+    nothing but ProtocolError."""
     for key in (None, KEY):
         for side in Side:
             connection = Connection(side, "vision", key=key, nonce=bytes(32) if key else b"")
@@ -472,14 +501,17 @@ def feed(data: bytes) -> None:
 
 @given(st.binary(max_size=600), st.integers(0, 200), st.integers(0, 15))
 @settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
-def test_arbitrary_bytes_raise_nothing_but_protocol_error(data: bytes, kept: int, which: int) -> None:
+def test_arbitrary_bytes_raise_nothing_but_protocol_error(
+    data: bytes, kept: int, which: int
+) -> None:
     """Alone, and after a good beginning."""
     feed(data)
     feed(beginnings()[which][:kept] + data)
 
 
 def beginnings() -> list[bytes]:
-    """Good conversations to begin from: HELLO, then one message of each kind that a client may send."""
+    """Good conversations to begin from: HELLO, then one message of each kind that a client may
+    send."""
     said: list[m.Message] = [
         m.Call("m/1", "echo", {"x": [1, 2.5, {"y": b"z"}]}, 2.0), m.ResultAck("m/1", ("m/2",)), m.Cancel("m/1", "why"),
         m.EventAck("s", 3), m.Subscribe(("a", "b")), m.Command("c", "hold", "arm", {"run": "r"}), m.Ping(1), m.Tick(0),
@@ -497,7 +529,7 @@ FUZZ = """
 import sys, pathlib
 sys.path.insert(0, {root!r})
 import atheris
-with atheris.instrument_imports(include=["services.comm"]):
+with atheris.instrument_imports(include=["petrobot.services.comm"]):
     from tests.doors.test_attacks import beginnings, feed
 for number, data in enumerate(beginnings()):
     pathlib.Path({corpus!r}, str(number)).write_bytes(data)
@@ -511,6 +543,10 @@ atheris.Fuzz()
 def test_coverage_guided_bytes_for_minutes(tmp_path: Path) -> None:
     """Three minutes of atheris, where it is installed: it looks for bytes that reach new code."""
     pytest.importorskip("atheris")
-    script = FUZZ.format(root=str(Path(__file__).resolve().parents[2]), corpus=str(tmp_path), seconds=180)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    script = FUZZ.format(
+        root=str(Path(__file__).resolve().parents[2]), corpus=str(tmp_path), seconds=180
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr[-2000:]

@@ -1,4 +1,5 @@
-"""The drives are left alone: everything of the motion node is killed in mid-move, and they stop by themselves."""
+"""The drives are left alone: everything of the motion node is killed in mid-move, and they stop by
+themselves."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.launch import local_programs
-from coordinator.supervisor import Supervisor
-from services.comm.cia402 import Fault, State, state_of
+from petrobot.coordinator.launch import local_programs
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.services.comm.cia402 import Fault, State, state_of
 from tests.doors.arm_cell import DRIVES, cell_in, ear_on
 from tests.doors.test_estop import LIMIT, Cell
 
 pytestmark = pytest.mark.processes
-DRIVE_EDS = str(files("services.comm.eds").joinpath("joint_drive.eds"))
+DRIVE_EDS = str(files("petrobot.services.comm.eds").joinpath("joint_drive.eds"))
 STATUSWORD, ERROR_CODE, POSITION = 0x6041, 0x603F, 0x6064
 
 
@@ -40,7 +41,8 @@ def family(process: int) -> list[int]:
 
 
 class Bench:
-    """An engineer's laptop on the bus: the canopen package reads the drives by SDO, with no master left to send SYNC."""
+    """An engineer's laptop on the bus: the canopen package reads the drives by SDO, with no master
+    left to send SYNC."""
 
     def __init__(self, channel: str) -> None:
         import canopen
@@ -59,7 +61,8 @@ class Bench:
 
 
 def left_alone(channel: str) -> tuple[list[State], list[int], list[int], list[int]]:
-    """States and error codes once every drive has faulted, and positions at two times a quarter of a second apart."""
+    """States and error codes once every drive has faulted, and positions at two times a quarter of
+    a second apart."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the canopen package's own
         bench = Bench(channel)
@@ -79,9 +82,12 @@ def left_alone(channel: str) -> tuple[list[State], list[int], list[int], list[in
 
 
 async def test_drives_stop_by_themselves_when_their_master_is_killed(tmp_path: Path) -> None:
-    """kill -9 of the node, its servo process and its worker in mid-move: heartbeat lost, quick stop, brake; nothing moves."""
+    """kill -9 of the node, its servo process and its worker in mid-move: heartbeat lost, quick
+    stop, brake; nothing moves."""
     directory = cell_in(tmp_path)
-    async with Supervisor(local_programs(directory), tmp_path / "logs", respawn=False) as supervisor:
+    async with Supervisor(
+        local_programs(directory), tmp_path / "logs", respawn=False
+    ) as supervisor:
         with ear_on(directory) as ear:
             cell = Cell(tmp_path, directory, supervisor, ear)
             try:

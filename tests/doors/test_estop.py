@@ -1,4 +1,5 @@
-"""The emergency stop on real processes: coordinator or node stopped in mid-move, and still the drives stop, seen on their bus."""
+"""The emergency stop on real processes: coordinator or node stopped in mid-move, and still the
+drives stop, seen on their bus."""
 
 from __future__ import annotations
 
@@ -16,14 +17,14 @@ from typing import Any
 
 import pytest
 
-from coordinator.launch import local_programs
-from coordinator.operator.door_file import find_door
-from coordinator.operator.emergency import still_stopped
-from coordinator.record.runfolder import NoRunError
-from coordinator.supervisor import Supervisor
-from services.comm.canopen import NmtState
-from services.comm.cia402 import State
-from services.comm.directory import Directory
+from petrobot.coordinator.launch import local_programs
+from petrobot.coordinator.operator.door_file import find_door
+from petrobot.coordinator.operator.emergency import still_stopped
+from petrobot.coordinator.record.runfolder import NoRunError
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.services.comm.canopen import NmtState
+from petrobot.services.comm.cia402 import State
+from petrobot.services.comm.directory import Directory
 from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat
 
@@ -37,7 +38,7 @@ def petrobot(*arguments: str, **variables: str) -> subprocess.Popen[str]:
     """A command in a process of its own, with these environment variables."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     return subprocess.Popen(
-        [sys.executable, "-m", "coordinator", *arguments],
+        [sys.executable, "-m", "petrobot.coordinator", *arguments],
         env=environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -54,7 +55,9 @@ async def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 class Cell:
     """The launched nodes, an ear on the bus, and a coordinator that moves the arm."""
 
-    def __init__(self, folder: Path, directory: Directory, supervisor: Supervisor, ear: Ear) -> None:
+    def __init__(
+        self, folder: Path, directory: Directory, supervisor: Supervisor, ear: Ear
+    ) -> None:
         self.folder = folder
         self.directory = directory
         self.supervisor = supervisor
@@ -112,7 +115,9 @@ def without_power(ear: Ear) -> bool:
 async def cell_of(folder: Path, *, respawn: bool = False) -> AsyncIterator[Cell]:
     """Laboratory and motion node as processes."""
     directory = cell_in(folder)
-    async with Supervisor(local_programs(directory), folder / "logs", respawn=respawn) as supervisor:
+    async with Supervisor(
+        local_programs(directory), folder / "logs", respawn=respawn
+    ) as supervisor:
         with ear_on(directory) as ear:
             cell = Cell(folder, directory, supervisor, ear)
             try:
@@ -126,8 +131,8 @@ async def cell_of(folder: Path, *, respawn: bool = False) -> AsyncIterator[Cell]
 
 
 async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path: Path) -> None:
-    """SIGSTOP in mid-move: quick stop on the bus, drives brake, and nothing moves them before it is cleared. With `--bus` the
-    bus itself is stopped without waiting for the node, and comes back."""
+    """SIGSTOP in mid-move: quick stop on the bus, drives brake, and nothing moves them before it is
+    cleared. With `--bus` the bus itself is stopped without waiting for the node, and comes back."""
     async with cell_of(tmp_path) as cell:
         await cell.sweep()
         assert cell.coordinator is not None
@@ -145,11 +150,15 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
         assert cell.ear.all_in(State.SWITCH_ON_DISABLED)
         assert (await cell.estop("--clear"))[0] == 0
         assert cell.ear.all_in(State.SWITCH_ON_DISABLED), "clearing alone moves and enables nothing"
-        await cell.sweep()  # by way of the task's error branch: drives are reset by an action, not by themselves
+        await (
+            cell.sweep()
+        )  # by way of the task's error branch: drives are reset by an action, not by themselves
         code, told = await cell.estop("--bus")
         (node,) = told["nodes"]
         assert code == 0 and node["bus"].endswith("all devices stopped by NMT") and node["devices"]
-        await cell.heard(lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES))
+        await cell.heard(
+            lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES)
+        )
         assert told["coordinator"].endswith(("aborted", "has ended"))
         assert (await finished(cell.coordinator))[0] == 1
         assert (await cell.estop("--clear"))[0] == 0
@@ -157,7 +166,8 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
 
 
 async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -> None:
-    """The node does not answer: all devices of its bus are stopped by NMT, and its absence is said."""
+    """The node does not answer: all devices of its bus are stopped by NMT, and its absence is
+    said."""
     async with cell_of(tmp_path) as cell:
         await cell.sweep()
         os.kill(cell.supervisor.process_ids()["motion"], signal.SIGSTOP)
@@ -165,12 +175,17 @@ async def test_estop_reaches_the_bus_though_the_node_is_frozen(tmp_path: Path) -
         (node,) = told["nodes"]
         assert code == 3 and node["seconds"] is None
         assert node["bus"].endswith("all devices stopped by NMT")
-        await cell.heard(lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES))
+        await cell.heard(
+            lambda ear: [ear.nmt.get(n) for n in DRIVES] == [NmtState.STOPPED] * len(DRIVES)
+        )
 
 
-@pytest.mark.parametrize("answers", [True, False], ids=["told itself", "frozen when it was to be told"])
+@pytest.mark.parametrize(
+    "answers", [True, False], ids=["told itself", "frozen when it was to be told"]
+)
 async def test_a_stop_outlives_its_node(tmp_path: Path, answers: bool) -> None:
-    """The node is killed (kill -9) and started again: the drives stay without power, whatever a task tries, until it is cleared."""
+    """The node is killed (kill -9) and started again: the drives stay without power, whatever a
+    task tries, until it is cleared."""
     async with cell_of(tmp_path, respawn=True) as cell:
         await cell.sweep()
         assert cell.coordinator is not None
@@ -178,12 +193,16 @@ async def test_a_stop_outlives_its_node(tmp_path: Path, answers: bool) -> None:
             os.kill(cell.supervisor.process_ids()["motion"], signal.SIGSTOP)
         code, told = await cell.estop()
         (node,) = told["nodes"]
-        assert code == (0 if answers else 3) and node["latch"].startswith("" if answers else "latched")
+        assert code == (0 if answers else 3) and node["latch"].startswith(
+            "" if answers else "latched"
+        )
         assert (await finished(cell.coordinator))[0] == 1
         os.kill(cell.supervisor.process_ids()["motion"], signal.SIGKILL)
         log = tmp_path / "logs" / "motion.log"
         await cell.until(lambda: log.read_text().count("motion ready on") == 2)
-        assert "petrobot estop --clear" in log.read_text(), "whoever starts it sees why nothing moves"
+        assert "petrobot estop --clear" in log.read_text(), (
+            "whoever starts it sees why nothing moves"
+        )
         await cell.heard(without_power)
         cell.ear.forget()
         code, _, err = await finished(cell.task())
@@ -206,7 +225,8 @@ async def test_estop_without_nodes_says_so(tmp_path: Path) -> None:
 
 
 async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> None:
-    """Where the nodes end with the run, nobody could clear it otherwise: exit code 0, and the file is gone."""
+    """Where the nodes end with the run, nobody could clear it otherwise: exit code 0, and the file
+    is gone."""
     directory = cell_in(tmp_path)
     services = ["--services", str(directory.source), "--journal", str(tmp_path)]
     code, out, _ = await finished(petrobot("estop", *services))
@@ -214,4 +234,6 @@ async def test_a_stop_is_cleared_while_its_node_does_not_run(tmp_path: Path) -> 
     code, out, _ = await finished(petrobot("estop", "--clear", *services))
     assert code == 0 and "cleared on disk" in out and "NO ANSWER" not in out
     assert still_stopped(directory) == []
-    assert (await finished(petrobot("estop", "--clear", *services)))[0] == 3, "nobody there, and nothing to clear"
+    assert (await finished(petrobot("estop", "--clear", *services)))[0] == 3, (
+        "nobody there, and nothing to clear"
+    )

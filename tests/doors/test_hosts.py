@@ -1,4 +1,5 @@
-"""Doors between hosts: no listening beyond loopback without a key, local services stay local, no output shows a secret."""
+"""Doors between hosts: no listening beyond loopback without a key, local services stay local, no
+output shows a secret."""
 
 from __future__ import annotations
 
@@ -16,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from coordinator.certificates import make_certificates
-from coordinator.cli import main
-from coordinator.launch import local_programs
-from coordinator.operator.door_file import DOOR
-from coordinator.supervisor import Supervisor
-from services.comm.directory import parse
-from services.comm.security import new_key, write_key
+from petrobot.coordinator.certificates import make_certificates
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.launch import local_programs
+from petrobot.coordinator.operator.door_file import DOOR
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.services.comm.directory import parse
+from petrobot.services.comm.security import new_key, write_key
 from tests.doors.arm_cell import ROOT, cell_in
 from tests.doors.conftest import KEY, Victim
 from tests.waiting import Limit, beat
@@ -37,11 +38,15 @@ def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess
     """A module of ours as a process."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, check=False, timeout=120)
+    return subprocess.run(
+        command, cwd=cwd, env=environment, capture_output=True, text=True, check=False, timeout=120
+    )
 
 
 @pytest.mark.parametrize("program", ["services", "sim"])
-def test_a_node_does_not_listen_beyond_this_host_without_a_key(tmp_path: Path, program: str) -> None:
+def test_a_node_does_not_listen_beyond_this_host_without_a_key(
+    tmp_path: Path, program: str
+) -> None:
     """Exit code 2 and one line that says what to do; with a key the same address is taken."""
     directory = cell_in(tmp_path)
     node = "motion" if program == "services" else "laboratory"
@@ -50,20 +55,27 @@ def test_a_node_does_not_listen_beyond_this_host_without_a_key(tmp_path: Path, p
         f'host = "127.0.0.1"\nport = {port}', f'host = "0.0.0.0"\nport = {port}'
     )
     directory.source.write_text(text)
-    arguments = [program, *([node] if program == "services" else []), "--services", str(directory.source)]
+    arguments = [
+        f"petrobot.{program}",
+        *([node] if program == "services" else []),
+        "--services",
+        str(directory.source),
+    ]
     done = run(*arguments)
     assert done.returncode == 2
-    assert f"{node}: refuses to listen on 0.0.0.0" in done.stderr and "`petrobot keys`" in done.stderr
+    assert (
+        f"{node}: refuses to listen on 0.0.0.0" in done.stderr and "`petrobot keys`" in done.stderr
+    )
 
 
-# --- another host --------------------------------------------------------------------------------------------------------
+# --- another host -----------------------------------------------------------------------------
 
 
 ELSEWHERE = """
 import asyncio, json, sys
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.client import Client
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
 
 async def main():
     hello = m.Hello(2, 2, "coordinator", "far", "f1", 1)
@@ -87,7 +99,8 @@ def ip(*arguments: str) -> None:
 
 @pytest.fixture
 def other_host() -> Iterator[tuple[str, str]]:
-    """A network namespace with a cable to this one: its name, and this host's address on the cable."""
+    """A network namespace with a cable to this one: its name, and this host's address on the
+    cable."""
     number = os.getpid() % 200 + 20
     name, here, there = f"pb{os.getpid()}", f"pbh{os.getpid() % 99999}", f"pbn{os.getpid() % 99999}"
     address = f"10.213.{number}.1"
@@ -106,18 +119,31 @@ def other_host() -> Iterator[tuple[str, str]]:
         ip("netns", "del", name)
 
 
-def test_a_local_service_is_out_of_reach_for_another_host(victim: Start, other_host: tuple[str, str]) -> None:
+def test_a_local_service_is_out_of_reach_for_another_host(
+    victim: Start, other_host: tuple[str, str]
+) -> None:
     """With the right key, over a real cable: it is neither shown nor called; the rest is served."""
     namespace, address = other_host
     server = victim(key=KEY.hex(), host=address)
-    command = [sys.executable, "-c", textwrap.dedent(ELSEWHERE), address, str(server.port), KEY.hex()]
+    command = [
+        sys.executable,
+        "-c",
+        textwrap.dedent(ELSEWHERE),
+        address,
+        str(server.port),
+        KEY.hex(),
+    ]
     far = subprocess.run(
         ["ip", "netns", "exec", namespace, *command],
         env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
     assert far.returncode == 0, far.stderr
     told = json.loads(far.stdout)
-    assert told == {"offers": ["echo", "big"], "echo": "success", "tune": ["error", "local_only", "no"]}
+    assert told == {
+        "offers": ["echo", "big"],
+        "echo": "success",
+        "tune": ["error", "local_only", "no"],
+    }
 
 
 async def test_on_its_own_host_it_is_in_reach(victim: Start) -> None:
@@ -130,7 +156,7 @@ async def test_on_its_own_host_it_is_in_reach(victim: Start) -> None:
     await client.close()
 
 
-# --- a whole cell with keys ----------------------------------------------------------------------------------------------
+# --- a whole cell with keys -------------------------------------------------------------------
 
 
 class Guarded:
@@ -153,13 +179,21 @@ class Guarded:
         found: dict[str, str] = {}
         for path in [*self.folder.glob("cell.key"), *self.folder.glob("keys/*.key")]:
             lines = [line for line in path.read_text().splitlines() if not line.startswith("-----")]
-            found |= {f"{path.name}:{number}": line for number, line in enumerate(lines) if len(line) >= 32}
+            found |= {
+                f"{path.name}:{number}": line
+                for number, line in enumerate(lines)
+                if len(line) >= 32
+            }
         return found
 
     def petrobot(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """A command; what it printed is kept."""
-        services = ["--services", str(self.directory.source)] if arguments[0] in ("run", "nodes", "estop") else []
-        done = run("coordinator", *arguments, *services, cwd=self.folder)
+        services = (
+            ["--services", str(self.directory.source)]
+            if arguments[0] in ("run", "nodes", "estop")
+            else []
+        )
+        done = run("petrobot.coordinator", *arguments, *services, cwd=self.folder)
         self.said += [done.stdout, done.stderr]
         return done
 
@@ -180,14 +214,30 @@ class Guarded:
                 path.write_bytes(data)
 
     def leaks(self, more: dict[str, str]) -> list[str]:
-        """Where a secret has come out: as text or as bytes, in what was printed and in every file but its own."""
+        """Where a secret has come out: as text or as bytes, in what was printed and in every file
+        but its own."""
         outputs = {f"output {n}": said.encode() for n, said in enumerate(self.said)}
-        own = {path for path in self.folder.rglob("*") if path.suffix == ".key" or path.name.startswith(DOOR)}
-        outputs |= {
-            str(path): path.read_bytes() for path in self.folder.rglob("*") if path.is_file() and path not in own
+        own = {
+            path
+            for path in self.folder.rglob("*")
+            if path.suffix == ".key" or path.name.startswith(DOOR)
         }
-        forms = [(name, form) for name, secret in (self.secrets() | more).items() for form in _forms(secret)]
-        return [f"{name} in {where}" for where, data in outputs.items() for name, form in forms if form in data]
+        outputs |= {
+            str(path): path.read_bytes()
+            for path in self.folder.rglob("*")
+            if path.is_file() and path not in own
+        }
+        forms = [
+            (name, form)
+            for name, secret in (self.secrets() | more).items()
+            for form in _forms(secret)
+        ]
+        return [
+            f"{name} in {where}"
+            for where, data in outputs.items()
+            for name, form in forms
+            if form in data
+        ]
 
 
 def _process_list() -> list[str]:
@@ -206,7 +256,8 @@ def _forms(secret: str) -> list[bytes]:
 
 @pytest.mark.parametrize("how", ["shared key", "certificates"])
 async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: str) -> None:
-    """Nodes, run, nodes, log, emergency stop: all of it works with keys, and no output, log, journal or report shows one."""
+    """Nodes, run, nodes, log, emergency stop: all of it works with keys, and no output, log,
+    journal or report shows one."""
     cell = Guarded(tmp_path, how)
     token: dict[str, str] = {}
 
@@ -217,31 +268,51 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
                 token["page token"] = json.loads(path.read_text())["token"]
             await beat(0.01)
 
-    async with Supervisor(local_programs(cell.directory), tmp_path / "logs", respawn=False, notice=cell.said.append):
+    async with Supervisor(
+        local_programs(cell.directory), tmp_path / "logs", respawn=False, notice=cell.said.append
+    ):
         options = ("--journal", "runs", "--report", "report", "--json", "out.json", "--no-page")
-        running = asyncio.ensure_future(asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", *options))
+        running = asyncio.ensure_future(
+            asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", *options)
+        )
         await look_for_token(running)
         cell.said += _process_list()
         done = await running
         assert done.returncode == 0, done.stderr
         assert json.loads((tmp_path / "out.json").read_text())["status"] == "success"
         assert (await asyncio.to_thread(cell.petrobot, "nodes", "--json", "-")).returncode == 0
-        assert (await asyncio.to_thread(cell.petrobot, "log", "last", "--format", "jsonl")).returncode == 0
+        assert (
+            await asyncio.to_thread(cell.petrobot, "log", "last", "--format", "jsonl")
+        ).returncode == 0
         assert (await asyncio.to_thread(cell.petrobot, "estop", "--json", "-")).returncode == 0
-        assert cell.petrobot("estop", "--clear", "--services", str(cell.directory.source)).returncode == 0
-        stranger = await asyncio.to_thread(cell.with_strange_keys, "run", "sweeping.toml", "--no-page", "--quiet")
+        assert (
+            cell.petrobot("estop", "--clear", "--services", str(cell.directory.source)).returncode
+            == 0
+        )
+        stranger = await asyncio.to_thread(
+            cell.with_strange_keys, "run", "sweeping.toml", "--no-page", "--quiet"
+        )
         assert stranger.returncode == 3 and "motion" in stranger.stderr
-        assert ("its certificate is not that of" if how == "certificates" else "wrong_key") in stranger.stderr
+        assert (
+            "its certificate is not that of" if how == "certificates" else "wrong_key"
+        ) in stranger.stderr
     assert token["page token"] and cell.secrets()
     assert list(tmp_path.glob("logs/*.log")) and (tmp_path / "report" / "index.html").exists()
     assert cell.leaks(token) == []
-    (tmp_path / "logs" / "planted.log").write_text(f"the key is {next(iter(cell.secrets().values()))}")
+    (tmp_path / "logs" / "planted.log").write_text(
+        f"the key is {next(iter(cell.secrets().values()))}"
+    )
     assert len(cell.leaks(token)) == 1, "this test could not fail"
 
 
-@pytest.mark.parametrize("command", [("nodes",), ("estop",), ("run", "sweeping.toml", "--no-page", "--quiet")])
+@pytest.mark.parametrize(
+    "command", [("nodes",), ("estop",), ("run", "sweeping.toml", "--no-page", "--quiet")]
+)
 def test_a_key_that_others_may_read_stops_every_command(
-    tmp_path: Path, command: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    command: tuple[str, ...],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Bad input, in one line that says what to do."""
     cell = Guarded(tmp_path, "shared key")

@@ -1,4 +1,5 @@
-"""The emergency stop's latch: what is kept, what counts when it cannot be read or written, and what a node makes of it."""
+"""The emergency stop's latch: what is kept, what counts when it cannot be read or written, and what
+a node makes of it."""
 
 from __future__ import annotations
 
@@ -6,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from services.comm.latch import ALL, STATE, Latch, LatchError, latch_of
-from services.emergency_stops import LOOK, NEVER, EmergencyStops
+from petrobot.services.comm.latch import ALL, STATE, Latch, LatchError, latch_of
+from petrobot.services.emergency_stops import LOOK, NEVER, EmergencyStops
 
 DEVICES = ("arm", "camera", "gripper")
 
@@ -73,12 +74,16 @@ def test_a_stop_that_cannot_be_kept_is_said_and_holds_all_the_same(tmp_path: Pat
     assert "remove it by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
 
 
-def test_a_node_that_can_keep_no_latch_comes_up_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_that_can_keep_no_latch_comes_up_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It cannot know whether it was stopped: no file is no proof where none can be."""
-    monkeypatch.setattr("services.comm.latch._writable", lambda folder: False)
+    monkeypatch.setattr("petrobot.services.comm.latch._writable", lambda folder: False)
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == list(DEVICES)
-    assert stops.clear(DEVICES) == "" and stops.names == (), "an operator may say so for this life of it"
+    assert stops.clear(DEVICES) == "" and stops.names == (), (
+        "an operator may say so for this life of it"
+    )
 
 
 def test_what_another_has_latched_is_heeded_at_the_next_look(tmp_path: Path) -> None:
@@ -91,11 +96,14 @@ def test_what_another_has_latched_is_heeded_at_the_next_look(tmp_path: Path) -> 
 
 
 def test_where_it_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside services.toml, then in the user's own folder; where the environment says, there alone."""
+    """Beside services.toml, then in the user's own folder; where the environment says, there
+    alone."""
     monkeypatch.delenv(STATE, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     beside, own = latch_of(tmp_path / "services.toml", "motion").paths
     assert beside == tmp_path.resolve() / ".petrobot" / "motion.stopped"
     assert own.is_relative_to(tmp_path / "state" / "petrobot") and own.name == "motion.stopped"
     monkeypatch.setenv(STATE, str(tmp_path / "given"))
-    assert latch_of(tmp_path / "services.toml", "motion").paths == (tmp_path / "given" / "motion.stopped",)
+    assert latch_of(tmp_path / "services.toml", "motion").paths == (
+        tmp_path / "given" / "motion.stopped",
+    )

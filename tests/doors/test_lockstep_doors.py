@@ -1,4 +1,5 @@
-"""Doors of a lock-step cell: sealed by the shared key; with certificates it stays on one host, and says so before it listens."""
+"""Doors of a lock-step cell: sealed by the shared key; with certificates it stays on one host, and
+says so before it listens."""
 
 from __future__ import annotations
 
@@ -6,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import main
-from coordinator.launch import Setting, lockstep_member, lockstep_mission
-from coordinator.taskfile import load as load_task
-from services.comm.directory import Directory, parse
-from services.comm.lockstep_process import cell_key
-from services.comm.security import KeyNeededError, new_key, write_key
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.launch import Setting, lockstep_member, lockstep_mission
+from petrobot.coordinator.taskfile import load as load_task
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.lockstep_process import cell_key
+from petrobot.services.comm.security import KeyNeededError, new_key, write_key
 from tests.chaos.shuttle_cell import SERVICES, TASK
 from tests.ports import free_ports
 
@@ -20,7 +21,9 @@ FAR = "192.0.2.7"  # RFC 5737: an address that is nobody's
 
 def cell(folder: Path, keys: str, host: str) -> Directory:
     """The shuttle's cell with these keys, its right node at `host`."""
-    text = SERVICES.format(*free_ports(3), log=folder / "moves.txt", fetch=0.1, carry=0.1, orphan=1.0)
+    text = SERVICES.format(
+        *free_ports(3), log=folder / "moves.txt", fetch=0.1, carry=0.1, orphan=1.0
+    )
     head, right = text.split("[nodes.right]")
     text = f"{head}[nodes.right]{right.replace('127.0.0.1', host, 1)}\n[keys]\n{keys}\n"
     path = folder / "services.toml"
@@ -28,20 +31,36 @@ def cell(folder: Path, keys: str, host: str) -> Directory:
     return parse(text, path)
 
 
-def test_certificates_do_not_reach_over_hosts_in_lock_step(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Members and coordinator refuse, with the member's address and what to write instead; the command line gives 2."""
+def test_certificates_do_not_reach_over_hosts_in_lock_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Members and coordinator refuse, with the member's address and what to write instead; the
+    command line gives 2."""
     directory = cell(tmp_path, 'certificates = "keys"', FAR)
-    with pytest.raises(KeyNeededError, match=rf"right is at {FAR}: .*file = \"cell.key\" in place of certificates"):
+    with pytest.raises(
+        KeyNeededError, match=rf"right is at {FAR}: .*file = \"cell.key\" in place of certificates"
+    ):
         cell_key(directory)
     setting = Setting(load_task(TASK))
     with pytest.raises(KeyNeededError, match="crosses no TLS"):
         lockstep_member(directory, lockstep_mission(directory, setting))
-    given = ["--services", str(directory.source), "--mode", "lockstep", "--processes", "0", "--join", "--quiet"]
+    given = [
+        "--services",
+        str(directory.source),
+        "--mode",
+        "lockstep",
+        "--processes",
+        "0",
+        "--join",
+        "--quiet",
+    ]
     assert main(["run", str(TASK), *given]) == 2
     assert "crosses no TLS" in capsys.readouterr().err
 
 
-def test_on_loopback_certificates_need_no_key_and_a_shared_key_goes_anywhere(tmp_path: Path) -> None:
+def test_on_loopback_certificates_need_no_key_and_a_shared_key_goes_anywhere(
+    tmp_path: Path,
+) -> None:
     assert cell_key(cell(tmp_path, 'certificates = "keys"', "127.0.0.1")) is None
     key = new_key()
     write_key(tmp_path / "cell.key", key)

@@ -1,4 +1,5 @@
-"""Emergency stops and pauses where the processes of a device are watched: latched over their deaths, gone with what was held."""
+"""Emergency stops and pauses where the processes of a device are watched: latched over their
+deaths, gone with what was held."""
 
 from __future__ import annotations
 
@@ -7,20 +8,20 @@ from typing import Any
 
 import pytest
 
-from services.action import Status, success
-from services.comm.directory import ActionEntry
-from services.comm.messages import Executed
-from services.device import stop_at_once
-from services.remote import (
+from petrobot.services.action import Status, success
+from petrobot.services.comm.directory import ActionEntry
+from petrobot.services.comm.messages import Executed
+from petrobot.services.device import stop_at_once
+from petrobot.services.remote import (
     CLEAR_EMERGENCY,
     EMERGENCY_STOP,
     IN_EMERGENCY,
     CyclicDriver,
     DeviceCommand,
 )
-from services.runner import GRACE, Runner
-from services.runs import Begin, Ended, Hold, Stop, Told, flat
-from services.worker import COMMAND
+from petrobot.services.runner import GRACE, Runner
+from petrobot.services.runs import Begin, Ended, Hold, Stop, Told, flat
+from petrobot.services.worker import COMMAND
 from tests.node.conftest import Clock, Device
 from tests.node.test_worker_place import Bench
 
@@ -79,7 +80,8 @@ def test_an_emergency_stop_is_the_drivers_hardest(driver: Stopping, did: str) ->
 
 
 def test_a_stopped_driver_takes_no_command_until_it_is_cleared() -> None:
-    """Not even `reset`; the stop routine is always taken. Clearing alone does nothing to the device."""
+    """Not even `reset`; the stop routine is always taken. Clearing alone does nothing to the
+    device."""
     driver = QuickStopping()
     cyclic = CyclicDriver(driver)
     cyclic.emergency_stop(0.0)
@@ -110,7 +112,8 @@ def test_the_driver_is_told_before_its_actions_are_stopped() -> None:
 
 
 def test_a_driver_that_dies_comes_back_stopped() -> None:
-    """Its new process, which would enable its drives, is told at once; after clearing the next one is not."""
+    """Its new process, which would enable its drives, is told at once; after clearing the next one
+    is not."""
     bench = Bench()
     driver, _ = bench.cyclic()
     bench.place.command(bench.clock.now, "e1", EMERGENCY_STOP)
@@ -130,7 +133,8 @@ def test_a_driver_that_dies_comes_back_stopped() -> None:
 
 
 def test_a_hold_ends_with_the_runs_that_it_held() -> None:
-    """The last one ended (cancelled, say): the device is released, and the next run finds its time unspent."""
+    """The last one ended (cancelled, say): the device is released, and the next run finds its time
+    unspent."""
     bench = Bench()
     driver, worker = bench.cyclic()
     bench.begin("one", deadline=1.0)
@@ -159,7 +163,8 @@ def test_a_hold_without_runs_stays_until_it_is_released() -> None:
 
 
 def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
-    """Held, the device looks as if it stood; released without having been stopped it would go on without its run."""
+    """Held, the device looks as if it stood; released without having been stopped it would go on
+    without its run."""
     clock = Clock()
     device = Device(clock, halting=0.0)
 
@@ -168,7 +173,9 @@ def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
 
     entries = {"move": ActionEntry("move", "tests:none", "task", "here", "it")}
     for held, stops in ((False, 0), (True, 1)):
-        runner = Runner(entries, clock=clock, device=device, substitutes={"move": move}, virtual=True)
+        runner = Runner(
+            entries, clock=clock, device=device, substitutes={"move": move}, virtual=True
+        )
         device.stops.clear()
         runner.take(clock.now, Begin("r", "move", {}, None, 1))
         runner.advance(clock.now)
@@ -184,7 +191,8 @@ def test_a_cancelled_run_of_a_held_device_calls_its_stop_routine() -> None:
 
 
 def test_a_held_run_does_not_grow_older() -> None:
-    """Its clock, its waits and its deadline stand still: an action that looks at `ctx.now` is not late after a pause."""
+    """Its clock, its waits and its deadline stand still: an action that looks at `ctx.now` is not
+    late after a pause."""
     clock = Clock()
     seen: list[float] = []
 

@@ -1,4 +1,5 @@
-"""Keys and authorities are replaced host by host: at every step every node reaches every other, and the coordinator all of them."""
+"""Keys and authorities are replaced host by host: at every step every node reaches every other, and
+the coordinator all of them."""
 
 from __future__ import annotations
 
@@ -10,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.certificates import make_certificates
-from services.comm.directory import DirectoryError, parse
-from services.comm.security import new_key, write_key
+from petrobot.coordinator.certificates import make_certificates
+from petrobot.services.comm.directory import DirectoryError, parse
+from petrobot.services.comm.security import new_key, write_key
 from tests.doors.test_streams import GuardedOperator
 from tests.node.test_processes import CELL, PATIENCE, start_node
 from tests.ports import free_ports
@@ -25,7 +26,8 @@ PASSES = {
         'certificates = "new"',
     ],
 }  # fmt: skip
-"""What stands under [keys], pass by pass; each host goes on to the next when all have done the one before."""
+"""What stands under [keys], pass by pass; each host goes on to the next when all have done the one
+before."""
 
 
 RETRY = 0.1
@@ -74,12 +76,14 @@ class Hosts:
             process.communicate(timeout=PATIENCE)
 
     async def works(self, keys: str) -> None:
-        """A coordinator with these keys reaches both nodes, and they each other: a call, and a stream of set points."""
+        """A coordinator with these keys reaches both nodes, and they each other: a call, and a
+        stream of set points."""
         path = await asyncio.to_thread(self.write, "coordinator", keys)
         operator = GuardedOperator(parse(path.read_text(), path))
         try:
             await operator.connect("left", "right")
-            # A node that was away is tried again once a second by the other: that long the first ones may fail.
+            # A node that was away is tried again once a second by the other: that long the first
+            # ones may fail.
             async with asyncio.timeout(PATIENCE):
                 while (await operator.call("relay", a=3)).values.get("sum") != 5:  # node to node
                     await asyncio.sleep(RETRY)
@@ -96,7 +100,9 @@ class Hosts:
         return bool((await following).values["count"])
 
 
-@pytest.mark.parametrize("how", ["shared key", pytest.param("certificates", marks=pytest.mark.proof)])
+@pytest.mark.parametrize(
+    "how", ["shared key", pytest.param("certificates", marks=pytest.mark.proof)]
+)
 async def test_keys_are_replaced_host_by_host_without_an_outage(tmp_path: Path, how: str) -> None:
     hosts = Hosts(tmp_path, how)
     passes = PASSES[how]
@@ -131,6 +137,9 @@ def test_an_also_needs_what_it_stands_beside(keys: str, says: str) -> None:
 def test_the_hash_leaves_keys_out() -> None:
     """While they are replaced hosts name different ones; everything else must still be the same."""
     cell = CELL.format(left=1001, right=1002)
-    hashes = {parse(cell + keys, Path("services.toml")).hash for keys in ("", '[keys]\nfile = "a"\nalso = "b"\n')}
+    hashes = {
+        parse(cell + keys, Path("services.toml")).hash
+        for keys in ("", '[keys]\nfile = "a"\nalso = "b"\n')
+    }
     assert len(hashes) == 1
     assert parse(cell.replace("1002", "1003"), Path("services.toml")).hash not in hashes

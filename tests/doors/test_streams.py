@@ -1,4 +1,5 @@
-"""Set points between guarded nodes: sealed by the shared key or by what crossed TLS; a stranger's set points move nothing."""
+"""Set points between guarded nodes: sealed by the shared key or by what crossed TLS; a stranger's
+set points move nothing."""
 
 from __future__ import annotations
 
@@ -11,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.certificates import make_certificates
-from services.comm.caller import Caller
-from services.comm.camera import ImageServer, StreamImages
-from services.comm.can_hub import Hub
-from services.comm.can_ports import StreamPort
-from services.comm.canbus import Frame
-from services.comm.client import Client
-from services.comm.credentials import credentials
-from services.comm.messages import Hello
-from services.comm.security import new_key, write_key
-from services.comm.stream import StreamReceiver, StreamSender
-from services.comm.stream_line import Incoming
+from petrobot.coordinator.certificates import make_certificates
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.camera import ImageServer, StreamImages
+from petrobot.services.comm.can_hub import Hub
+from petrobot.services.comm.can_ports import StreamPort
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import credentials
+from petrobot.services.comm.messages import Hello
+from petrobot.services.comm.security import new_key, write_key
+from petrobot.services.comm.stream import StreamReceiver, StreamSender
+from petrobot.services.comm.stream_line import Incoming
 from tests.node.test_processes import CELL, Nodes, Operator
 from tests.waiting import Limit
 
@@ -37,18 +38,25 @@ class GuardedOperator(Operator):
         """Connect to the nodes."""
         proves = credentials(self.directory, "coordinator")
         for node in nodes:
-            hello = Hello(2, 2, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
+            hello = Hello(
+                2, 2, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash
+            )
             caller, (host, port) = Caller(node, hello, auto_ack=True), self.directory.address(node)
-            client = Client(host, port, caller, on_notices=self._take, key=proves.key, tls=proves.client())
+            client = Client(
+                host, port, caller, on_notices=self._take, key=proves.key, tls=proves.client()
+            )
             self.clients[node] = client
             client.start()
             assert await client.connected(60.0)
 
 
 @pytest.mark.processes
-@pytest.mark.parametrize("how", [pytest.param("shared key", marks=pytest.mark.proof), "certificates"])
+@pytest.mark.parametrize(
+    "how", [pytest.param("shared key", marks=pytest.mark.proof), "certificates"]
+)
 async def test_set_points_cross_guarded_nodes(tmp_path: Path, how: str) -> None:
-    """An action of one node leads a device of another; a variable of a third call goes over the same doors."""
+    """An action of one node leads a device of another; a variable of a third call goes over the
+    same doors."""
     if how == "certificates":
         make_certificates(tmp_path / "keys", ["coordinator", "left", "right"])
     else:
@@ -95,7 +103,9 @@ def test_a_strangers_set_points_move_nothing(key: bytes | None, ticket: str, say
     """Without the key, with another key, without the ticket."""
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "secret.1")}, key=b"k" * 32)
-    sender = StreamSender("mallory", "points", 0.02, *receiver.address, receiver="arm", ticket=ticket, key=key)
+    sender = StreamSender(
+        "mallory", "points", 0.02, *receiver.address, receiver="arm", ticket=ticket, key=key
+    )
     for _ in range(10_000):
         sender.send([1.0])
         receiver.poll()
@@ -108,7 +118,8 @@ def test_a_strangers_set_points_move_nothing(key: bytes | None, ticket: str, say
 
 
 def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
-    """However many connect and send, one poll takes a few connections and a few bytes of each: the good stream goes on."""
+    """However many connect and send, one poll takes a few connections and a few bytes of each: the
+    good stream goes on."""
     sink = Taken()
     receiver = StreamReceiver("arm", {"points": Incoming(0.02, sink, "t.1")})
     good = StreamSender("vision", "points", 0.02, *receiver.address, receiver="arm", ticket="t.1")
@@ -136,7 +147,8 @@ def test_strangers_do_not_hold_up_the_loop_that_polls() -> None:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.7.2", "::"])
 def test_unprotected_streams_stay_on_this_host(host: str) -> None:
-    """Images and CAN frames between processes have neither secrecy nor authentication: no other host may reach them."""
+    """Images and CAN frames between processes have neither secrecy nor authentication: no other
+    host may reach them."""
     with pytest.raises(ValueError, match="images are not protected"):
         ImageServer(host, 0)
     with pytest.raises(ValueError, match="the stream is not protected"):

@@ -1,4 +1,5 @@
-"""Mutual TLS between real sockets: who has the cell's certificates is let in, under the name on them, and nobody else."""
+"""Mutual TLS between real sockets: who has the cell's certificates is let in, under the name on
+them, and nobody else."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from coordinator.certificates import CertificateError, make_certificates
-from coordinator.cli import main
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.credentials import Credentials, may_speak_as
-from services.comm.directory import DirectoryError, parse
-from services.comm.security import KeyFileError
+from petrobot.coordinator.certificates import CertificateError, make_certificates
+from petrobot.coordinator.cli import main
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.credentials import Credentials, may_speak_as
+from petrobot.services.comm.directory import DirectoryError, parse
+from petrobot.services.comm.security import KeyFileError
 from tests.doors.conftest import HELLO, Victim
 from tests.waiting import beat
 
@@ -46,7 +47,9 @@ def context(folder: Path, party: str) -> ssl.SSLContext:
     return made
 
 
-async def test_who_has_a_certificate_of_the_cell_is_served(victim: Start, certificates: Path) -> None:
+async def test_who_has_a_certificate_of_the_cell_is_served(
+    victim: Start, certificates: Path
+) -> None:
     """TLS 1.3, both ends certified; a large message crosses it whole."""
     server = victim(folder=str(certificates))
     client = server.client()
@@ -61,8 +64,11 @@ async def test_who_has_a_certificate_of_the_cell_is_served(victim: Start, certif
     await client.close()
 
 
-async def test_a_certificate_of_another_authority_is_refused(victim: Start, certificates: Path, tmp_path: Path) -> None:
-    """A stranger who made certificates of its own, with all the right names: neither end trusts the other."""
+async def test_a_certificate_of_another_authority_is_refused(
+    victim: Start, certificates: Path, tmp_path: Path
+) -> None:
+    """A stranger who made certificates of its own, with all the right names: neither end trusts the
+    other."""
     make_certificates(tmp_path / "own", ["coordinator", "vision"])
     server = victim(folder=str(certificates))
     client = server.client(tls=context(tmp_path / "own", "coordinator"))
@@ -84,7 +90,9 @@ async def test_without_a_certificate_nobody_is_let_in(victim: Start, certificate
     bare = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     bare.load_verify_locations(certificates / "ca.pem")
     for tls in (None, bare):
-        outcome = await outcome_of(Client(*server.address, Caller("vision", HELLO, auto_ack=True), tls=tls))
+        outcome = await outcome_of(
+            Client(*server.address, Caller("vision", HELLO, auto_ack=True), tls=tls)
+        )
         assert outcome.status == "error" and outcome.executed is not m.Executed.YES
     assert server.about()["connected"] == []
 
@@ -100,7 +108,9 @@ async def test_older_tls_is_refused(victim: Start, certificates: Path) -> None:
     assert "it takes TLS 1.3" in client.trouble
 
 
-async def test_a_node_cannot_stand_in_for_another(victim: Start, certificates: Path, tmp_path: Path) -> None:
+async def test_a_node_cannot_stand_in_for_another(
+    victim: Start, certificates: Path, tmp_path: Path
+) -> None:
     """Whoever has taken motion's key and listens at vision's address is not taken for vision."""
     stolen = tmp_path / "stolen"
     shutil.copytree(certificates, stolen)
@@ -142,7 +152,7 @@ def test_nobody_certified_speaks_as_nobody() -> None:
     assert not may_speak_as("", "coordinator", "coordinator") and not may_speak_as("", "node", "")
 
 
-# --- the command ------------------------------------------------------------------------------------------------------------
+# --- the command ------------------------------------------------------------------------------
 
 
 def services_in(folder: Path) -> Path:
@@ -159,7 +169,8 @@ def services_in(folder: Path) -> Path:
 def test_keys_makes_certificates_and_says_where_to_copy_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One command; keys are their owner's alone; a second time it adds what is missing and overwrites nothing."""
+    """One command; keys are their owner's alone; a second time it adds what is missing and
+    overwrites nothing."""
     monkeypatch.chdir(tmp_path)
     services = str(services_in(tmp_path))
     assert main(["keys", "--tls", "--services", services]) == 0
@@ -167,7 +178,9 @@ def test_keys_makes_certificates_and_says_where_to_copy_them(
     assert "192.168.7.2: ca.pem, vision.pem, vision.key" in said and 'certificates = "keys"' in said
     folder = tmp_path / "keys"
     assert {path.name for path in folder.iterdir()} == {
-        f"{name}.{end}" for name in ("ca", "coordinator", "vision", "motion") for end in ("pem", "key")
+        f"{name}.{end}"
+        for name in ("ca", "coordinator", "vision", "motion")
+        for end in ("pem", "key")
     }
     for key in folder.glob("*.key"):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
@@ -194,7 +207,10 @@ def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> Non
     [
         (lambda folder: (folder / "vision.key").unlink(), "petrobot keys --tls"),
         (lambda folder: (folder / "vision.key").chmod(0o644), "chmod 600"),
-        (lambda folder: (folder / "vision.pem").write_text("no certificate"), "copy vision's files here"),
+        (
+            lambda folder: (folder / "vision.pem").write_text("no certificate"),
+            "copy vision's files here",
+        ),
         (
             lambda folder: shutil.copy(folder / "motion.key", folder / "vision.key"),
             "no certificate of vision can be used",
@@ -202,7 +218,9 @@ def test_keys_without_the_authoritys_key_says_where_to_go(tmp_path: Path) -> Non
         (lambda folder: (folder / "ca.pem").unlink(), "no certificate of vision can be used"),
     ],
 )
-def test_bad_files_give_one_clear_error(tmp_path: Path, spoil: Callable[[Path], Any], says: str) -> None:
+def test_bad_files_give_one_clear_error(
+    tmp_path: Path, spoil: Callable[[Path], Any], says: str
+) -> None:
     """Which file, and what to do."""
     make_certificates(tmp_path, ["vision", "motion"])
     spoil(tmp_path)
@@ -211,15 +229,21 @@ def test_bad_files_give_one_clear_error(tmp_path: Path, spoil: Callable[[Path], 
 
 
 def test_stream_keys_are_of_the_ticket(tmp_path: Path) -> None:
-    """With certificates a stream is sealed by what crossed TLS; with a shared key by that; on loopback by nothing."""
+    """With certificates a stream is sealed by what crossed TLS; with a shared key by that; on
+    loopback by nothing."""
     certified, keyed = Credentials("vision", None, tmp_path), Credentials("vision", b"k" * 32)
     one, two = certified.stream_key("secret.1"), certified.stream_key("secret.2")
     assert one == two and one is not None and len(one) == 32
     assert certified.stream_key("other.1") != one and certified.stream_key("") is None
-    assert keyed.stream_key("secret.1") == b"k" * 32 and Credentials("vision").stream_key("secret.1") is None
+    assert (
+        keyed.stream_key("secret.1") == b"k" * 32
+        and Credentials("vision").stream_key("secret.1") is None
+    )
 
 
-async def test_client_tells_why_it_is_lost(victim: Start, certificates: Path, tmp_path: Path) -> None:
+async def test_client_tells_why_it_is_lost(
+    victim: Start, certificates: Path, tmp_path: Path
+) -> None:
     """A coordinator whose certificate is refused hears of it, not of a cable."""
     make_certificates(tmp_path, ["coordinator"])
     shutil.copy(certificates / "ca.pem", tmp_path / "ca.pem")
@@ -232,11 +256,12 @@ async def test_client_tells_why_it_is_lost(victim: Start, certificates: Path, tm
     await client.close()
 
 
-# --- the shared key ---------------------------------------------------------------------------------------------------------
+# --- the shared key ---------------------------------------------------------------------------
 
 
 def test_keys_makes_one_shared_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A file for its owner's eyes alone, never shown, never overwritten, with the lines for services.toml."""
+    """A file for its owner's eyes alone, never shown, never overwritten, with the lines for
+    services.toml."""
     services, file = str(services_in(tmp_path)), tmp_path / "cell.key"
     assert main(["keys", "--file", str(file), "--services", services]) == 0
     said = capsys.readouterr().out
@@ -251,7 +276,10 @@ def test_keys_makes_one_shared_key(tmp_path: Path, capsys: pytest.CaptureFixture
     ("keys", "says"),
     [
         ('flie = "cell.key"', "keys.flie: unknown; .*did you mean 'file'"),
-        ('file = "cell.key"\ncertificates = "keys"', "keys: a shared key and certificates; name one of them"),
+        (
+            'file = "cell.key"\ncertificates = "keys"',
+            "keys: a shared key and certificates; name one of them",
+        ),
         ("file = 3", "keys.file: is 3; write the path of a file or folder"),
     ],
 )

@@ -1,6 +1,8 @@
-"""Whoever answers must be the node that was asked for: a man in the middle without the key, and a wrong port without a key.
+"""Whoever answers must be the node that was asked for: a man in the middle without the key, and a
+wrong port without a key.
 
-The man in the middle is a process of nobody's: it takes what comes on a node's address and carries it to another node.
+The man in the middle is a process of nobody's: it takes what comes on a node's address and carries
+it to another node.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from services.comm.security import new_key, write_key
+from petrobot.services.comm.security import new_key, write_key
 from tests.doors.test_estop import finished, petrobot
 from tests.node.test_processes import Nodes
 from tests.ports import free_ports
@@ -44,7 +46,8 @@ KEYS = '[keys]\nfile = "cell.key"\n'
 
 
 class Middle:
-    """Carries what comes to one port to another one, and can play what a server said in an earlier session."""
+    """Carries what comes to one port to another one, and can play what a server said in an earlier
+    session."""
 
     def __init__(self, to: int) -> None:
         self.to = to
@@ -110,7 +113,8 @@ class Deceived:
         self.middles: list[Middle] = []
 
     async def between(self, **to: str) -> Path:
-        """The location file of a caller whose way to these nodes leads to others; gives its path."""
+        """The location file of a caller whose way to these nodes leads to others; gives its
+        path."""
         ports = dict(self.ports)
         for node, other in to.items():
             middle = Middle(self.ports[other])
@@ -123,11 +127,21 @@ class Deceived:
 
     async def estop(self, services: Path) -> tuple[int, dict[str, str]]:
         """`petrobot estop`: exit code, and of each node why it did not answer (empty: it did)."""
-        options = ["--services", str(services), "--journal", str(self.folder / "runs"), "--json", "-"]
+        options = [
+            "--services",
+            str(services),
+            "--journal",
+            str(self.folder / "runs"),
+            "--json",
+            "-",
+        ]
         state = str(self.folder / "state of the caller's host")
         code, out, err = await finished(petrobot("estop", *options, PETROBOT_STATE=state))
         assert out, err
-        return code, {one["node"]: one["why"] or "?" * (one["seconds"] is None) for one in json.loads(out)["nodes"]}
+        return code, {
+            one["node"]: one["why"] or "?" * (one["seconds"] is None)
+            for one in json.loads(out)["nodes"]
+        }
 
 
 @asynccontextmanager
@@ -148,10 +162,13 @@ async def deceived(folder: Path, keyed: bool) -> AsyncIterator[Deceived]:
 
 @pytest.mark.parametrize("keyed", [True, False], ids=["shared key", "no key"])
 async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed: bool) -> None:
-    """Both ways to one node, both swapped, one led astray: never exit code 0, and only who was really told counts as told."""
+    """Both ways to one node, both swapped, one led astray: never exit code 0, and only who was
+    really told counts as told."""
     async with deceived(tmp_path, keyed) as cell:
         straight = await cell.between(left="left", right="right")
-        assert await cell.estop(straight) == (0, {"left": "", "right": ""}), "somebody who only listens changes nothing"
+        assert await cell.estop(straight) == (0, {"left": "", "right": ""}), (
+            "somebody who only listens changes nothing"
+        )
         for ways, missed in (
             ({"left": "left", "right": "left"}, {"right"}),
             ({"left": "right", "right": "left"}, {"left", "right"}),
@@ -159,11 +176,15 @@ async def test_estop_names_each_node_that_was_not_reached(tmp_path: Path, keyed:
         ):
             code, told = await cell.estop(await cell.between(**ways))
             assert code == 3 and {node for node, why in told.items() if why} == missed, (ways, told)
-            assert all("wrong_node" in told[node] and f"{node} was asked for" in told[node] for node in missed), told
+            assert all(
+                "wrong_node" in told[node] and f"{node} was asked for" in told[node]
+                for node in missed
+            ), told
 
 
 async def test_a_recorded_session_stops_nobody(tmp_path: Path) -> None:
-    """What the right node said to an earlier `estop` is said again: the proof is of other nonces."""
+    """What the right node said to an earlier `estop` is said again: the proof is of other
+    nonces."""
     async with deceived(tmp_path, True) as cell:
         services = await cell.between(left="left", right="right")
         assert (await cell.estop(services))[0] == 0
@@ -174,10 +195,13 @@ async def test_a_recorded_session_stops_nobody(tmp_path: Path) -> None:
 
 
 async def test_nodes_shows_a_wrong_port(tmp_path: Path) -> None:
-    """Two ports mixed up in services.toml, no key: each is said to be the other, and neither counts as up."""
+    """Two ports mixed up in services.toml, no key: each is said to be the other, and neither counts
+    as up."""
     async with deceived(tmp_path, False) as cell:
         services = await cell.between(left="right", right="left")
-        code, out, err = await finished(petrobot("nodes", "--services", str(services), "--json", "-"))
+        code, out, err = await finished(
+            petrobot("nodes", "--services", str(services), "--json", "-")
+        )
         told = json.loads(out)
         assert code == 3, err
         assert "this is right, left was asked for" in told["left"]["why"]

@@ -1,10 +1,11 @@
-"""Random nets of the shape that robot tasks have: steps, alternatives, loops and side-by-side branches around resources."""
+"""Random nets of the shape that robot tasks have: steps, alternatives, loops and side-by-side
+branches around resources."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from coordinator.net import Net
+from petrobot.coordinator.net import Net
 
 
 class _Growing:
@@ -25,12 +26,17 @@ class _Growing:
 
     def step(self, takes: list[str], gives: list[str]) -> None:
         """A new transition."""
-        self.transitions[f"step_{len(self.transitions)}"] = (dict.fromkeys(takes, 1), dict.fromkeys(gives, 1))
+        self.transitions[f"step_{len(self.transitions)}"] = (
+            dict.fromkeys(takes, 1),
+            dict.fromkeys(gives, 1),
+        )
 
     def block(self, start: str, depth: int) -> str:
         """Something that begins at a place; gives the place where it ends."""
         kind = (
-            self.random.choice(["sequence", "sequence", "action", "parallel", "alternative", "loop"])
+            self.random.choice(
+                ["sequence", "sequence", "action", "parallel", "alternative", "loop"]
+            )
             if depth
             else "action"
         )

@@ -1,4 +1,5 @@
-"""Macro places that group: what a task file may say of them, what it changes, and how they are drawn."""
+"""Macro places that group: what a task file may say of them, what it changes, and how they are
+drawn."""
 
 from __future__ import annotations
 
@@ -8,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import CommandError, show
-from coordinator.drawing import Overlay, draw
-from coordinator.drawing.scene import scene_of_task
-from coordinator.drawing.sheet import sheet_of
-from coordinator.hmi.picture import picture
-from coordinator.task import Task
-from coordinator.taskfile import TaskFileError, dumps, loads
+from petrobot.coordinator.cli import CommandError, show
+from petrobot.coordinator.drawing import Overlay, draw
+from petrobot.coordinator.drawing.scene import scene_of_task
+from petrobot.coordinator.drawing.sheet import sheet_of
+from petrobot.coordinator.hmi.picture import picture
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import TaskFileError, dumps, loads
 
 TEXT = """
 schema = 1
@@ -50,7 +51,9 @@ s = { in = ["x"], out = ["y"] }
 
 def flat_twin() -> Task:
     """The same task with nothing grouped."""
-    lines = [line for line in TEXT.splitlines() if not line.startswith(("inner =", "outer =", "g ="))]
+    lines = [
+        line for line in TEXT.splitlines() if not line.startswith(("inner =", "outer =", "g ="))
+    ]
     text = "\n".join(lines)
     for macro in ("inner", "outer", "g"):
         text = text.replace(f', macro = "{macro}"', "")
@@ -73,7 +76,11 @@ def test_grouping_changes_nothing_but_the_drawing() -> None:
         ('out = ["done", "use"]', 'out = ["outer"]', "transitions.t4"),
         ('macro = "outer", label', 'macro = "inner", label', "places.inner.macro"),
         ('t1 = { in = ["begin"]', 't1 = { macro = "inner", in = ["begin"]', "transitions.t1.macro"),
-        ('a = { kind = "control", macro = "inner"', 'a = { kind = "control", macro = "inne"', "places.a.macro"),
+        (
+            'a = { kind = "control", macro = "inner"',
+            'a = { kind = "control", macro = "inne"',
+            "places.a.macro",
+        ),
         ('macro = "inner", tokens', 'macro = "use", tokens', "places.b.macro"),
         ('outer = { kind = "macro"', 'outer = { kind = "macro", tokens = 1', "places.outer"),
         ('"y" }', '"y" }', ""),
@@ -123,7 +130,8 @@ def test_the_page_knows_which_stands_in_which() -> None:
 
 
 def test_the_command_opens_a_macro_place(tmp_path: Path) -> None:
-    """`petrobot show --inside` draws the inside; a name that is none is bad input and says which there are."""
+    """`petrobot show --inside` draws the inside; a name that is none is bad input and says which
+    there are."""
     parser = argparse.ArgumentParser()
     show.add_arguments(parser)
     task, out = tmp_path / "m.toml", tmp_path / "m.svg"

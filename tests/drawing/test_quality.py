@@ -1,4 +1,5 @@
-"""Automatic drawings are fit to be published: measured on random nets that nobody looked at while the layout was made."""
+"""Automatic drawings are fit to be published: measured on random nets that nobody looked at while
+the layout was made."""
 
 from __future__ import annotations
 
@@ -11,11 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.drawing.layout import Point
-from coordinator.drawing.routing import Box, Way, Words, place_words, route
-from coordinator.drawing.scene import Node, Scene, scene_of_net, scene_of_task
-from coordinator.task import Task
-from coordinator.taskfile import load
+from petrobot.coordinator.drawing.layout import Point
+from petrobot.coordinator.drawing.routing import Box, Way, Words, place_words, route
+from petrobot.coordinator.drawing.scene import Node, Scene, scene_of_net, scene_of_task
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import load
 from tests.drawing.conftest import random_task
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
@@ -37,7 +38,9 @@ Array = NDArray[np.float64]
 
 def _side(p: Array, q: Array, r: Array) -> Array:
     """On which side of the line from p to q the points r lie."""
-    side: Array = (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+    side: Array = (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
+        r[..., 0] - p[..., 0]
+    )
     return side
 
 
@@ -88,7 +91,8 @@ def drawn(scene: Scene) -> tuple[list[Way], list[Words]]:
 
 
 def test_random_nets_are_drawn_as_a_person_would() -> None:
-    """No node on another, no arc over a node, no word on a word or node; crossings and struck words are rare (all seeds)."""
+    """No node on another, no arc over a node, no word on a word or node; crossings and struck words
+    are rare (all seeds)."""
     arcs = crossed = struck = 0
     for seed in SEEDS:
         scene = scene_of_net(random_task(np.random.default_rng(seed), 2 + seed % 3), None, None)
@@ -98,7 +102,11 @@ def test_random_nets_are_drawn_as_a_person_would() -> None:
         assert not list(through_nodes(scene, ways))
         assert not any(covers(a.box, b.box) for a, b in combinations(words, 2))
         assert not any(covers(w.box, box) for w in words for box in boxes)
-        arcs, crossed, struck = arcs + len(ways), crossed + crossings(ways), struck + through_words(words, ways)
+        arcs, crossed, struck = (
+            arcs + len(ways),
+            crossed + crossings(ways),
+            struck + through_words(words, ways),
+        )
     assert arcs > 300
     assert crossed <= 0.01 * arcs
     assert struck <= 0.01 * arcs
@@ -108,14 +116,17 @@ def unplaced(task: Task) -> Task:
     """The task without positions."""
     places = {n: replace(p, x=None, y=None) for n, p in task.places.items()}
     return replace(
-        task, places=places, transitions={n: replace(t, x=None, y=None) for n, t in task.transitions.items()}
+        task,
+        places=places,
+        transitions={n: replace(t, x=None, y=None) for n, t in task.transitions.items()},
     )
 
 
 @pytest.mark.parametrize("errors", [False, True])
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda p: p.stem)
 def test_shipped_tasks_could_do_without_positions(path: Path, errors: bool) -> None:
-    """Laid out automatically no arc runs over a node, and no more arcs cross or strike words than where people put things."""
+    """Laid out automatically no arc runs over a node, and no more arcs cross or strike words than
+    where people put things."""
     task = load(path)
     by_hand = drawn(scene_of_task(task, errors, None, None))
     scene = scene_of_task(unplaced(task), errors, None, None)
@@ -134,4 +145,6 @@ def test_a_long_way_back_is_led_around() -> None:
     for way in led:
         steps = np.diff(np.array(way.points), axis=0)
         assert np.hypot(*steps.T).max() < 60
-        assert way.points[0] == pytest.approx(way.start) and way.points[-1] == pytest.approx(way.end)
+        assert way.points[0] == pytest.approx(way.start) and way.points[-1] == pytest.approx(
+            way.end
+        )

@@ -1,4 +1,5 @@
-"""Small nets in a short notation, and a player that feeds them stimuli and remembers what came out."""
+"""Small nets in a short notation, and a player that feeds them stimuli and remembers what came
+out."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from coordinator.conditions import parse
-from coordinator.engine import (
+from petrobot.coordinator.conditions import parse
+from petrobot.coordinator.engine import (
     Begin,
     Engine,
     Finished,
@@ -21,7 +22,7 @@ from coordinator.engine import (
     State,
     Stimulus,
 )
-from coordinator.task import (
+from petrobot.coordinator.task import (
     Early,
     Event,
     Input,
@@ -37,7 +38,7 @@ from coordinator.task import (
     Variable,
     VariableType,
 )
-from coordinator.taskfile.arcs import read_input, read_output
+from petrobot.coordinator.taskfile.arcs import read_input, read_output
 
 
 def make_task(
@@ -53,9 +54,9 @@ def make_task(
 ) -> Task:
     """A task from words.
 
-    Places: `a!` action, `a!2` action with 2 servers, `r~` resource, `c` control; `=N` tokens, `/N` capacity. Each action
-    place x runs the primitive task x with the action do_x. Events: `e` pulse, `e*` latched, `e+` latched and kept, `e<x`
-    internal to x.
+    Places: `a!` action, `a!2` action with 2 servers, `r~` resource, `c` control; `=N` tokens, `/N`
+    capacity. Each action place x runs the primitive task x with the action do_x. Events: `e` pulse,
+    `e*` latched, `e+` latched and kept, `e<x` internal to x.
     """
     read_places = {p.name: p for p in map(_place, places.split())}
     for name, mapping in (args or {}).items():
@@ -101,7 +102,9 @@ def _event(word: str) -> Event:
         name, _, by = word.partition("<")
         return Event(name, Scope.INTERNAL, by=by)
     memory = Memory.PULSE if word.isidentifier() else Memory.LATCHED
-    return Event(word.rstrip("*+"), Scope.EXTERNAL, memory, Early.KEEP if word.endswith("+") else Early.DROP)
+    return Event(
+        word.rstrip("*+"), Scope.EXTERNAL, memory, Early.KEEP if word.endswith("+") else Early.DROP
+    )
 
 
 def _transition(name: str, given: Mapping[str, Any]) -> Transition:
@@ -121,7 +124,8 @@ def _transition(name: str, given: Mapping[str, Any]) -> Transition:
 
 
 class Play:
-    """A mission run being played. Calling it handles stimuli and gives the instructions of the last one."""
+    """A mission run being played. Calling it handles stimuli and gives the instructions of the last
+    one."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -153,7 +157,8 @@ class Play:
 
     @property
     def reports(self) -> list[str]:
-        """Keys of all reports so far, but for that of a dead marking, in which most small nets end."""
+        """Keys of all reports so far, but for that of a dead marking, in which most small nets
+        end."""
         return [i.key for i in self.all if isinstance(i, Report) and i.key != "dead"]
 
     @property
@@ -183,7 +188,9 @@ def play() -> Callable[..., Play]:
         begin: bool = True,
         **kwargs: Any,
     ) -> Play:
-        player = Play(Engine(make_task(*args, **kwargs), devices, policy or Policy(end_when_dead=False)))
+        player = Play(
+            Engine(make_task(*args, **kwargs), devices, policy or Policy(end_when_dead=False))
+        )
         if begin:
             player(Begin())
         return player

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.check import Severity, check
-from coordinator.conditions import parse
-from coordinator.task import Task
+from petrobot.coordinator.check import Severity, check
+from petrobot.coordinator.conditions import parse
+from petrobot.coordinator.task import Task
 
 Tasks = Callable[..., Task]
 A = {"n": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error", "out": "y"}}
@@ -36,7 +36,9 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "uncovered-exit",
             E,
             "places.a",
-            lambda t: t("a!=1 y", {**A, "n": {"in": "a:normal", "when": "k > 1"}}, variables={"k": 0}),
+            lambda t: t(
+                "a!=1 y", {**A, "n": {"in": "a:normal", "when": "k > 1"}}, variables={"k": 0}
+            ),
         ),
         (
             "uncovered-exit",
@@ -48,7 +50,11 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "unsettled-conflict",
             E,
             "transitions.t",
-            lambda t: t("x=1 y", {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "event": "e"}}, "e"),
+            lambda t: t(
+                "x=1 y",
+                {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "event": "e"}},
+                "e",
+            ),
         ),
         (
             "unsettled-conflict",
@@ -60,21 +66,27 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "unsettled-conflict",
             E,
             "transitions.t",
-            lambda t: t("x=1 w=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "w", "event": "e"}}, "e*"),
-        ),
-        (
-            "unsettled-conflict",
-            E,
-            "transitions.t",
             lambda t: t(
-                "x=1 w=1 y/1", {n: {"in": p, "out": "y", "event": "e"} for n, p in (("t", "x"), ("u", "w"))}, "e"
+                "x=1 w=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "w", "event": "e"}}, "e*"
             ),
         ),
         (
             "unsettled-conflict",
             E,
             "transitions.t",
-            lambda t: t("x=1 w=1 y z", {"t": {"in": "x !z", "out": "y"}, "u": {"in": "w !y", "out": "z"}}),
+            lambda t: t(
+                "x=1 w=1 y/1",
+                {n: {"in": p, "out": "y", "event": "e"} for n, p in (("t", "x"), ("u", "w"))},
+                "e",
+            ),
+        ),
+        (
+            "unsettled-conflict",
+            E,
+            "transitions.t",
+            lambda t: t(
+                "x=1 w=1 y z", {"t": {"in": "x !z", "out": "y"}, "u": {"in": "w !y", "out": "z"}}
+            ),
         ),
         (
             "unsettled-conflict",
@@ -92,19 +104,25 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "arrival-order",
             N,
             "transitions.t",
-            lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e f*"),
+            lambda t: t(
+                "x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e f*"
+            ),
         ),
         (
             "unsettled-conflict",
             E,
             "transitions.t",
-            lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e+ f+"),
+            lambda t: t(
+                "x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "event": "f"}}, "e+ f+"
+            ),
         ),
         (
             "arrival-order",
             N,
             "transitions.t",
-            lambda t: t("x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "after": 1.0}}, "e"),
+            lambda t: t(
+                "x=1", {"t": {"in": "x", "event": "e"}, "u": {"in": "x", "after": 1.0}}, "e"
+            ),
         ),
         (
             "timeless-cycle",
@@ -118,12 +136,19 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "external-wait",
             W,
             "places.a",
-            lambda t: t("a!=1", {"n": {"in": "a:normal", "event": "e"}, "e": {"in": "a:error"}}, "e*"),
+            lambda t: t(
+                "a!=1", {"n": {"in": "a:normal", "event": "e"}, "e": {"in": "a:error"}}, "e*"
+            ),
         ),
         ("never-marked", W, "places.r", lambda t: t("r~ y", {"t": {"in": "r", "out": "y"}})),
         ("never-marked", N, "places.x", lambda t: t("x y", {"t": {"in": "x", "out": "y"}})),
         ("never-fires", W, "transitions.t", lambda t: t("r~ y", {"t": {"in": "r", "out": "y"}})),
-        ("final-at-start", W, "task.final", lambda t: t("x y", {"t": {"in": "x", "out": "y"}}, final="x == 0")),
+        (
+            "final-at-start",
+            W,
+            "task.final",
+            lambda t: t("x y", {"t": {"in": "x", "out": "y"}}, final="x == 0"),
+        ),
         ("unused", N, "events.e", lambda t: t("a!=1 y", A, "e")),
         (
             "never-written",
@@ -141,14 +166,28 @@ def test_sound_task_has_no_finding(task: Tasks) -> None:
             "internal-impossible",
             E,
             "transitions.start.event",
-            lambda t: t("x=1 a! y", {**A, "start": {"in": "x", "out": "a", "event": "tick"}}, "tick<a"),
+            lambda t: t(
+                "x=1 a! y", {**A, "start": {"in": "x", "out": "a", "event": "tick"}}, "tick<a"
+            ),
         ),
         ("inconsistent", E, "transitions.t.in", lambda t: t("x=1", {"t": {"in": "w"}})),
-        ("inconsistent", E, "transitions.t.event", lambda t: t("x=1", {"t": {"in": "x", "event": "odd"}})),
-        ("inconsistent", E, "transitions.t.event", lambda t: t("x=1", {"t": {"in": "x", "event": "e f"}}, "e f")),
+        (
+            "inconsistent",
+            E,
+            "transitions.t.event",
+            lambda t: t("x=1", {"t": {"in": "x", "event": "odd"}}),
+        ),
+        (
+            "inconsistent",
+            E,
+            "transitions.t.event",
+            lambda t: t("x=1", {"t": {"in": "x", "event": "e f"}}, "e f"),
+        ),
     ],
 )
-def test_finding(task: Tasks, code: str, severity: Severity, key: str, broken: Callable[[Tasks], Task]) -> None:
+def test_finding(
+    task: Tasks, code: str, severity: Severity, key: str, broken: Callable[[Tasks], Task]
+) -> None:
     report = check(broken(task))
     keys = {(f.code, f.severity, f.key) for f in report.findings}
     assert (code, severity, key) in keys, str(report)
@@ -175,7 +214,10 @@ def test_what_settles_a_conflict(task: Tasks, mended: dict[str, dict[str, Any]])
 
 
 def test_conditions_that_overlap_give_a_witness(task: Tasks) -> None:
-    net = {"t": {"in": "x", "event": "e", "when": "k > 1"}, "u": {"in": "x", "event": "e", "when": "k < 4"}}
+    net = {
+        "t": {"in": "x", "event": "e", "when": "k > 1"},
+        "u": {"in": "x", "event": "e", "when": "k < 4"},
+    }
     witness = found(task("x=1", net, "e", {"k": 0}))["unsettled-conflict"].witness
     assert 1 < witness["k"] < 4
 
@@ -194,7 +236,9 @@ def test_uncovered_exit_gives_a_witness(task: Tasks) -> None:
     ],
     ids=["inhibitor", "status", "end and preemption"],
 )
-def test_tokens_that_exclude_each_other_are_no_conflict(task: Tasks, net: dict[str, dict[str, Any]]) -> None:
+def test_tokens_that_exclude_each_other_are_no_conflict(
+    task: Tasks, net: dict[str, dict[str, Any]]
+) -> None:
     codes = found(task("x=1 y=1 a!=1", net, "e"))
     assert "unsettled-conflict" not in codes and "arrival-order" not in codes
 
@@ -206,11 +250,23 @@ def test_invariant_that_excludes_two_transitions(task: Tasks) -> None:
         "t": {"in": "p r", "out": "p", "event": "e"},
         "u": {"in": "q r", "out": "q", "event": "e"},
     }
-    pairs = [f.text for f in check(task("p~=1 q~ r~=1", net, "e f")).findings if f.code == "unsettled-conflict"]
+    pairs = [
+        f.text
+        for f in check(task("p~=1 q~ r~=1", net, "e f")).findings
+        if f.code == "unsettled-conflict"
+    ]
     assert pairs == []
-    pairs = [f.text for f in check(task("p~=1 q~=1 r~=1", net, "e f")).findings if f.code == "unsettled-conflict"]
+    pairs = [
+        f.text
+        for f in check(task("p~=1 q~=1 r~=1", net, "e f")).findings
+        if f.code == "unsettled-conflict"
+    ]
     assert any(t.startswith("t and u") for t in pairs), "with two tokens they can meet"
-    pairs = [f.text for f in check(task("p=1 q r~=1", net, "e f")).findings if f.code == "unsettled-conflict"]
+    pairs = [
+        f.text
+        for f in check(task("p=1 q r~=1", net, "e f")).findings
+        if f.code == "unsettled-conflict"
+    ]
     assert any(t.startswith("t and u") for t in pairs), "the operator may add the second one"
 
 
@@ -239,14 +295,19 @@ def test_action_that_no_node_offers(task: Tasks) -> None:
     assert "'look_twice'" in finding.text and "did you mean 'look_twise'" in finding.text
     assert "unoffered" not in found(made, offers={"look_once": "vision", "look_twice": "vision"})
     assert "unoffered" not in found(made)
-    assert "to mine.toml, or" in found(made, offers={"look_once": "vision"}, source="mine.toml")["unoffered"].remedy
+    assert (
+        "to mine.toml, or"
+        in found(made, offers={"look_once": "vision"}, source="mine.toml")["unoffered"].remedy
+    )
 
 
 @pytest.mark.parametrize(
     ("said", "finds"),
     [("look", False), ("take", False), ("lok", True), ("rest", True)],
 )
-def test_action_that_is_said_to_translate_another_primitive_task(task: Tasks, said: str, finds: bool) -> None:
+def test_action_that_is_said_to_translate_another_primitive_task(
+    task: Tasks, said: str, finds: bool
+) -> None:
     net = {**A, "s": {"in": "b:normal", "out": "y"}, "f": {"in": "b:error", "out": "y"}}
     made = task("a!=1 b! y", net, alternatives={"a": ("move",), "b": ("move",)})
     both = dict(made.primitive_tasks)
@@ -259,9 +320,18 @@ def test_action_that_is_said_to_translate_another_primitive_task(task: Tasks, sa
     found = [f for f in report.findings if f.code == "translates-other"]
     assert bool(found) is finds and report.ok
     assert all(f.severity is W and f.key == "primitive_tasks.look.alternatives" for f in found)
-    assert all("mine.toml says" in f.text and repr(said) in f.text and "'look' or 'take'" in f.remedy for f in found)
+    assert all(
+        "mine.toml says" in f.text and repr(said) in f.text and "'look' or 'take'" in f.remedy
+        for f in found
+    )
 
 
 def test_honest_end_at_start(task: Tasks) -> None:
-    made = task("x=1 y", {"t": {"in": "x", "out": "y", "event": "e"}}, "e", final="y == 1", final_error=parse("x == 1"))
+    made = task(
+        "x=1 y",
+        {"t": {"in": "x", "out": "y", "event": "e"}},
+        "e",
+        final="y == 1",
+        final_error=parse("x == 1"),
+    )
     assert found(made)["final-at-start"].key == "task.final_error"

@@ -1,4 +1,5 @@
-"""Conditions: language, positions of faults, kinds, and exclusivity and coverage against brute force."""
+"""Conditions: language, positions of faults, kinds, and exclusivity and coverage against brute
+force."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.conditions import (
+from petrobot.coordinator.conditions import (
     Answer,
     ConditionError,
     ConditionFault,
@@ -82,7 +83,9 @@ def test_fault_with_its_position(text: str, column: int, words: str) -> None:
     assert caught.value.at + 1 == column and words in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["n", "u", "not n", "a and n", "s > 1", "u < 1", "a < 1", "missing", "n and a"])
+@pytest.mark.parametrize(
+    "text", ["n", "u", "not n", "a and n", "s > 1", "u < 1", "a < 1", "missing", "n and a"]
+)
 def test_no_truth_value(text: str) -> None:
     with pytest.raises(ConditionFault):
         parse(text).holds(VALUES)
@@ -91,7 +94,10 @@ def test_no_truth_value(text: str) -> None:
 def test_names_and_renaming() -> None:
     condition = parse("a and (p.reason == 'a' or not a)")
     assert condition.names == {"a", "p.reason"}
-    assert rename(condition, {"a": "m.a", "p.reason": "m.p.reason"}).text == "m.a and (m.p.reason == 'a' or not m.a)"
+    assert (
+        rename(condition, {"a": "m.a", "p.reason": "m.p.reason"}).text
+        == "m.a and (m.p.reason == 'a' or not m.a)"
+    )
 
 
 DOMAINS = {
@@ -179,13 +185,16 @@ def conditions(draw: st.DrawFn, depth: int = 2) -> str:
     if depth == 0 or draw(st.booleans()):
         number = draw(st.sampled_from(("n", "m", "0", "1", "2")))
         comparison = (
-            f"{draw(st.sampled_from(('n', 'm')))} {draw(st.sampled_from(('<', '<=', '==', '!=', '>=', '>')))} {number}"
+            f"{draw(st.sampled_from(('n', 'm')))} "
+            f"{draw(st.sampled_from(('<', '<=', '==', '!=', '>=', '>')))} {number}"
         )
         word = f"w {draw(st.sampled_from(('==', '!=')))} {draw(st.sampled_from(('1', '2')))!r}"
         return draw(st.sampled_from(("p", "q", comparison, word)))
     inner = [draw(conditions(depth - 1)) for _ in range(2)]
     return draw(
-        st.sampled_from((f"not ({inner[0]})", f"({inner[0]}) and ({inner[1]})", f"({inner[0]}) or ({inner[1]})"))
+        st.sampled_from(
+            (f"not ({inner[0]})", f"({inner[0]}) and ({inner[1]})", f"({inner[0]}) or ({inner[1]})")
+        )
     )
 
 
@@ -197,14 +206,16 @@ SMALL = {
     "w": Domain("str", ("1", "2", "3")),
 }
 BRUTE = [
-    dict(zip("pqnmw", v, strict=True)) for v in product((True, False), (True, False), range(-2, 5), range(-2, 5), "123")
+    dict(zip("pqnmw", v, strict=True))
+    for v in product((True, False), (True, False), range(-2, 5), range(-2, 5), "123")
 ]
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(conditions(), min_size=1, max_size=3))
 def test_regions_agree_with_brute_force(texts: list[str]) -> None:
-    """Integers from -2 to 4 stand for all: literals lie in 0 to 2 and at most two names are compared."""
+    """Integers from -2 to 4 stand for all: literals lie in 0 to 2 and at most two names are
+    compared."""
     parsed = [parse(t) for t in texts]
     truths: list[list[Any]] = [[c.holds(values) for c in parsed] for values in BRUTE]
     assert (exclusive(parsed, SMALL).answer is Answer.PROVED) is all(sum(t) < 2 for t in truths)

@@ -1,4 +1,5 @@
-"""Steps and conflicts by table: what fires together, in which order, and what settles a conflict."""
+"""Steps and conflicts by table: what fires together, in which order, and what settles a
+conflict."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     AddTokens,
     CancelRun,
     Chosen,
@@ -19,7 +20,7 @@ from coordinator.engine import (
     StopConfirmed,
     Subject,
 )
-from coordinator.task import Executed, Status
+from petrobot.coordinator.task import Executed, Status
 
 Plays = Callable[..., Any]
 
@@ -30,7 +31,11 @@ def test_event_free_transitions_follow_until_stable(play: Plays) -> None:
 
 
 def test_timeless_cycle_pauses(play: Plays) -> None:
-    p = play("x=1 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}}, policy=Policy(firing_limit=10))
+    p = play(
+        "x=1 y",
+        {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}},
+        policy=Policy(firing_limit=10),
+    )
     assert len(p.fired) == 10 and p.state.mode is Mode.PAUSED and p.reports == ["timeless"]
 
 
@@ -38,7 +43,10 @@ def test_a_net_that_fires_without_end_is_given_up(play: Plays) -> None:
     """With nobody there to continue it: an unattended run does not wait for ever."""
     p = play("x=3 y", {"t": {"in": "x", "out": "y"}, "u": {"in": "y", "out": "x"}})
     (finished,) = p.of(Finished)
-    assert finished.status is Status.ERROR and "transitions fired without time passing, last" in finished.reason
+    assert (
+        finished.status is Status.ERROR
+        and "transitions fired without time passing, last" in finished.reason
+    )
     assert p.state.mode is Mode.FINISHED and p.reports == ["timeless"]
     assert 1_000 + 2 * (3 + 2) <= len(p.fired) < 1_000 + 2 * (3 + 2) + 4
 
@@ -57,7 +65,11 @@ def test_runs_of_a_net_that_is_given_up_are_stopped_first(play: Plays) -> None:
     ("places", "net", "fired"),
     [
         ("x=1200 y", {"t": {"in": "x", "out": "y"}}, 1_200),
-        ("x=1 y z", {"t": {"in": "x", "out": "y*40"}, "u": {"in": "y", "out": "z*40"}, "v": {"in": "z"}}, 1_641),
+        (
+            "x=1 y z",
+            {"t": {"in": "x", "out": "y*40"}, "u": {"in": "y", "out": "z*40"}, "v": {"in": "z"}},
+            1_641,
+        ),
         ("x=800 y k=800 z", {"t": {"in": "x", "out": "y"}, "u": {"in": "y k", "out": "x"}}, 2_400),
     ],
     ids=["many tokens", "tokens that multiply", "a loop that a store of tokens ends"],
@@ -71,7 +83,11 @@ def test_a_net_that_comes_to_an_end_may_fire_often(
 
 
 def test_time_between_stimuli_makes_firings_no_cycle(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "y", "out": "z"}, "v": {"in": "z", "out": "x"}}
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e"},
+        "u": {"in": "y", "out": "z"},
+        "v": {"in": "z", "out": "x"},
+    }
     p = play("x=1 y z", net, "e", policy=Policy(firing_limit=4))
     p(EventOccurred("e"), EventOccurred("e"))
     assert len(p.fired) == 6 and p.reports == []
@@ -89,21 +105,30 @@ def test_step_orders_transitions_so_that_none_bars_the_next(play: Plays) -> None
 
 
 def test_step_is_judged_on_one_marking(play: Plays) -> None:
-    net = {"t": {"in": "x !y", "out": "z", "event": "e"}, "u": {"in": "w", "out": "y", "event": "e"}}
+    net = {
+        "t": {"in": "x !y", "out": "z", "event": "e"},
+        "u": {"in": "w", "out": "y", "event": "e"},
+    }
     p = play("x=1 y w=1 z", net, events="e")
     p(EventOccurred("e"))
     assert p.fired == ["t", "u"] and p.marked == {"z": 1, "y": 1}
 
 
 def test_conflict_settled_by_priority(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "x", "out": "z", "event": "e", "priority": 1}}
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e"},
+        "u": {"in": "x", "out": "z", "event": "e", "priority": 1},
+    }
     p = play("x=1 y z", net, events="e")
     p(EventOccurred("e"))
     assert p.fired == ["u"] and p.reports == []
 
 
 def test_priority_settles_conflicts_alone(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "w", "out": "z", "event": "e", "priority": 1}}
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e"},
+        "u": {"in": "w", "out": "z", "event": "e", "priority": 1},
+    }
     p = play("x=1 w=1 y z", net, events="e")
     p(EventOccurred("e"))
     assert sorted(p.fired) == ["t", "u"]
@@ -116,7 +141,11 @@ def test_conflict_drawn_by_weight(play: Plays) -> None:
     }
     p = play("x=1 y z", net, events="e")
     (choose,) = p(EventOccurred("e"))
-    assert (choose.subject, choose.alternatives, choose.weights) == (Subject.CONFLICT, ("t", "u"), (1.0, 3.0))
+    assert (choose.subject, choose.alternatives, choose.weights) == (
+        Subject.CONFLICT,
+        ("t", "u"),
+        (1.0, 3.0),
+    )
     assert p.fired == []
     p(Chosen(choose.key, "w"))
     assert p.reports == ["bad_choice"] and p.fired == []
@@ -179,7 +208,10 @@ def test_exclusive_conditions_are_no_conflict(play: Plays) -> None:
 
 
 def test_one_latched_event_serves_one_of_two(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "w", "out": "z", "event": "e", "priority": 1}}
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e"},
+        "u": {"in": "w", "out": "z", "event": "e", "priority": 1},
+    }
     p = play("x=1 w=1 y z", net, events="e*")
     p(EventOccurred("e"))
     assert p.fired == ["u"]
@@ -188,7 +220,10 @@ def test_one_latched_event_serves_one_of_two(play: Plays) -> None:
 
 
 def test_mutual_inhibition_is_a_conflict(play: Plays) -> None:
-    net = {"t": {"in": "x !z", "out": "y", "event": "e"}, "u": {"in": "w !y", "out": "z", "event": "e", "priority": 1}}
+    net = {
+        "t": {"in": "x !z", "out": "y", "event": "e"},
+        "u": {"in": "w !y", "out": "z", "event": "e", "priority": 1},
+    }
     p = play("x=1 w=1 y z", net, events="e")
     p(EventOccurred("e"))
     assert p.fired == ["u"]

@@ -1,4 +1,5 @@
-"""A mission run may begin at any point that another one has come to: marking, ended runs, variables and latches are the same."""
+"""A mission run may begin at any point that another one has come to: marking, ended runs, variables
+and latches are the same."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     Begin,
     Engine,
     Marked,
@@ -22,15 +23,17 @@ from coordinator.engine import (
     point_from_plain,
     to_plain,
 )
-from coordinator.operator.departure import point_of
-from coordinator.task import Status, Task
+from petrobot.coordinator.operator.departure import point_of
+from petrobot.coordinator.task import Status, Task
 from tests.engine.conftest import make_task
 from tests.engine.test_properties import DEVICES, Journal, tasks
 
 
 def over(state: State) -> Counter[tuple[str, Status | None, str, str]]:
     """The ended runs whose tokens wait."""
-    return Counter((r.place, r.status, r.cause, r.action) for r in state.runs() if r.phase is Phase.DONE)
+    return Counter(
+        (r.place, r.status, r.cause, r.action) for r in state.runs() if r.phase is Phase.DONE
+    )
 
 
 def alive(state: State) -> Counter[str]:
@@ -38,14 +41,22 @@ def alive(state: State) -> Counter[str]:
     return Counter(r.place for r in state.runs() if r.phase is not Phase.DONE)
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+@settings(
+    max_examples=80,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
 @given(tasks(), st.data())
 def test_any_point_of_any_run_is_a_beginning(task: Task, data: st.DataObject) -> None:
     set_out_anywhere(task, data)
 
 
 @pytest.mark.proof
-@settings(max_examples=5000, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+@settings(
+    max_examples=5000,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
 @given(tasks(), st.data())
 def test_any_point_of_any_run_is_a_beginning_at_length(task: Task, data: st.DataObject) -> None:
     set_out_anywhere(task, data)
@@ -104,7 +115,8 @@ def test_runs_that_went_on_begin_again_or_are_over(standing: Standing, fired: li
 
 
 def test_what_the_task_does_not_know_is_told_and_left_out() -> None:
-    """A point of another task does no harm: unknown places are reported, tokens and runs always agree."""
+    """A point of another task does no harm: unknown places are reported, tokens and runs always
+    agree."""
     engine = Engine(TASK)
     point = Point({"c": 1, "a": 3, "nowhere": 1}, (Standing("b"), Standing("r"), Standing("moon")))
     state, instructions = engine.handle(engine.initial(), Begin(point=point))

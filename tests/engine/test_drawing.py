@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.drawing import draw
-from coordinator.drawing.layout import lay_out
-from coordinator.drawing.routing import Words, place_words, route
-from coordinator.drawing.scene import scene_of_task
-from coordinator.task import Task
-from coordinator.taskfile import load
+from petrobot.coordinator.drawing import draw
+from petrobot.coordinator.drawing.layout import lay_out
+from petrobot.coordinator.drawing.routing import Words, place_words, route
+from petrobot.coordinator.drawing.scene import scene_of_task
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import load
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 Tasks = Callable[..., Task]
@@ -24,7 +24,11 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 def elements(svg: str, tag: str, style: str) -> list[ElementTree.Element]:
     """Elements of a tag that have a CSS class."""
-    return [e for e in ElementTree.fromstring(svg).iter(SVG + tag) if style in e.get("class", "").split()]
+    return [
+        e
+        for e in ElementTree.fromstring(svg).iter(SVG + tag)
+        if style in e.get("class", "").split()
+    ]
 
 
 def texts(svg: str) -> set[str]:
@@ -36,7 +40,9 @@ def unplaced(task: Task) -> Task:
     """The task without positions."""
     places = {n: replace(p, x=None, y=None) for n, p in task.places.items()}
     return replace(
-        task, places=places, transitions={n: replace(t, x=None, y=None) for n, t in task.transitions.items()}
+        task,
+        places=places,
+        transitions={n: replace(t, x=None, y=None) for n, t in task.transitions.items()},
     )
 
 
@@ -47,7 +53,11 @@ def test_shipped_tasks_are_drawn_whole(path: Path, errors: bool) -> None:
     svg = draw(task, error_branches=errors)
     hidden = set() if errors else task.error_elements
     root = ElementTree.fromstring(svg)
-    assert root.get("role") == "img" and root[0].text == task.name and "Tokens:" in (root[1].text or "")
+    assert (
+        root.get("role") == "img"
+        and root[0].text == task.name
+        and "Tokens:" in (root[1].text or "")
+    )
     drawn = {g.get("id") for g in root.iter(SVG + "g")}
     assert (set(task.transitions) - hidden) <= drawn and drawn.isdisjoint(hidden)
 
@@ -63,12 +73,16 @@ def test_words_cover_neither_nodes_nor_each_other(path: Path, errors: bool, plac
     for w in words:
         for node in scene.nodes.values():
             (x, y), (rx, ry) = node.at, node.half
-            assert not (w.box[0] < x + rx and x - rx < w.box[2] and w.box[1] < y + ry and y - ry < w.box[3])
+            assert not (
+                w.box[0] < x + rx and x - rx < w.box[2] and w.box[1] < y + ry and y - ry < w.box[3]
+            )
 
 
 def overlap(a: Words, b: Words) -> bool:
     """Whether two blocks of words cover each other."""
-    return a.box[0] < b.box[2] and b.box[0] < a.box[2] and a.box[1] < b.box[3] and b.box[1] < a.box[3]
+    return (
+        a.box[0] < b.box[2] and b.box[0] < a.box[2] and a.box[1] < b.box[3] and b.box[1] < a.box[3]
+    )
 
 
 def test_tokens_are_dots_up_to_four(task: Tasks) -> None:
@@ -89,14 +103,25 @@ def test_kinds_events_weights_and_inhibitors_are_seen(task: Tasks) -> None:
         "w": {"in": "a:going", "event": "seen"},
     }
     svg = draw(task("p=2 a! r~", net, "tick seen<a", {"k": 0}))
-    assert {"ext tick", "int seen", "int u", "[k > 1 and k < 4]", "v: after 2.5 s", "2"} <= texts(svg)
-    assert len(elements(svg, "circle", "ring")) == 1 and len(elements(svg, "circle", "control")) == 1
-    assert len(elements(svg, "circle", "inhibitor")) == 1 and len(elements(svg, "path", "preempt")) == 1
+    assert {"ext tick", "int seen", "int u", "[k > 1 and k < 4]", "v: after 2.5 s", "2"} <= texts(
+        svg
+    )
+    assert (
+        len(elements(svg, "circle", "ring")) == 1 and len(elements(svg, "circle", "control")) == 1
+    )
+    assert (
+        len(elements(svg, "circle", "inhibitor")) == 1
+        and len(elements(svg, "path", "preempt")) == 1
+    )
     assert len(elements(svg, "path", "going")) == 1
 
 
 def test_folded_error_branches_leave_a_badge(task: Tasks) -> None:
-    net = {"n": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error", "out": "r"}, "back": {"in": "r", "out": "a"}}
+    net = {
+        "n": {"in": "a:normal", "out": "y"},
+        "e": {"in": "a:error", "out": "r"},
+        "back": {"in": "r", "out": "a"},
+    }
     made = task("a!=1 y r", net)
     folded, whole = draw(made), draw(made, error_branches=True)
     assert len(elements(folded, "circle", "badge")) == 1 and not elements(folded, "rect", "error")
@@ -124,8 +149,14 @@ def test_layout_keeps_given_positions_and_fills_in_the_rest() -> None:
 
 
 def test_layout_goes_along_the_flow() -> None:
-    at = lay_out(dict.fromkeys("abcde"), [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("b", "e")], ["a"]).at
-    assert at["a"][0] < at["b"][0] < at["c"][0] < at["d"][0] and at["e"][0] == at["c"][0] and at["e"] != at["c"]
+    at = lay_out(
+        dict.fromkeys("abcde"), [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a"), ("b", "e")], ["a"]
+    ).at
+    assert (
+        at["a"][0] < at["b"][0] < at["c"][0] < at["d"][0]
+        and at["e"][0] == at["c"][0]
+        and at["e"] != at["c"]
+    )
 
 
 def test_empty_net_is_drawn(task: Tasks) -> None:

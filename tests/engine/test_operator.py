@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     ORDERS,
     Abort,
     AddTokens,
@@ -42,7 +42,7 @@ from coordinator.engine import (
     state_from_plain,
     to_plain,
 )
-from coordinator.task import Reference, Status
+from petrobot.coordinator.task import Reference, Status
 
 Plays = Callable[..., Any]
 OK, ERR = Status.SUCCESS, Status.ERROR
@@ -78,7 +78,10 @@ def test_paused_nothing_fires_or_starts(play: Plays) -> None:
 
 
 def test_timers_stop_with_the_pause_and_those_of_a_run_when_it_holds(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "after": 5.0}, "late": {"in": "a:preempt=none", "after": 3.0}}
+    net = {
+        "t": {"in": "x", "out": "y", "after": 5.0},
+        "late": {"in": "a:preempt=none", "after": 3.0},
+    }
     p = play("x=1 a!=1 y", net)
     keys = {a.transition: a.key for a in p.of(ArmTimer)}
     assert HoldTimer(keys["t"]) in p(Pause()) and HoldTimer(keys["late"]) not in p.all
@@ -99,7 +102,11 @@ def test_timer_of_a_run_that_cannot_hold_goes_on_and_counts_after_the_pause(play
 def test_step_fires_one_transition(play: Plays) -> None:
     p = play(
         "x=1 y z w",
-        {"t": {"in": "x", "out": "y", "event": "e"}, "u": {"in": "y", "out": "z"}, "v": {"in": "z", "out": "w"}},
+        {
+            "t": {"in": "x", "out": "y", "event": "e"},
+            "u": {"in": "y", "out": "z"},
+            "v": {"in": "z", "out": "w"},
+        },
         "e+",
     )
     p(Pause(), EventOccurred("e"))
@@ -159,12 +166,15 @@ def test_unknown_breakpoint_is_refused_and_the_others_set(play: Plays) -> None:
 
 
 def test_an_override_is_kept_for_the_primitive_task_until_it_is_given_back(play: Plays) -> None:
-    """Also before the beginning; what is no task or no alternative is refused and changes nothing."""
+    """Also before the beginning; what is no task or no alternative is refused and changes
+    nothing."""
     p = play("x=1 a! b! y", LINE, "e", alternatives={"a": ("do_a", "do_a_slowly")})
     p(Override("a", "do_a_slowly"), Override("a", "do_b"), Override("nothing", "do_a"))
     assert p.state.overrides == {"a": "do_a_slowly"} and p.reports == ["refused", "refused"]
     p(EventOccurred("e"))
-    assert p.of(Choose)[0].of == "a", "the choice is still put, so that it is recorded with its reason"
+    assert p.of(Choose)[0].of == "a", (
+        "the choice is still put, so that it is recorded with its reason"
+    )
     p(Override("a"))
     assert p.state.overrides == {} and state_from_plain(to_plain(p.state)) == p.state
 
@@ -220,7 +230,9 @@ def test_forced_exit_cancels_counts_none_and_ignores_event_and_condition(play: P
 
 
 def test_forced_exit_of_a_run_that_is_done_cancels_nothing(play: Plays) -> None:
-    p = play("a!=1 y", {"t": {"in": "a:error", "out": "y"}, "n": {"in": "a:normal", "event": "e"}}, "e")
+    p = play(
+        "a!=1 y", {"t": {"in": "a:error", "out": "y"}, "n": {"in": "a:normal", "event": "e"}}, "e"
+    )
     p(RunEnded("a#1", OK), ForceExit("t"))
     assert p.marked == {"y": 1} and p.of(CancelRun) == []
 
@@ -245,7 +257,10 @@ def test_step_and_pause_after_the_end_are_refused(play: Plays) -> None:
 
 
 def test_pause_waits_for_an_outstanding_draw_but_abort_does_not(play: Plays) -> None:
-    net = {"t": {"in": "x", "weight": 1.0, "event": "e"}, "u": {"in": "x", "weight": 1.0, "event": "e"}}
+    net = {
+        "t": {"in": "x", "weight": 1.0, "event": "e"},
+        "u": {"in": "x", "weight": 1.0, "event": "e"},
+    }
     p = play("x=1", net, "e")
     (choose,) = p(EventOccurred("e"))
     p(Pause())
@@ -258,7 +273,11 @@ def test_pause_waits_for_an_outstanding_draw_but_abort_does_not(play: Plays) -> 
 
 
 def test_operators_token_is_no_way_to_lose_the_end(play: Plays) -> None:
-    p = play("x=1 a!=1 y", {"t": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error"}}, final="x == 0 and y == 1")
+    p = play(
+        "x=1 a!=1 y",
+        {"t": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error"}},
+        final="x == 0 and y == 1",
+    )
     p(RunEnded("a#1", OK))
     assert not p.finished
     p(RemoveTokens("x"))
@@ -292,11 +311,13 @@ def test_outstanding_orders_are_those_that_nobody_has_answered(play: Plays) -> N
 
 
 def test_outstanding_start_keeps_the_arguments_that_it_had(play: Plays) -> None:
-    p = play("b!=1", {"n": {"in": "b:normal"}}, args={"b": {"v": Reference("k")}}, variables={"k": 4})
+    p = play(
+        "b!=1", {"n": {"in": "b:normal"}}, args={"b": {"v": Reference("k")}}, variables={"k": 4}
+    )
     p(VariableChanged("k", 5), Pause(), RunHeld("b#1", Hold.HELD))
-    assert p.engine.outstanding(p.state) == (p.of(StartRun)[0], HoldRun("b#1")) and p.of(StartRun)[0].arguments == {
-        "v": 4
-    }
+    assert p.engine.outstanding(p.state) == (p.of(StartRun)[0], HoldRun("b#1")) and p.of(StartRun)[
+        0
+    ].arguments == {"v": 4}
 
 
 def test_outstanding_draw(play: Plays) -> None:

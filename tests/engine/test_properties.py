@@ -1,4 +1,5 @@
-"""Any stimuli on any task: the journal projects on a firing sequence of the ordinary net, and nothing is lost or doubled."""
+"""Any stimuli on any task: the journal projects on a firing sequence of the ordinary net, and
+nothing is lost or doubled."""
 
 from __future__ import annotations
 
@@ -11,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator.check import check
-from coordinator.conditions import parse
-from coordinator.engine import (
+from petrobot.coordinator.check import check
+from petrobot.coordinator.conditions import parse
+from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
     ArmTimer,
@@ -57,8 +58,8 @@ from coordinator.engine import (
     stimulus_from_plain,
     to_plain,
 )
-from coordinator.engine.state import ACTIVE
-from coordinator.task import (
+from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.task import (
     Counts,
     Early,
     End,
@@ -80,8 +81,8 @@ from coordinator.task import (
     Variable,
     VariableType,
 )
-from coordinator.task.consistency import faults
-from coordinator.taskfile import dumps, loads
+from petrobot.coordinator.task.consistency import faults
+from petrobot.coordinator.taskfile import dumps, loads
 
 CONDITIONS = (
     "b",
@@ -132,7 +133,9 @@ def place_tables(draw: st.DrawFn) -> dict[str, Place]:
         places[f"a{i}"] = Place(f"a{i}", Kind.ACTION, tokens, capacity, task, args, out, servers)
     for i in range(draw(st.integers(1, 3))):
         kind = draw(st.sampled_from((Kind.CONTROL, Kind.RESOURCE)))
-        places[f"c{i}"] = Place(f"c{i}", kind, draw(st.integers(0, 2)), draw(st.sampled_from((None, None, 3))))
+        places[f"c{i}"] = Place(
+            f"c{i}", kind, draw(st.integers(0, 2)), draw(st.sampled_from((None, None, 3)))
+        )
     return places
 
 
@@ -140,7 +143,9 @@ def place_tables(draw: st.DrawFn) -> dict[str, Place]:
 def inputs(draw: st.DrawFn, places: Mapping[str, Place]) -> tuple[Input, ...]:
     """Arcs from one to three places."""
     arcs = []
-    for name in draw(st.lists(st.sampled_from(sorted(places)), min_size=1, max_size=3, unique=True)):
+    for name in draw(
+        st.lists(st.sampled_from(sorted(places)), min_size=1, max_size=3, unique=True)
+    ):
         weight = draw(st.sampled_from((1, 1, 1, 2)))
         if places[name].kind is not Kind.ACTION:
             arcs.append(Input(name, weight))
@@ -157,7 +162,9 @@ def transitions(draw: st.DrawFn, name: str, places: Mapping[str, Place]) -> Tran
     names = sorted(places)
     out = draw(st.lists(st.sampled_from(names), max_size=2, unique=True))
     bars = draw(st.lists(st.sampled_from(names), max_size=1))
-    events = draw(st.sampled_from(((), (), ("tick",), ("flag",), ("kept",), ("seen",), ("tick", "flag"))))
+    events = draw(
+        st.sampled_from(((), (), ("tick",), ("flag",), ("kept",), ("seen",), ("tick", "flag")))
+    )
     return Transition(
         name,
         draw(inputs(places)),
@@ -177,7 +184,9 @@ def tasks(draw: st.DrawFn) -> Task:
     places = draw(place_tables())
     made = {f"t{i}": draw(transitions(f"t{i}", places)) for i in range(draw(st.integers(1, 6)))}
     final = parse(draw(st.sampled_from(("1 == 2", "c0 == 0", "a0 == 0 and c0 > 1"))))
-    task = Task("random", places, made, draw(primitive_tasks()), final, events=EVENTS, variables=VARIABLES)
+    task = Task(
+        "random", places, made, draw(primitive_tasks()), final, events=EVENTS, variables=VARIABLES
+    )
     assert faults(task) == ()
     return task
 
@@ -202,10 +211,14 @@ class Journal:
         thawed = state_from_plain(json.loads(json.dumps(before)))
         assert thawed == self.state
         again = stimulus_from_plain(json.loads(json.dumps(to_plain(stimulus))))
-        assert again == stimulus and self.engine.handle(thawed, again) == (state, instructions), "deterministic"
+        assert again == stimulus and self.engine.handle(thawed, again) == (state, instructions), (
+            "deterministic"
+        )
         self.state = state
         for instruction in instructions:
-            assert instruction_from_plain(json.loads(json.dumps(to_plain(instruction)))) == instruction
+            assert (
+                instruction_from_plain(json.loads(json.dumps(to_plain(instruction)))) == instruction
+            )
             self._project(instruction)
             self._count(instruction)
         assert self.state.marking == self.marking
@@ -218,8 +231,15 @@ class Journal:
             self.marking = net.fire(self.marking, net.transition_index[instruction.transition])
             assert instruction.after == self.marking
         if isinstance(instruction, Marked):
-            assert instruction.before == self.marking and self.task.places[instruction.place].kind is Kind.CONTROL
-            changed = [i for i, (a, b) in enumerate(zip(self.marking, instruction.after, strict=True)) if a != b]
+            assert (
+                instruction.before == self.marking
+                and self.task.places[instruction.place].kind is Kind.CONTROL
+            )
+            changed = [
+                i
+                for i, (a, b) in enumerate(zip(self.marking, instruction.after, strict=True))
+                if a != b
+            ]
             assert changed == [net.place_index[instruction.place]] and min(instruction.after) >= 0
             self.marking = instruction.after
 
@@ -228,7 +248,10 @@ class Journal:
             key = (type(instruction).__name__, instruction.run)
             self.seen[key] += 1
             assert self.seen[key] == 1, f"{key} twice"
-            if not isinstance(instruction, StartRun) and getattr(instruction, "cause", "") != "device_fenced":
+            if (
+                not isinstance(instruction, StartRun)
+                and getattr(instruction, "cause", "") != "device_fenced"
+            ):
                 assert self.seen["StartRun", instruction.run] == 1, "only what was started ends"
         if isinstance(instruction, Choose):
             self.open[instruction.key] = instruction
@@ -252,20 +275,35 @@ class Journal:
                     assert len(going) - stuck <= (place.servers or 1)
         holders = [r for r in state.runs() if r.phase in ACTIVE and r.device and not r.at_once]
         holders += [r for r in state.stopping.values() if r.device and not r.at_once]
-        assert max(Counter(r.device for r in holders).values(), default=0) <= 1, "one device, one run"
+        assert max(Counter(r.device for r in holders).values(), default=0) <= 1, (
+            "one device, one run"
+        )
 
     def stimuli(self) -> list[Stimulus]:
         """What could come now: mostly answers to what was ordered, and some nonsense."""
         runs = [r for r in self.state.runs() if r.phase in ACTIVE]
-        found: list[Stimulus] = [RunEnded("a0#99", Status.SUCCESS), StopConfirmed("a0#98"), TimerFired("t0#77")]
+        found: list[Stimulus] = [
+            RunEnded("a0#99", Status.SUCCESS),
+            StopConfirmed("a0#98"),
+            TimerFired("t0#77"),
+        ]
         for r in runs:
-            found += [RunEnded(r.id, s, "lost", values={"v": v}) for s in Status for v in (True, 2, None)]
-            found += [RunRaised(r.id, "seen"), RunStarted(r.id), RunHeld(r.id, Hold.HELD), RunHeld(r.id, Hold.CANNOT)]
+            found += [
+                RunEnded(r.id, s, "lost", values={"v": v}) for s in Status for v in (True, 2, None)
+            ]
+            found += [
+                RunRaised(r.id, "seen"),
+                RunStarted(r.id),
+                RunHeld(r.id, Hold.HELD),
+                RunHeld(r.id, Hold.CANNOT),
+            ]
             found += [RunEnded(r.id, Status.SUCCESS, deferred=True), Verdict(r.id, Status.FAILURE)]
         for run_id in self.state.stopping:
             found += [StopConfirmed(run_id), RunEnded(run_id, Status.FAILURE), StopFailed(run_id)]
             found += [StopConfirmed(run_id, Executed.NO)]
-        found += [Chosen(c.key, a) for c in self.open.values() for a in (*c.alternatives, "wrong")] * 2
+        found += [
+            Chosen(c.key, a) for c in self.open.values() for a in (*c.alternatives, "wrong")
+        ] * 2
         found += [TimerFired(key) for key in self.timers[-4:]]
         found += [EventOccurred(e) for e in ("tick", "flag", "kept", "seen", "odd")] * 2
         found += [EventOccurred("flag", "gate", n) for n in (1, 2)]
@@ -273,7 +311,15 @@ class Journal:
 
     def commands(self) -> list[Stimulus]:
         """What the operator could do, and what global memory could say."""
-        found: list[Stimulus] = [Pause(), Resume(), Resume(), Step(), Step(), SetBreakpoints(), RaiseEvent("tick")]
+        found: list[Stimulus] = [
+            Pause(),
+            Resume(),
+            Resume(),
+            Step(),
+            Step(),
+            SetBreakpoints(),
+            RaiseEvent("tick"),
+        ]
         found += [
             AddTokens("c0"),
             RemoveTokens("c0"),
@@ -282,7 +328,12 @@ class Journal:
             Override("a0", "do_a0"),
             ForceExit("t0"),
         ]
-        found += [ForceExit("t1"), VariableChanged("b", True), VariableChanged("b", False), VariableChanged("b", "odd")]
+        found += [
+            ForceExit("t1"),
+            VariableChanged("b", True),
+            VariableChanged("b", False),
+            VariableChanged("b", "odd"),
+        ]
         return found + [VariableChanged("n", n) for n in (0, 1, 3)] + [Abort("enough")]
 
 
@@ -317,12 +368,15 @@ def test_what_check_calls_settled_is_never_left_undecided(task: Task, data: st.D
 @pytest.mark.proof
 @settings(max_examples=5000, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(tasks(), st.data())
-def test_what_check_calls_settled_is_never_left_undecided_at_length(task: Task, data: st.DataObject) -> None:
+def test_what_check_calls_settled_is_never_left_undecided_at_length(
+    task: Task, data: st.DataObject
+) -> None:
     play_without_operator(task, data)
 
 
 def play_without_operator(task: Task, data: st.DataObject) -> None:
-    """Stimuli of the world alone: whoever pauses a net lets stimuli gather that never come together by themselves."""
+    """Stimuli of the world alone: whoever pauses a net lets stimuli gather that never come together
+    by themselves."""
     unsettled = any(f.code == "unsettled-conflict" for f in check(task).findings)
     engine = Engine(task, DEVICES, Policy(firing_limit=40))
     journal = Journal(task)
@@ -333,7 +387,11 @@ def play_without_operator(task: Task, data: st.DataObject) -> None:
         journal.state = state
         journal.open |= {i.key: i for i in instructions if isinstance(i, Choose)}
         journal.timers += [i.key for i in instructions if isinstance(i, ArmTimer)]
-        world: list[Stimulus] = [VariableChanged("b", True), VariableChanged("b", False), VariableChanged("n", 1)]
+        world: list[Stimulus] = [
+            VariableChanged("b", True),
+            VariableChanged("b", False),
+            VariableChanged("n", 1),
+        ]
         stimulus = data.draw(st.sampled_from(journal.stimuli() + world))
         state, instructions = engine.handle(state, stimulus)
 
@@ -347,19 +405,27 @@ def test_written_tasks_read_back_equal(task: Task) -> None:
 
 TEXTS = st.text(st.characters(codec="utf-8"), max_size=8)
 PLAIN: st.SearchStrategy[Any] = st.recursive(
-    st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False, allow_infinity=False) | TEXTS,
+    st.booleans()
+    | st.integers(-(2**63), 2**63 - 1)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | TEXTS,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXTS, inner, max_size=3),
     max_leaves=6,
 )
 
 
 @settings(max_examples=60, deadline=None)
-@given(TEXTS, st.dictionaries(st.sampled_from("uvw"), PLAIN, max_size=3), st.dictionaries(TEXTS, PLAIN, max_size=3))
+@given(
+    TEXTS,
+    st.dictionaries(st.sampled_from("uvw"), PLAIN, max_size=3),
+    st.dictionaries(TEXTS, PLAIN, max_size=3),
+)
 def test_any_words_and_plain_values_survive_the_file(
     text: str, parameters: dict[str, Any], args: dict[str, Any]
 ) -> None:
     argument_is_reference = any(
-        isinstance(v, dict) and set(v) == {"var"} and isinstance(v["var"], str) for v in args.values()
+        isinstance(v, dict) and set(v) == {"var"} and isinstance(v["var"], str)
+        for v in args.values()
     )
     places = {"a": Place("a", Kind.ACTION, task="p", args=args, label=text)}
     task = Task(

@@ -1,7 +1,8 @@
-"""Races by name: two things that cross on their way, in either order. Each has one right outcome, and tokens stay whole.
+"""Races by name: two things that cross on their way, in either order. Each has one right outcome,
+and tokens stay whole.
 
-Where other coordination systems got one of them wrong, the name of the trouble is in the test; all of them by name, over a node,
-in tests/mission/test_named_races.py.
+Where other coordination systems got one of them wrong, the name of the trouble is in the test; all
+of them by name, over a node, in tests/mission/test_named_races.py.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     Abort,
     CancelRun,
     Chosen,
@@ -30,7 +31,7 @@ from coordinator.engine import (
     StopFailed,
     TimerFired,
 )
-from coordinator.task import Executed, Status
+from petrobot.coordinator.task import Executed, Status
 
 Plays = Callable[..., Any]
 OK, FAIL, ERR = Status.SUCCESS, Status.FAILURE, Status.ERROR
@@ -45,13 +46,25 @@ ARM = {"do_a": "arm", "do_h": "arm"}
 
 
 def test_completion_crosses_with_cancel_recorded_and_moves_nothing(play: Plays) -> None:
-    """A result after the cancel must not end anything a second time (SMACH #98: it gave the outcome)."""
-    p = play("a!=1 h! r done", CATCH, "ball*", devices=ARM, out={"a": {"v": "point"}}, variables={"point": 0})
+    """A result after the cancel must not end anything a second time (SMACH #98: it gave the
+    outcome)."""
+    p = play(
+        "a!=1 h! r done",
+        CATCH,
+        "ball*",
+        devices=ARM,
+        out={"a": {"v": "point"}},
+        variables={"point": 0},
+    )
     p(EventOccurred("ball"))
     assert p.started == ["a#1"]
     p(RunEnded("a#1", FAIL, "passed", values={"v": 9}, seconds=1.5))
     (record,) = p.of(RunRecorded)
-    assert (record.status, record.cancelled, record.seconds) == (OK, True, 1.5) and "failure" in record.text
+    assert (record.status, record.cancelled, record.seconds) == (
+        OK,
+        True,
+        1.5,
+    ) and "failure" in record.text
     assert p.state.variables["point"] == 0 and p.fired == ["caught"] and p.started == ["a#1", "h#1"]
     p(StopConfirmed("a#1"), RunEnded("a#1", ERR))
     assert p.fired == ["caught"] and p.reports == ["unknown_run", "unknown_run"]
@@ -65,15 +78,21 @@ def test_cancel_crosses_with_completion_the_event_comes_too_late(play: Plays) ->
 
 def test_event_before_arming_is_forgotten(play: Plays) -> None:
     """The ball falling out of the cup at home must not count for the next run."""
-    p = play("x=1 a! h! r done", {**CATCH, "go": {"in": "x", "out": "a", "event": "tick"}}, "ball* tick")
+    p = play(
+        "x=1 a! h! r done", {**CATCH, "go": {"in": "x", "out": "a", "event": "tick"}}, "ball* tick"
+    )
     p(EventOccurred("ball"), EventOccurred("tick"))
     assert p.marked == {"a": 1} and p.reports == ["early_event"]
 
 
 def test_event_before_arming_is_kept_where_that_is_declared(play: Plays) -> None:
-    p = play("x=1 a! h! r done", {**CATCH, "go": {"in": "x", "out": "a", "event": "tick"}}, "ball+ tick")
+    p = play(
+        "x=1 a! h! r done", {**CATCH, "go": {"in": "x", "out": "a", "event": "tick"}}, "ball+ tick"
+    )
     p(EventOccurred("ball"), EventOccurred("tick"))
-    assert p.marked == {"h": 1} and p.started == ["h#1"], "a run that is preempted before it starts never starts"
+    assert p.marked == {"h": 1} and p.started == ["h#1"], (
+        "a run that is preempted before it starts never starts"
+    )
 
 
 def test_preempt_and_normal_end_pending_together_normal_end_first(play: Plays) -> None:
@@ -101,7 +120,9 @@ def test_nothing_uses_a_device_before_the_cancelled_run_has_stopped(play: Plays)
     """PlanSys2 #400: two performers for one token."""
     p = play("a!=1 h! r done", CATCH, "ball*", devices=ARM)
     p(EventOccurred("ball"))
-    assert p.marked == {"h": 1} and p.started == ["a#1"] and p.state.run("h#1").phase is Phase.WAITING
+    assert (
+        p.marked == {"h": 1} and p.started == ["a#1"] and p.state.run("h#1").phase is Phase.WAITING
+    )
     p(StopConfirmed("a#1"))
     assert p.started == ["a#1", "h#1"]
 
@@ -112,13 +133,20 @@ def test_start_at_once_does_not_wait(play: Plays) -> None:
     assert p.started == ["a#1", "h#1"]
 
 
-def test_run_that_cannot_be_stopped_keeps_its_fence_and_the_next_one_errs_without_executing(play: Plays) -> None:
+def test_run_that_cannot_be_stopped_keeps_its_fence_and_the_next_one_errs_without_executing(
+    play: Plays,
+) -> None:
     """PlanSys2 #399: a performer that never answers."""
     p = play("a!=1 h! r done", CATCH, "ball*", devices=ARM)
     p(EventOccurred("ball"), StopFailed("a#1", "no answer for 2 s"))
     assert p.fired == ["caught", "lost"] and p.started == ["a#1"]
     (record,) = p.of(RunRecorded)
-    assert (record.run, record.status, record.cause, record.executed) == ("h#1", ERR, "device_fenced", Executed.NO)
+    assert (record.run, record.status, record.cause, record.executed) == (
+        "h#1",
+        ERR,
+        "device_fenced",
+        Executed.NO,
+    )
     assert p.state.run("a#1").phase is Phase.STUCK
     p(StopConfirmed("a#1"))
     assert not p.state.stopping
@@ -138,7 +166,9 @@ def test_cancel_crosses_with_accept(play: Plays) -> None:
     p(EventOccurred("ball"), RunStarted("a#1"))
     assert p.state.run("a#1").phase is Phase.STOPPING
     p(StopConfirmed("a#1", Executed.NO))
-    assert p.of(RunRecorded)[0].status is None, "a run that never executed says nothing about reliability"
+    assert p.of(RunRecorded)[0].status is None, (
+        "a run that never executed says nothing about reliability"
+    )
 
 
 def test_cancel_before_the_choice_is_made(play: Plays) -> None:
@@ -150,7 +180,11 @@ def test_cancel_before_the_choice_is_made(play: Plays) -> None:
 
 
 def test_inhibitor_counts_a_stopping_run_as_still_there(play: Plays) -> None:
-    p = play("a!=1 x=1 y", {"t": {"in": "a:preempt=none", "event": "e"}, "u": {"in": "x !a", "out": "y"}}, "e")
+    p = play(
+        "a!=1 x=1 y",
+        {"t": {"in": "a:preempt=none", "event": "e"}, "u": {"in": "x !a", "out": "y"}},
+        "e",
+    )
     p(EventOccurred("e"))
     assert p.fired == ["t"] and p.marked == {"x": 1}
     p(StopConfirmed("a#1"))
@@ -158,7 +192,11 @@ def test_inhibitor_counts_a_stopping_run_as_still_there(play: Plays) -> None:
 
 
 def test_capacity_counts_a_stopping_run_as_still_there(play: Plays) -> None:
-    p = play("a!=1/1 x=1", {"t": {"in": "a:preempt=none", "event": "e"}, "u": {"in": "x", "out": "a"}}, "e")
+    p = play(
+        "a!=1/1 x=1",
+        {"t": {"in": "a:preempt=none", "event": "e"}, "u": {"in": "x", "out": "a"}},
+        "e",
+    )
     p(EventOccurred("e"))
     assert p.fired == ["t"]
     p(StopConfirmed("a#1"))
@@ -174,7 +212,12 @@ def test_server_is_not_free_before_the_cancelled_run_has_stopped(play: Plays) ->
 
 
 def test_restart_of_a_place_by_its_own_preemption(play: Plays) -> None:
-    p = play("a!=1", {"t": {"in": "a:preempt=none", "out": "a", "event": "e"}}, "e", devices={"do_a": "arm"})
+    p = play(
+        "a!=1",
+        {"t": {"in": "a:preempt=none", "out": "a", "event": "e"}},
+        "e",
+        devices={"do_a": "arm"},
+    )
     p(EventOccurred("e"))
     assert p.marked == {"a": 1} and p.started == ["a#1"]
     p(StopConfirmed("a#1"))
@@ -183,7 +226,11 @@ def test_restart_of_a_place_by_its_own_preemption(play: Plays) -> None:
 
 def test_timer_fires_after_the_run_has_ended(play: Plays) -> None:
     p = play(
-        "a!=1 y z", {"t": {"in": "a:normal", "out": "y"}, "late": {"in": "a:preempt=failure", "out": "z", "after": 5.0}}
+        "a!=1 y z",
+        {
+            "t": {"in": "a:normal", "out": "y"},
+            "late": {"in": "a:preempt=failure", "out": "z", "after": 5.0},
+        },
     )
     key = p.state.timers["late"].key
     p(RunEnded("a#1", OK), TimerFired(key))
@@ -191,7 +238,10 @@ def test_timer_fires_after_the_run_has_ended(play: Plays) -> None:
 
 
 def test_raised_event_of_a_run_that_is_stopping_is_dropped(play: Plays) -> None:
-    net = {"t": {"in": "a:preempt=none", "out": "a", "event": "e"}, "u": {"in": "a:going x", "event": "seen"}}
+    net = {
+        "t": {"in": "a:preempt=none", "out": "a", "event": "e"},
+        "u": {"in": "a:going x", "event": "seen"},
+    }
     p = play("a!=1 x=1", net, "e seen<a")
     p(EventOccurred("e"), RunRaised("a#1", "seen"))
     assert p.fired == ["t"] and p.reports == ["unknown_run"]
@@ -222,7 +272,10 @@ def test_run_ends_while_paused(play: Plays) -> None:
 def test_abort_ends_when_every_run_has_stopped(play: Plays, last: Any) -> None:
     p = play("a!=1 h!=1 r done", CATCH, "ball*")
     p(Abort("fire"))
-    assert p.state.mode is Mode.ABORTING and sorted(c.run for c in p.of(CancelRun)) == ["a#1", "h#1"]
+    assert p.state.mode is Mode.ABORTING and sorted(c.run for c in p.of(CancelRun)) == [
+        "a#1",
+        "h#1",
+    ]
     p(StopConfirmed("h#1"))
     assert not p.finished
     p(last)

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from coordinator.conditions import parse
-from coordinator.engine import (
+from petrobot.coordinator.conditions import parse
+from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
     Choose,
@@ -27,7 +27,7 @@ from coordinator.engine import (
     VariableChanged,
     Verdict,
 )
-from coordinator.task import Executed, Reference, Status, Task
+from petrobot.coordinator.task import Executed, Reference, Status, Task
 
 Plays = Callable[..., Any]
 OK, FAIL, ERR = Status.SUCCESS, Status.FAILURE, Status.ERROR
@@ -35,7 +35,9 @@ BRANCHES = {"good": {"in": "a:normal", "out": "done"}, "bad": {"in": "a:error", 
 
 
 @pytest.mark.parametrize(("status", "place"), [(OK, "done"), (FAIL, "done"), (ERR, "broken")])
-def test_success_and_failure_leave_by_the_normal_branch(play: Plays, status: Status, place: str) -> None:
+def test_success_and_failure_leave_by_the_normal_branch(
+    play: Plays, status: Status, place: str
+) -> None:
     p = play("a!=1 done broken", BRANCHES)
     assert p.started == ["a#1"] and p.marked == {"a": 1}
     p(RunEnded("a#1", status))
@@ -69,21 +71,30 @@ def test_pulse_serves_who_is_ready_and_is_gone(play: Plays) -> None:
 
 
 def test_pulse_is_broadcast_and_fires_each_transition_once(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "z", "event": "tick"}, "u": {"in": "y", "out": "z", "event": "tick"}}
+    net = {
+        "t": {"in": "x", "out": "z", "event": "tick"},
+        "u": {"in": "y", "out": "z", "event": "tick"},
+    }
     p = play("x=2 y=1 z", net, events="tick")
     p(EventOccurred("tick"))
     assert sorted(p.fired) == ["t", "u"] and p.marked == {"x": 1, "z": 2}
 
 
 def test_pulse_does_not_serve_what_its_own_firing_enables(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "tick"}, "u": {"in": "y", "out": "z", "event": "tick"}}
+    net = {
+        "t": {"in": "x", "out": "y", "event": "tick"},
+        "u": {"in": "y", "out": "z", "event": "tick"},
+    }
     p = play("x=1 y z", net, events="tick")
     p(EventOccurred("tick"))
     assert p.marked == {"y": 1}
 
 
 def test_latched_event_waits_for_the_run_to_end_and_is_consumed_once(play: Plays) -> None:
-    net = {"t": {"in": "a:normal", "out": "b", "event": "go"}, "u": {"in": "b:normal", "out": "done", "event": "go"}}
+    net = {
+        "t": {"in": "a:normal", "out": "b", "event": "go"},
+        "u": {"in": "b:normal", "out": "done", "event": "go"},
+    }
     p = play("a!=1 b! done", net, events="go*")
     p(EventOccurred("go"), EventOccurred("go"))
     assert p.state.flags == {"go"}
@@ -106,7 +117,9 @@ def test_latched_event_is_forgotten_with_the_tokens_that_waited_for_it(play: Pla
     assert p.fired == ["off", "again"]
 
 
-def test_latched_event_does_not_outlive_a_token_that_comes_back_in_the_same_firing(play: Plays) -> None:
+def test_latched_event_does_not_outlive_a_token_that_comes_back_in_the_same_firing(
+    play: Plays,
+) -> None:
     net = {"t": {"in": "a:normal", "event": "go"}, "retry": {"in": "a:error", "out": "a"}}
     p = play("a!=1", net, events="go*")
     p(EventOccurred("go"), RunEnded("a#1", ERR))
@@ -115,12 +128,19 @@ def test_latched_event_does_not_outlive_a_token_that_comes_back_in_the_same_firi
 
 def test_duplicate_numbered_event_is_taken_once(play: Plays) -> None:
     p = play("x=3 y", {"t": {"in": "x", "out": "y", "event": "go"}}, events="go*")
-    p(EventOccurred("go", "gate", 1), EventOccurred("go", "gate", 1), EventOccurred("go", "gate", 2))
+    p(
+        EventOccurred("go", "gate", 1),
+        EventOccurred("go", "gate", 1),
+        EventOccurred("go", "gate", 2),
+    )
     assert p.marked == {"x": 1, "y": 2}
 
 
 def test_internal_event_is_latched_to_its_run(play: Plays) -> None:
-    net = {"t": {"in": "a:going x", "out": "y", "event": "seen"}, "u": {"in": "a:normal", "out": "a"}}
+    net = {
+        "t": {"in": "a:going x", "out": "y", "event": "seen"},
+        "u": {"in": "a:normal", "out": "a"},
+    }
     p = play("a!=1 x=2 y", net, events="seen<a")
     p(RunRaised("a#1", "seen"))
     assert p.marked == {"a": 1, "x": 1, "y": 1} and p.started == ["a#1"]
@@ -137,7 +157,9 @@ def test_internal_event_of_another_primitive_task_is_refused(play: Plays) -> Non
 
 
 def test_preempt_cancels_and_counts(play: Plays) -> None:
-    p = play("a!=1 done", {"t": {"in": "a:preempt=success", "out": "done", "event": "go"}}, events="go")
+    p = play(
+        "a!=1 done", {"t": {"in": "a:preempt=success", "out": "done", "event": "go"}}, events="go"
+    )
     (fired, cancel) = p(EventOccurred("go"))
     assert fired.runs == ("a#1",) and (cancel.run, cancel.counts) == ("a#1", "success")
     assert p.marked == {"done": 1} and set(p.state.stopping) == {"a#1"}
@@ -175,7 +197,12 @@ def test_reason_and_status_are_variables(play: Plays) -> None:
         "weak": {"in": "a:normal", "out": "w", "when": "a.status == 'failure'"},
         "fine": {"in": "a:normal", "out": "f", "when": "a.status == 'success'"},
     }
-    for end, place in [((ERR, "lost"), "l"), ((ERR, "cold"), "r"), ((FAIL, ""), "w"), ((OK, ""), "f")]:
+    for end, place in [
+        ((ERR, "lost"), "l"),
+        ((ERR, "cold"), "r"),
+        ((FAIL, ""), "w"),
+        ((OK, ""), "f"),
+    ]:
         p = play("a!=1 l r w f", net)
         p(RunEnded("a#1", end[0], end[1]))
         assert p.marked == {place: 1}
@@ -214,7 +241,10 @@ def test_unwritten_name_makes_a_condition_false_and_is_reported(play: Plays) -> 
 
 
 def test_after_timer_is_armed_fires_and_is_disarmed(play: Plays) -> None:
-    net = {"t": {"in": "x", "out": "y", "event": "e"}, "late": {"in": "x", "out": "z", "after": 2.5}}
+    net = {
+        "t": {"in": "x", "out": "y", "event": "e"},
+        "late": {"in": "x", "out": "z", "after": 2.5},
+    }
     p = play("x=2 y z", net, events="e")
     (arm,) = p.of(ArmTimer)
     assert (arm.transition, arm.seconds) == ("late", 2.5)
@@ -227,7 +257,10 @@ def test_after_timer_is_armed_fires_and_is_disarmed(play: Plays) -> None:
 
 
 def test_after_timer_starts_anew_for_another_run(play: Plays) -> None:
-    net = {"retry": {"in": "a:error", "out": "a"}, "long": {"in": "a:preempt=failure", "out": "z", "after": 9.0}}
+    net = {
+        "retry": {"in": "a:error", "out": "a"},
+        "long": {"in": "a:preempt=failure", "out": "z", "after": 9.0},
+    }
     p = play("a!=1 z", net)
     p(RunEnded("a#1", ERR))
     first, second = p.of(ArmTimer)
@@ -258,7 +291,11 @@ def test_timer_belongs_to_the_run_that_it_would_take(play: Plays) -> None:
 
 
 def test_elapsed_timer_waits_for_its_condition(play: Plays) -> None:
-    p = play("x=1 y", {"t": {"in": "x", "out": "y", "after": 1.0, "when": "ready"}}, variables={"ready": False})
+    p = play(
+        "x=1 y",
+        {"t": {"in": "x", "out": "y", "after": 1.0, "when": "ready"}},
+        variables={"ready": False},
+    )
     p(TimerFired(p.of(ArmTimer)[0].key))
     assert p.fired == []
     p(VariableChanged("ready", True))
@@ -275,13 +312,19 @@ def test_servers_run_at_once_and_the_rest_queue_first_in_first_out(play: Plays) 
 
 
 def test_first_done_is_first_taken(play: Plays) -> None:
-    p = play("a!2=2 shut=1 go", {"t": {"in": "a:normal go"}, "open": {"in": "shut", "out": "go", "event": "e"}}, "e")
+    p = play(
+        "a!2=2 shut=1 go",
+        {"t": {"in": "a:normal go"}, "open": {"in": "shut", "out": "go", "event": "e"}},
+        "e",
+    )
     p(RunEnded("a#2", OK), RunEnded("a#1", OK), EventOccurred("e"))
     assert p.of(Fired)[-1].runs == ("a#2",)
 
 
 def test_second_token_in_a_one_safe_place_is_reported_and_waits(play: Plays) -> None:
-    p = play("x=2 a!", {"t": {"in": "x", "out": "a"}, "n": {"in": "a:normal"}, "e": {"in": "a:error"}})
+    p = play(
+        "x=2 a!", {"t": {"in": "x", "out": "a"}, "n": {"in": "a:normal"}, "e": {"in": "a:error"}}
+    )
     assert p.reports == ["unsafe"] and p.started == ["a#1"]
     p(RunEnded("a#1", OK))
     assert p.started == ["a#1", "a#2"]
@@ -290,7 +333,11 @@ def test_second_token_in_a_one_safe_place_is_reported_and_waits(play: Plays) -> 
 def test_alternatives_are_chosen_when_a_server_is_free(play: Plays) -> None:
     p = play("a!1=2", {"n": {"in": "a:normal"}}, alternatives={"a": ("slow", "fast")})
     (choose,) = p.of(Choose)
-    assert (choose.key, choose.of, choose.alternatives) == ("a#1", "a", ("slow", "fast")) and p.started == []
+    assert (choose.key, choose.of, choose.alternatives) == (
+        "a#1",
+        "a",
+        ("slow", "fast"),
+    ) and p.started == []
     p(Chosen("a#1", "fast", "lowest J"))
     assert p.of(StartRun)[0].action == "fast"
     p(RunEnded("a#1", OK))
@@ -310,7 +357,8 @@ def test_deferred_verdict_corrects_once_and_moves_nothing(play: Plays) -> None:
 
 
 def test_a_verdict_may_overtake_the_end_of_its_run(play: Plays) -> None:
-    """Two nodes, two links: the judge's word may come first. It is kept until the run ends, and counts once."""
+    """Two nodes, two links: the judge's word may come first. It is kept until the run ends, and
+    counts once."""
     p = play("a!=1 done broken", BRANCHES)
     p(Verdict("a#1", FAIL, "slipped", "seen from above"), Verdict("a#1", OK))
     assert p.of(Corrected) == [] and p.reports == ["no_verdict_due"]
@@ -342,13 +390,22 @@ def test_records_for_the_estimates(play: Plays) -> None:
     p = play("a!=1 done broken", BRANCHES)
     p(RunEnded("a#1", ERR, "no_node", "unreachable", Executed.NO, seconds=0.1))
     (record,) = p.of(RunRecorded)
-    assert (record.primitive_task, record.action, record.status, record.executed) == ("a", "do_a", ERR, Executed.NO)
+    assert (record.primitive_task, record.action, record.status, record.executed) == (
+        "a",
+        "do_a",
+        ERR,
+        Executed.NO,
+    )
 
 
 @pytest.mark.parametrize(
-    ("end", "status", "words"), [(OK, OK, "final"), (ERR, ERR, "given up")], ids=["designed", "honest"]
+    ("end", "status", "words"),
+    [(OK, OK, "final"), (ERR, ERR, "given up")],
+    ids=["designed", "honest"],
 )
-def test_the_end(task: Callable[..., Task], play: Plays, end: Status, status: Status, words: str) -> None:
+def test_the_end(
+    task: Callable[..., Task], play: Plays, end: Status, status: Status, words: str
+) -> None:
     p = play("a!=1 done broken", BRANCHES, final="done == 1", final_error=parse("broken == 1"))
     p(RunEnded("a#1", end))
     assert p.finished is not None and p.finished.status is status and words in p.finished.reason
@@ -357,9 +414,15 @@ def test_the_end(task: Callable[..., Task], play: Plays, end: Status, status: St
 
 
 def test_dead_marking_ends_in_error(play: Plays) -> None:
-    p = play("a!=1 x", {"t": {"in": "a:normal", "out": "x"}, "u": {"in": "a:error"}}, policy=Policy())
+    p = play(
+        "a!=1 x", {"t": {"in": "a:normal", "out": "x"}, "u": {"in": "a:error"}}, policy=Policy()
+    )
     p(RunEnded("a#1", OK))
-    assert isinstance(p.finished, Finished) and p.finished.status is ERR and "no transition" in p.finished.reason
+    assert (
+        isinstance(p.finished, Finished)
+        and p.finished.status is ERR
+        and "no transition" in p.finished.reason
+    )
 
 
 def test_nothing_happens_before_begin(play: Plays) -> None:
@@ -371,6 +434,11 @@ def test_nothing_happens_before_begin(play: Plays) -> None:
 
 
 def test_parameters_are_taken_and_wrong_ones_reported(play: Plays) -> None:
-    p = play("x=1 y", {"t": {"in": "x", "out": "y", "when": "regime == 'B'"}}, parameters={"regime": "A"}, begin=False)
+    p = play(
+        "x=1 y",
+        {"t": {"in": "x", "out": "y", "when": "regime == 'B'"}},
+        parameters={"regime": "A"},
+        begin=False,
+    )
     p(Begin({"regime": "B", "colour": "red"}))
     assert p.fired == ["t"] and p.reports == ["bad_parameter"]

@@ -1,4 +1,5 @@
-"""The catching task: its state space, its branches, and a mission run from begin to end in each of its ways."""
+"""The catching task: its state space, its branches, and a mission run from begin to end in each of
+its ways."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from coordinator.check import Severity, check
-from coordinator.engine import (
+from petrobot.coordinator.check import Severity, check
+from petrobot.coordinator.engine import (
     AddTokens,
     ArmTimer,
     Begin,
@@ -27,9 +28,9 @@ from coordinator.engine import (
     StopConfirmed,
     TimerFired,
 )
-from coordinator.net import Marking
-from coordinator.task import Status, Task
-from coordinator.taskfile import load
+from petrobot.coordinator.net import Marking
+from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.taskfile import load
 
 PATH = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 OK, FAIL, ERR = Status.SUCCESS, Status.FAILURE, Status.ERROR
@@ -45,7 +46,9 @@ def catch() -> Task:
 def test_check_finds_nothing_but_one_arrival_order(catch: Task) -> None:
     offers = {a: "node" for p in catch.primitive_tasks.values() for a in p.alternatives}
     report = check(catch, offers)
-    assert report.ok and [(f.severity, f.code) for f in report.findings] == [(Severity.NOTE, "arrival-order")]
+    assert report.ok and [(f.severity, f.code) for f in report.findings] == [
+        (Severity.NOTE, "arrival-order")
+    ]
 
 
 def reachable(task: Task) -> dict[Marking, list[Marking]]:
@@ -69,7 +72,9 @@ def test_every_ending_is_designed_or_honest_and_reachable_from_everywhere(catch:
     designed = [m for m in ends if catch.final.holds(dict(zip(names, m, strict=True)))]
     assert catch.final_error is not None
     honest = [m for m in ends if catch.final_error.holds(dict(zip(names, m, strict=True)))]
-    assert len(designed) == 1 and set(ends) == {*designed, *honest} and not set(designed) & set(honest)
+    assert (
+        len(designed) == 1 and set(ends) == {*designed, *honest} and not set(designed) & set(honest)
+    )
     before: dict[Marking, list[Marking]] = {m: [] for m in space}
     for marking, following in space.items():
         for m in following:
@@ -82,7 +87,9 @@ def test_every_ending_is_designed_or_honest_and_reachable_from_everywhere(catch:
             fresh += before[marking]
     stuck = {m for m in space if m not in able}
     out = names.index("arm_out_of_order")
-    assert all(m[out] for m in stuck), "every error comes back to the normal flow until the arm is out of order"
+    assert all(m[out] for m in stuck), (
+        "every error comes back to the normal flow until the arm is out of order"
+    )
 
 
 def test_all_transitions_can_fire_and_action_places_are_safe(catch: Task) -> None:
@@ -98,7 +105,12 @@ class Cell:
     """Answers every order at once: events when they are waited for, ends by a script."""
 
     def __init__(self, task: Task, script: Script, caught: bool = True, ticks: bool = True) -> None:
-        devices = {a: p for p in ("arm", "camera") for t in _of(p) for a in task.primitive_tasks[t].alternatives}
+        devices = {
+            a: p
+            for p in ("arm", "camera")
+            for t in _of(p)
+            for a in task.primitive_tasks[t].alternatives
+        }
         self.engine = Engine(task, devices)
         self.state = self.engine.initial()
         self.script, self.caught, self.ticks = script, caught, ticks
@@ -124,7 +136,9 @@ class Cell:
             status = self.script(i)
             if status is None:
                 return [EventOccurred("ball_caught", "cup")]
-            return [RunEnded(i.run, status, "" if status is OK else "test", values={"ball": [1.0, 0.2]})]
+            return [
+                RunEnded(i.run, status, "" if status is OK else "test", values={"ball": [1.0, 0.2]})
+            ]
         return [StopConfirmed(i.run)] if isinstance(i, CancelRun) else []
 
     def _idle(self) -> Any:
@@ -143,7 +157,11 @@ class Cell:
 
 def _of(device: str) -> tuple[str, ...]:
     camera = ("locate_ball", "track_ball")
-    return camera if device == "camera" else ("move_to_point", "catch_ball", "return_home", "recover_arm")
+    return (
+        camera
+        if device == "camera"
+        else ("move_to_point", "catch_ball", "return_home", "recover_arm")
+    )
 
 
 def test_four_catches(catch: Task) -> None:
@@ -159,11 +177,17 @@ def test_balls_that_pass_use_up_the_runs(catch: Task) -> None:
     assert cell.run().status is OK and [r.status for r in cell.records("catch_ball")] == [FAIL] * 4
 
 
-@pytest.mark.parametrize("place", ["locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home"])
+@pytest.mark.parametrize(
+    "place", ["locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home"]
+)
 def test_an_error_anywhere_comes_back_to_the_normal_flow(catch: Task, place: str) -> None:
     cell = Cell(catch, lambda s: ERR if s.place == place else OK)
     assert cell.run().status is OK
-    assert (cell.tokens("attempts"), cell.tokens("failed_attempts"), cell.tokens("arm_free")) == (3, 0, 1)
+    assert (cell.tokens("attempts"), cell.tokens("failed_attempts"), cell.tokens("arm_free")) == (
+        3,
+        0,
+        1,
+    )
     recovered = len(cell.records("recover_arm"))
     assert recovered == (0 if place in ("locate_ball", "track_ball") else 4)
 
@@ -183,7 +207,11 @@ def test_attempts_are_given_back_after_a_recovery(catch: Task) -> None:
         return ERR if start.place == "catch_ball" else OK
 
     cell = Cell(catch, script)
-    assert cell.run().status is OK and len(cell.records("recover_arm")) == 12 and cell.tokens("attempts") == 3
+    assert (
+        cell.run().status is OK
+        and len(cell.records("recover_arm")) == 12
+        and cell.tokens("attempts") == 3
+    )
 
 
 def test_a_camera_that_takes_no_images_uses_the_runs_up(catch: Task) -> None:

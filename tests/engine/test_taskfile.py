@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.check import check
-from coordinator.task import Counts, End, Inhibitor, Input, Output
-from coordinator.taskfile import TaskFileError, dumps, load, loads
-from coordinator.taskfile.arcs import ArcError, read_input, read_output, write_arc
+from petrobot.coordinator.check import check
+from petrobot.coordinator.task import Counts, End, Inhibitor, Input, Output
+from petrobot.coordinator.taskfile import TaskFileError, dumps, load, loads
+from petrobot.coordinator.taskfile.arcs import ArcError, read_input, read_output, write_arc
 
 GOOD = """schema = 1
 
@@ -74,7 +74,12 @@ def test_good_file_reads() -> None:
         ('final = "done == 1"', 'final = "dome == 1"', "task.final", "did you mean 'done'"),
         ('final = "done == 1"', 'final = "done = 1"', "task.final", "written =="),
         ('runs_place = "runs"', 'runs_place = "done"', "task.runs_place", "no control place"),
-        ('runs_place = "runs"', 'run_place = "runs"', "task.run_place", "did you mean 'runs_place'"),
+        (
+            'runs_place = "runs"',
+            'run_place = "runs"',
+            "task.run_place",
+            "did you mean 'runs_place'",
+        ),
         ("[task.parameters]", "[task.parametres]", "task.parametres", "unknown key"),
         ("[events.tick]", "[event.tick]", "event", "did you mean 'events'"),
         ("deadline = 2.0", 'deadline = "2"', "primitive_tasks.look.deadline", "not a number"),
@@ -93,15 +98,35 @@ def test_good_file_reads() -> None:
             "primitive_tasks.look.target_reliability",
             "0 < R <= 1",
         ),
-        ('["look_once", "look_twice"]', "[]", "primitive_tasks.look.alternatives", "at least one action"),
-        ('["look_once", "look_twice"]', '["a", "a"]', "primitive_tasks.look.alternatives", "2 times"),
+        (
+            '["look_once", "look_twice"]',
+            "[]",
+            "primitive_tasks.look.alternatives",
+            "at least one action",
+        ),
+        (
+            '["look_once", "look_twice"]',
+            '["a", "a"]',
+            "primitive_tasks.look.alternatives",
+            "2 times",
+        ),
         ('["look_once", "look_twice"]', "[1]", "primitive_tasks.look.alternatives", "no text"),
         ('goal = "it is seen"', 'goal = ""', "primitive_tasks.look.goal", "no goal"),
         ('type = "bool"', 'type = "boolean"', "variables.seen.type", "did you mean 'bool'"),
         ('type = "bool"', 'type = "bool"\ninitial = 1', "variables.seen.initial", "no bool"),
-        ('type = "bool"', 'type = "bool"\nvalues = ["a"]', "variables.seen.values", "make the type str"),
+        (
+            'type = "bool"',
+            'type = "bool"\nvalues = ["a"]',
+            "variables.seen.values",
+            "make the type str",
+        ),
         ('scope = "external"', 'scope = "internal"', "events.tick.by", "no primitive task"),
-        ('scope = "external"', 'scope = "external"\nearly = "keep"', "events.tick.early", "only a latched"),
+        (
+            'scope = "external"',
+            'scope = "external"\nearly = "keep"',
+            "events.tick.early",
+            "only a latched",
+        ),
         ('scope = "external"', 'scope = "external"\nby = "look"', "events.tick.by", "drop `by`"),
         ('kind = "control"', 'kind = "controll"', "places.runs.kind", "did you mean 'control'"),
         ("tokens = 1", "tokens = -1", "places.runs.tokens", "0 or more"),
@@ -112,7 +137,12 @@ def test_good_file_reads() -> None:
         ('task = "look"', 'task = "look"\nservers = 0', "places.look.servers", "1 or more"),
         ('{ var = "seed" }', '{ var = "sed" }', "places.look.args.seed", "did you mean 'seed'"),
         ('{ var = "seed" }', "2020-01-01", "places.look.args.seed", "no plain value"),
-        ('out = { seen = "seen" }', 'out = { seen = "saw" }', "places.look.out.seen", "no variable"),
+        (
+            'out = { seen = "seen" }',
+            'out = { seen = "saw" }',
+            "places.look.out.seen",
+            "no variable",
+        ),
         ('in = ["runs"]', 'in = ["run"]', "transitions.start.in", "did you mean 'runs'"),
         ('in = ["runs"]', 'in = ["runs*0"]', "transitions.start.in", "1 or more"),
         ('in = ["runs"]', 'in = ["runs", "runs"]', "transitions.start.in", "runs*2"),
@@ -121,14 +151,24 @@ def test_good_file_reads() -> None:
         ('["look:normal"]', '["look"]', "transitions.found.in", "write look:normal, look:error"),
         ('["look:normal"]', '["look:norml"]', "transitions.found.in", "did you mean 'normal'"),
         ('["look:normal"]', '["look:preempt"]', "transitions.found.in", "=success, =failure"),
-        ('["look:normal"]', '["look:normal=success"]', "transitions.found.in", "only a preempted run"),
+        (
+            '["look:normal"]',
+            '["look:normal=success"]',
+            "transitions.found.in",
+            "only a preempted run",
+        ),
         ('["look:normal"]', '["look:normal*2"]', "transitions.found.in", "`servers`"),
         ('["look:normal"]', '["!look:normal"]', "transitions.found.in", "write !look"),
         ('["look:normal"]', '["look normal"]', "transitions.found.in", "is no arc"),
         ('out = ["done"]', 'out = ["!done"]', "transitions.found.out", "no arc of `out`"),
         ('event = "tick"', 'event = "tock"', "transitions.start.event", "no declared event"),
         ('event = "tick"', 'event = ["tick", "tick"]', "transitions.start.event", "twice"),
-        ('event = "tick"', 'event = "tick"\nafter = 1', "transitions.start.after", "beside this one"),
+        (
+            'event = "tick"',
+            'event = "tick"\nafter = 1',
+            "transitions.start.after",
+            "beside this one",
+        ),
         ('event = "tick"', "after = 0", "transitions.start.after", "positive"),
         ('event = "tick"', "weight = 0", "transitions.start.weight", "positive"),
         ('when = "seen"', 'when = "sen"', "transitions.found.when", "did you mean 'seen'"),
@@ -175,7 +215,11 @@ def test_all_faults_come_at_once_with_their_lines() -> None:
     ("text", "key", "line"),
     [
         (GOOD.replace("[events.tick]", "[event.tick]"), "event", "[event.tick]"),
-        (GOOD.replace("[task.parameters]", "[task.parametres]"), "task.parametres", "[task.parametres]"),
+        (
+            GOOD.replace("[task.parameters]", "[task.parametres]"),
+            "task.parametres",
+            "[task.parametres]",
+        ),
         (GOOD.replace("[events.tick]", "[[events.tick]]"), "events.tick", "[[events.tick]]"),
         (GOOD.replace("schema = 1", "schema = 2"), "schema", "schema = 2"),
         ("# nothing\nschema = 1\n", "task.name", "# nothing"),
@@ -228,7 +272,9 @@ def test_notation_of_arcs(text: str, arc: Input | Inhibitor) -> None:
     assert read_input(text) == arc and read_input(write_arc(arc)) == arc
 
 
-@pytest.mark.parametrize("text", ["", "*2", "a:", "a:normal:error", "a*", "a*-1", "2*a", "!!a", "a:preempt=maybe"])
+@pytest.mark.parametrize(
+    "text", ["", "*2", "a:", "a:normal:error", "a*", "a*-1", "2*a", "!!a", "a:preempt=maybe"]
+)
 def test_no_arc(text: str) -> None:
     with pytest.raises(ArcError):
         read_input(text)
@@ -241,7 +287,10 @@ def test_outputs() -> None:
 
 
 SUBNET = (
-    GOOD.replace('[places.look]\nkind = "action"\ntask = "look"', '[places.look]\nkind = "macro"\nsubnet = "twice"')
+    GOOD.replace(
+        '[places.look]\nkind = "action"\ntask = "look"',
+        '[places.look]\nkind = "macro"\nsubnet = "twice"',
+    )
     .replace('args = { seed = { var = "seed" } }\nout = { seen = "seen" }\n', "")
     .replace('when = "seen"\n', "")
     + """
@@ -340,7 +389,11 @@ def test_macro_places_unfold_with_prefixed_names() -> None:
         ('["second:normal"]', '["second:error"]', "has no error exit"),
         ('["second:normal"]', '["second"]', "is a macro place"),
         ('["second:normal"]', '["second:normal", "!second"]', "inhibitor arc from the macro place"),
-        ('kind = "macro"\nsubnet = "once"', 'kind = "macro"\nsubnet = "once"\ntokens = 1', "no tokens of its own"),
+        (
+            'kind = "macro"\nsubnet = "once"',
+            'kind = "macro"\nsubnet = "once"\ntokens = 1',
+            "no tokens of its own",
+        ),
     ],
 )
 def test_faults_of_subnets(old: str, new: str, words: str) -> None:
@@ -352,7 +405,12 @@ def test_faults_of_subnets(old: str, new: str, words: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "key", "line"),
     [
-        ('subnet = "once"', 'subnet = "twice"', "subnets.twice.places.second.subnet", 'subnet = "twice"'),
+        (
+            'subnet = "once"',
+            'subnet = "twice"',
+            "subnets.twice.places.second.subnet",
+            'subnet = "twice"',
+        ),
         (
             "when = \"first.status == 'success'\"",
             'when = "first.status == 1"',

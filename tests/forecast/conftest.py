@@ -1,4 +1,5 @@
-"""What the tests of forecasts share: throws of a small task that are drawn here, so that the truth is known."""
+"""What the tests of forecasts share: throws of a small task that are drawn here, so that the truth
+is known."""
 
 from __future__ import annotations
 
@@ -7,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.task import Task
-from coordinator.taskfile import loads
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import loads
 
 TASK = """
 schema = 1
@@ -81,11 +82,15 @@ def pair() -> Task:
 def make_throws() -> Make:
     """Throws in which a hidden difficulty (`dependence` 1) or chance (0) decides about both runs.
 
-    first: error 5 %, else failure when it was hard; second: the signal comes after 2 - (duration of first) s, or it is missed.
+    first: error 5 %, else failure when it was hard; second: the signal comes after 2 - (duration of
+    first) s, or it is missed.
     """
 
     def make(
-        n: int, random: np.random.Generator, dependence: float = 1.0, actions: tuple[str, ...] = ("first_a",)
+        n: int,
+        random: np.random.Generator,
+        dependence: float = 1.0,
+        actions: tuple[str, ...] = ("first_a",),
     ) -> list[Throw]:
         out = []
         for k in range(n):
@@ -94,7 +99,11 @@ def make_throws() -> Make:
             took = float(random.uniform(0.4, 1.2)) + (0.2 if action == "first_b" else 0.0)
             lost = random.random() < 0.05
             status = "error" if lost else "failure" if hard else "success"
-            runs = [RunEntry("first", action, 0.0, took, status, taken="off" if lost else "on", seconds=took)]
+            runs = [
+                RunEntry(
+                    "first", action, 0.0, took, status, taken="off" if lost else "on", seconds=took
+                )
+            ]
             time = took
             if not lost:
                 again = hard if random.random() < dependence else random.random() < 0.3
@@ -102,10 +111,23 @@ def make_throws() -> Make:
                 rest = 2.0 - took + float(random.uniform(0.0, 0.1)) if met else 2.5
                 taken, counted = ("done", "success") if met else ("missed", "failure")
                 runs.append(
-                    RunEntry("second", "second_a", took, rest, counted, taken=taken, cancelled=met, seconds=rest)
+                    RunEntry(
+                        "second",
+                        "second_a",
+                        took,
+                        rest,
+                        counted,
+                        taken=taken,
+                        cancelled=met,
+                        seconds=rest,
+                    )
                 )
                 time += rest
-            worst = "error" if lost else max((r.status for r in runs), key=("success", "failure", "error").index)
+            worst = (
+                "error"
+                if lost
+                else max((r.status for r in runs), key=("success", "failure", "error").index)
+            )
             goals = int(runs[-1].taken == "done")
             wait = [("begin", float(random.uniform(0, 0.2)))]
             out.append(Throw(k % 5 + 1, 0.0, round(time, 6), True, goals, worst, "", runs, wait))

@@ -1,4 +1,5 @@
-"""Forecasts of a task whose truth is known: they cover it, keep dependence, and the product rule does not."""
+"""Forecasts of a task whose truth is known: they cover it, keep dependence, and the product rule
+does not."""
 
 from __future__ import annotations
 
@@ -12,16 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.forecast.agreement import agreement, quantile_interval
-from coordinator.forecast.choices import choices_of
-from coordinator.forecast.history import Training
-from coordinator.forecast.laws import Laws, dependences
-from coordinator.forecast.predict import Request, distance, figures, predict
-from coordinator.forecast.registered import ForecastError, read, register, write
-from coordinator.forecast.residual import measured
-from coordinator.forecast.shares import holm, predictive_interval, share_p_value
-from coordinator.task import Task
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.forecast.agreement import agreement, quantile_interval
+from petrobot.coordinator.forecast.choices import choices_of
+from petrobot.coordinator.forecast.history import Training
+from petrobot.coordinator.forecast.laws import Laws, dependences
+from petrobot.coordinator.forecast.predict import Request, distance, figures, predict
+from petrobot.coordinator.forecast.registered import ForecastError, read, register, write
+from petrobot.coordinator.forecast.residual import measured
+from petrobot.coordinator.forecast.shares import holm, predictive_interval, share_p_value
+from petrobot.coordinator.task import Task
 from tests.forecast.conftest import Make
 
 RUNS = 400
@@ -30,7 +31,10 @@ RUNS = 400
 def forecast(task: Task, throws: list[Throw], **given_: Any) -> dict[str, Any]:
     """A forecast from throws with their own choices."""
     training = Training.of(task, throws)
-    return predict(training, Request(RUNS, given_.pop("choices", choices_of(training)), replicates=60, point=20_000))
+    return predict(
+        training,
+        Request(RUNS, given_.pop("choices", choices_of(training)), replicates=60, point=20_000),
+    )
 
 
 def test_marginals_of_the_training_are_kept(pair: Task, make_throws: Make) -> None:
@@ -43,13 +47,18 @@ def test_marginals_of_the_training_are_kept(pair: Task, make_throws: Make) -> No
         assert found[name]["value"] == pytest.approx(own[name], rel=0.01)
 
 
-def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(pair: Task, make_throws: Make) -> None:
-    """Statuses of one throw depend on each other: the product of marginals is too small, the contexts are not."""
+def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(
+    pair: Task, make_throws: Make
+) -> None:
+    """Statuses of one throw depend on each other: the product of marginals is too small, the
+    contexts are not."""
     throws = make_throws(1500, np.random.default_rng(2))
     training = Training.of(pair, throws)
     assert dependences(training)[0]["p"] < 1e-6
     made = forecast(pair, throws)
-    assert ("second", "outcome", "outcome of first") in {(s["place"], s["of"], s["by"]) for s in made["splits"]}
+    assert ("second", "outcome", "outcome of first") in {
+        (s["place"], s["of"], s["by"]) for s in made["splits"]
+    }
     new = {"": Training.of(pair, make_throws(RUNS, np.random.default_rng(3)))}
     found = agreement({"regimes": {"": made}}, new)
     assert found["agrees"], found["rows"]
@@ -72,17 +81,24 @@ def test_without_dependence_the_product_is_not_rejected(pair: Task, make_throws:
 def test_a_changed_world_is_not_agreed_with(pair: Task, make_throws: Make) -> None:
     """The comparison can fail: other times and other shares are told."""
     made = forecast(pair, make_throws(1500, np.random.default_rng(6)))
-    slower = [replace(t, time=t.time * 1.05 if t.time else None) for t in make_throws(RUNS, np.random.default_rng(7))]
+    slower = [
+        replace(t, time=t.time * 1.05 if t.time else None)
+        for t in make_throws(RUNS, np.random.default_rng(7))
+    ]
     found = agreement({"regimes": {"": made}}, {"": Training.of(pair, slower)})
     assert not found["agrees"]
     assert {row["figure"] for row in found["rows"] if (row["p_holm"] or 1) < 0.01} >= {"mean"}
     assert 0.75 < made["figures"]["R_goal"]["value"] < 0.85
-    fewer = [replace(t, goals=t.goals * (i % 4 > 0)) for i, t in enumerate(make_throws(RUNS, np.random.default_rng(8)))]
+    fewer = [
+        replace(t, goals=t.goals * (i % 4 > 0))
+        for i, t in enumerate(make_throws(RUNS, np.random.default_rng(8)))
+    ]
     assert not agreement({"regimes": {"": made}}, {"": Training.of(pair, fewer)})["agrees"]
 
 
 def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_throws: Make) -> None:
-    """A long first run is followed by a short second one: independent draws would spread the time too far."""
+    """A long first run is followed by a short second one: independent draws would spread the time
+    too far."""
     throws = make_throws(1500, np.random.default_rng(9))
     training = Training.of(pair, throws)
     real = measured(training)
@@ -102,34 +118,50 @@ def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_throws: Ma
     with pytest.raises(ValueError, match="first_b was never run"):
         forecast(pair, throws, choices=other)
     both = make_throws(1000, np.random.default_rng(12), actions=("first_a", "first_b"))
-    alone = figures(measured(Training.of(pair, make_throws(4000, np.random.default_rng(13), actions=("first_b",)))))
-    assert forecast(pair, both, choices=other)["figures"]["mean"]["value"] == pytest.approx(alone["mean"], rel=0.02)
+    alone = figures(
+        measured(
+            Training.of(pair, make_throws(4000, np.random.default_rng(13), actions=("first_b",)))
+        )
+    )
+    assert forecast(pair, both, choices=other)["figures"]["mean"]["value"] == pytest.approx(
+        alone["mean"], rel=0.02
+    )
 
 
 def test_predictive_intervals_cover(pair: Task, make_throws: Make) -> None:
-    """Of 40 worlds with 95 % intervals for R_goal and the mean, nearly all hold (99.9 % binomial bound)."""
+    """Of 40 worlds with 95 % intervals for R_goal and the mean, nearly all hold (99.9 % binomial
+    bound)."""
     inside = 0
     for seed in range(20):
         random = np.random.default_rng(100 + seed)
         training = Training.of(pair, make_throws(250, random))
-        made = predict(training, Request(200, choices_of(training), seed, replicates=40, point=8000))
-        found = agreement({"regimes": {"": made}}, {"": Training.of(pair, make_throws(200, random))})
-        inside += sum(row["p"] >= 0.05 for row in found["rows"] if row["figure"] in ("R_goal", "mean"))
+        made = predict(
+            training, Request(200, choices_of(training), seed, replicates=40, point=8000)
+        )
+        found = agreement(
+            {"regimes": {"": made}}, {"": Training.of(pair, make_throws(200, random))}
+        )
+        inside += sum(
+            row["p"] >= 0.05 for row in found["rows"] if row["figure"] in ("R_goal", "mean")
+        )
     assert binom.cdf(inside, 40, 0.95) > 0.001
 
 
 def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
-    """Aalen-Johansen by hand: ends at 1 (success), 3 (failure); one censored at 2 gives its third to the end at 3."""
+    """Aalen-Johansen by hand: ends at 1 (success), 3 (failure); one censored at 2 gives its third
+    to the end at 3."""
     runs = [
         RunEntry("first", "first_a", 0.0, took, status)
         for took, status in ((1.0, "success"), (2.0, ""), (3.0, "failure"))
     ]
-    law = next(iter(Laws(Training.of(pair, [Throw(1, 0.0, runs=[run]) for run in runs])).contexts.values())).law
+    law = next(
+        iter(Laws(Training.of(pair, [Throw(1, 0.0, runs=[run]) for run in runs])).contexts.values())
+    ).law
     assert law.took.tolist() == [1.0, 3.0]
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
 
 
-# --- statistics ----------------------------------------------------------------------------------------------------------
+# --- statistics -------------------------------------------------------------------------------
 
 
 def test_holm_by_hand() -> None:
@@ -142,7 +174,10 @@ def test_holm_by_hand() -> None:
 def test_holm_lies_between_plain_and_bonferroni(p_values: list[float]) -> None:
     """And keeps the order."""
     adjusted = holm(p_values)
-    assert all(p <= a <= min(1.0, len(p_values) * p) + 1e-12 for p, a in zip(p_values, adjusted, strict=True))
+    assert all(
+        p <= a <= min(1.0, len(p_values) * p) + 1e-12
+        for p, a in zip(p_values, adjusted, strict=True)
+    )
 
 
 @given(st.floats(0.0, 1.0), st.integers(10, 5000), st.integers(1, 2000))
@@ -163,7 +198,10 @@ def test_a_share_of_one_expects_a_miss_now_and_then() -> None:
 def test_quantile_interval_holds_its_quantile() -> None:
     """Uniform numbers: the 90 % point is in the 90 % interval about nine times in ten."""
     random = np.random.default_rng(1)
-    hits = sum(low <= 0.9 <= high for low, high in (quantile_interval(random.random(300), 0.9) for _ in range(200)))
+    hits = sum(
+        low <= 0.9 <= high
+        for low, high in (quantile_interval(random.random(300), 0.9) for _ in range(200))
+    )
     assert 165 <= hits <= 198
 
 
@@ -173,13 +211,17 @@ def test_distance_is_kolmogorovs() -> None:
 
     random = np.random.default_rng(2)
     one, reference = random.random(40), np.sort(random.random(500) ** 1.2)
-    assert distance(one, reference) == pytest.approx(float(ks_2samp(one, reference).statistic), abs=1e-12)
+    assert distance(one, reference) == pytest.approx(
+        float(ks_2samp(one, reference).statistic), abs=1e-12
+    )
 
 
-# --- registered files ----------------------------------------------------------------------------------------------------
+# --- registered files -------------------------------------------------------------------------
 
 
-def test_a_registered_forecast_stays_as_it_is(pair: Task, make_throws: Make, tmp_path: Path) -> None:
+def test_a_registered_forecast_stays_as_it_is(
+    pair: Task, make_throws: Make, tmp_path: Path
+) -> None:
     """Never written over; a changed one is refused."""
     training = {"": Training.of(pair, make_throws(200, np.random.default_rng(1)))}
     request = {"": Request(100, choices_of(training[""]), replicates=20, point=2000)}
@@ -203,10 +245,11 @@ def test_the_same_seed_gives_the_same_forecast(pair: Task, make_throws: Make) ->
 
 
 def test_the_stochastic_view_stands_beside(pair: Task, make_throws: Make) -> None:
-    """It keeps shares and means exactly, but takes statuses for independent: its R_conj is the product, not the truth."""
-    from coordinator.campaign.observed import estimates_of
-    from coordinator.campaign.rows import Row
-    from coordinator.forecast.registered import exact
+    """It keeps shares and means exactly, but takes statuses for independent: its R_conj is the
+    product, not the truth."""
+    from petrobot.coordinator.campaign.observed import estimates_of
+    from petrobot.coordinator.campaign.rows import Row
+    from petrobot.coordinator.forecast.registered import exact
 
     throws = make_throws(1500, np.random.default_rng(14))
     training = Training.of(pair, throws)

@@ -1,4 +1,5 @@
-"""The command as a user meets it, on campaigns that are written here: doubts, what-ifs and what does not belong together."""
+"""The command as a user meets it, on campaigns that are written here: doubts, what-ifs and what
+does not belong together."""
 
 from __future__ import annotations
 
@@ -10,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.campaign.plan import Plan, digest, write_manifest
-from coordinator.campaign.rows import Row
-from coordinator.campaign.table import Table
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.cli import main
-from coordinator.forecast.choices import misfit
-from coordinator.forecast.history import Training
-from coordinator.forecast.residual import routing
-from coordinator.task import Task
-from coordinator.taskfile import loads
+from petrobot.coordinator.campaign.plan import Plan, digest, write_manifest
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.table import Table
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.forecast.choices import misfit
+from petrobot.coordinator.forecast.history import Training
+from petrobot.coordinator.forecast.residual import routing
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import loads
 from tests.forecast.conftest import TASK, Make
 from tests.forecast.test_preempting import ONE_WAY
 
@@ -38,19 +39,38 @@ def write_campaign(tmp_path: Path) -> Write:
         path.write_text(text, encoding="utf-8")
         folder = tmp_path / name
         folder.mkdir()
-        plan = Plan(str(path), "nowhere.toml", len(throws), ("",), seed, digests={"task": digest(path)}, **more)
+        plan = Plan(
+            str(path),
+            "nowhere.toml",
+            len(throws),
+            ("",),
+            seed,
+            digests={"task": digest(path)},
+            **more,
+        )
         write_manifest(folder, plan)
-        Table(folder, task).append([Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws, 1)])
+        Table(folder, task).append(
+            [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws, 1)]
+        )
         return folder
 
     return write
 
 
 def dependent(random: np.random.Generator) -> Throw:
-    """Watching always ends a little before locating: what two independent runs would not do, and no context tells."""
+    """Watching always ends a little before locating: what two independent runs would not do, and no
+    context tells."""
     locate = float(random.uniform(0.5, 1.5))
     runs = [
-        RunEntry("watch", "watch_a", 0.0, locate - 0.1, "success", taken="found_late", seconds=locate - 0.1),
+        RunEntry(
+            "watch",
+            "watch_a",
+            0.0,
+            locate - 0.1,
+            "success",
+            taken="found_late",
+            seconds=locate - 0.1,
+        ),
         RunEntry("locate", "locate_a", 0.0, locate, "success", taken="found_late", seconds=locate),
     ]
     return Throw(1, 0.0, round(locate, 6), True, 0, runs=runs, fired={"next": 1, "found_late": 1})
@@ -63,10 +83,21 @@ def test_a_doubtful_forecast_is_told_and_not_registered(
     random = np.random.default_rng(1)
     train = write_campaign("train", ONE_WAY, [dependent(random) for _ in range(300)])
     out = tmp_path / "f.json"
-    told = ["forecast", str(tmp_path / "scan.toml"), "--estimates", str(train), *QUICK, "--out", str(out)]
+    told = [
+        "forecast",
+        str(tmp_path / "scan.toml"),
+        "--estimates",
+        str(train),
+        *QUICK,
+        "--out",
+        str(out),
+    ]
     assert main(told) == 1
     shown = capsys.readouterr()
-    assert "DOUBTFUL: throws played with the training's own choices differ from the training's: goal" in shown.out
+    assert (
+        "DOUBTFUL: throws played with the training's own choices differ from the training's: goal"
+        in shown.out
+    )
     assert "DOUBTFUL" in shown.err and "--doubtful" in shown.err
     assert "registered" not in shown.out
     assert not out.exists()
@@ -81,18 +112,23 @@ def test_a_doubtful_forecast_is_told_and_not_registered(
 def test_a_what_if_is_compared_with_runs_that_choose_so(
     write_campaign: Write, make_throws: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Others are refused with the choices that fit; those that fit agree, their ways out of each place too."""
+    """Others are refused with the choices that fit; those that fit agree, their ways out of each
+    place too."""
     train = write_campaign("train", TASK, make_throws(900, np.random.default_rng(1), actions=BOTH))
     out = tmp_path / "f.json"
     told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
     assert main([*told, "--choose", "first=first_b", "--out", str(out)]) == 0
-    mixed = write_campaign("mixed", TASK, make_throws(300, np.random.default_rng(2), actions=BOTH), 2)
+    mixed = write_campaign(
+        "mixed", TASK, make_throws(300, np.random.default_rng(2), actions=BOTH), 2
+    )
     capsys.readouterr()
     assert main(["forecast", "--compare", str(out), str(mixed)]) == 2
     said = capsys.readouterr().err
     assert "it forecasts first=first_b; the campaign chooses first: first_" in said
     assert "--choose first=first_b" in said
-    alone = write_campaign("alone", TASK, make_throws(300, np.random.default_rng(3), actions=("first_b",)), 3)
+    alone = write_campaign(
+        "alone", TASK, make_throws(300, np.random.default_rng(3), actions=("first_b",)), 3
+    )
     assert main(["forecast", "--compare", str(out), str(alone)]) == 0
     plain = tmp_path / "plain.json"
     assert main([*told, "--out", str(plain)]) == 0
@@ -126,8 +162,11 @@ def test_ways_out_of_places_are_those_of_the_chosen_actions(pair: Task, make_thr
         ({"a": 1.0, "b": 0.0}, {"asked": ["t"]}, {"a": 6}, True),
     ],
 )
-def test_misfits(choices: dict[str, float], more: dict[str, Any], run: dict[str, int], fits: bool) -> None:
-    """Of 400 training throws: a mix by its shares, one action alone by the others' absence, unless it was hardly ever run."""
+def test_misfits(
+    choices: dict[str, float], more: dict[str, Any], run: dict[str, int], fits: bool
+) -> None:
+    """Of 400 training throws: a mix by its shares, one action alone by the others' absence, unless
+    it was hardly ever run."""
     said = {"choices": {"t": choices}, "training_throws": 400, **more}
     assert misfit(said, {"t": run, "of another forecast": {"x": 5}}) == ([] if fits else ["t"])
 
@@ -161,9 +200,11 @@ def test_bad_input(
     assert shown.count("\n") == 1
 
 
-def test_estimates_of_another_task_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_estimates_of_another_task_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Also from a file of estimates."""
-    from coordinator.campaign.observed import estimates_of, write_estimates
+    from petrobot.coordinator.campaign.observed import estimates_of, write_estimates
 
     random = np.random.default_rng(1)
     task = loads(ONE_WAY, "scan.toml")

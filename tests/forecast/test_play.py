@@ -1,4 +1,5 @@
-"""Playing a net: branches side by side, timers, conditions, loops, inhibitors and dead ends, each against what is known by hand."""
+"""Playing a net: branches side by side, timers, conditions, loops, inhibitors and dead ends, each
+against what is known by hand."""
 
 from __future__ import annotations
 
@@ -7,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.forecast.choices import choices_of
-from coordinator.forecast.history import Training
-from coordinator.forecast.laws import Laws
-from coordinator.forecast.play import Play, Played
-from coordinator.forecast.sampling import Drawer
-from coordinator.forecast.structure import Structure
-from coordinator.taskfile import loads
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.forecast.choices import choices_of
+from petrobot.coordinator.forecast.history import Training
+from petrobot.coordinator.forecast.laws import Laws
+from petrobot.coordinator.forecast.play import Play, Played
+from petrobot.coordinator.forecast.sampling import Drawer
+from petrobot.coordinator.forecast.structure import Structure
+from petrobot.coordinator.taskfile import loads
 
 HEAD = """
 schema = 1
@@ -44,16 +45,23 @@ kind = "control"
 
 
 def play(
-    text: str, throws: list[Throw], n: int = 2000, task: str = 'final = "end == 1"\nruns_place = "jobs"'
+    text: str,
+    throws: list[Throw],
+    n: int = 2000,
+    task: str = 'final = "end == 1"\nruns_place = "jobs"',
 ) -> Played:
     """Throws of a task played from what was measured."""
     training = Training.of(loads(HEAD.replace("{task}", task) + text, "net.toml"), throws)
     random = np.random.default_rng(1)
     drawer = Drawer(Laws(training), training.waits, np.ones((1, len(throws))), random)
-    return Play(Structure.of(training.task), drawer, choices_of(training), np.zeros(n, np.int64)).run()
+    return Play(
+        Structure.of(training.task), drawer, choices_of(training), np.zeros(n, np.int64)
+    ).run()
 
 
-def entry(place: str, took: float, status: str = "success", taken: str = "", **more: Any) -> RunEntry:
+def entry(
+    place: str, took: float, status: str = "success", taken: str = "", **more: Any
+) -> RunEntry:
     """A run that ended."""
     return RunEntry(place, f"run_{place}", 0.0, took, status, taken=taken, **more)
 
@@ -77,7 +85,8 @@ out = ["end"]
 def test_side_by_side_takes_the_longer_one() -> None:
     """Uniform on 1, 3 beside 2: the time is 2 or 3, half each."""
     throws = [
-        Throw(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")]) for took in (1.0, 3.0)
+        Throw(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")])
+        for took in (1.0, 3.0)
     ]
     played = play(FORK, throws)
     assert set(played.time.tolist()) == {2.0, 3.0}
@@ -86,7 +95,8 @@ def test_side_by_side_takes_the_longer_one() -> None:
 
 
 def test_what_its_runs_chose_decides_between_exits_of_one_status() -> None:
-    """Two normal exits with a condition on a variable: taken as often as they were, with the durations that went with each."""
+    """Two normal exits with a condition on a variable: taken as often as they were, with the
+    durations that went with each."""
     text = """
 [variables.found]
 type = "bool"
@@ -112,7 +122,14 @@ in = ["b:error"]
 out = ["end"]
 """
     yes = [
-        Throw(1, 0.0, runs=[entry("a", 1.0, taken="yes"), RunEntry("b", "run_b", 1.0, 5.0, "failure", taken="done")])
+        Throw(
+            1,
+            0.0,
+            runs=[
+                entry("a", 1.0, taken="yes"),
+                RunEntry("b", "run_b", 1.0, 5.0, "failure", taken="done"),
+            ],
+        )
     ]
     no = [Throw(1, 0.0, runs=[entry("a", 2.0, taken="no")])]
     played = play(text, yes + no * 3)
@@ -154,7 +171,14 @@ def test_a_loop_is_geometric() -> None:
 def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
     """Always interrupted twice, then done: the number of runs before is a context of its own."""
     runs = [
-        RunEntry("a", "run_a", float(k), 1.0, "error" if k < 2 else "success", taken="again" if k < 2 else "done")
+        RunEntry(
+            "a",
+            "run_a",
+            float(k),
+            1.0,
+            "error" if k < 2 else "success",
+            taken="again" if k < 2 else "done",
+        )
         for k in range(3)
     ]
     played = play(LOOP, [Throw(1, 0.0, runs=runs)] * 60)
@@ -166,7 +190,13 @@ def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
 
     def rounds(n: int) -> Throw:
         ends = [("error", "again")] * (n - 1) + [("success", "done")]
-        return Throw(1, 0.0, runs=[RunEntry("a", "run_a", float(k), 1.0, s, taken=t) for k, (s, t) in enumerate(ends)])
+        return Throw(
+            1,
+            0.0,
+            runs=[
+                RunEntry("a", "run_a", float(k), 1.0, s, taken=t) for k, (s, t) in enumerate(ends)
+            ],
+        )
 
     played = play(LOOP, [rounds(3)] * 60 + [rounds(4)] * 5)
     assert played.completed.all()
@@ -174,7 +204,8 @@ def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
 
 
 def test_branches_that_go_in_step_are_told_apart_by_their_own_rounds() -> None:
-    """Rounds of either branch tell those of the other in every throw that was run; where they are played they drift apart."""
+    """Rounds of either branch tell those of the other in every throw that was run; where they are
+    played they drift apart."""
     text = """
 [transitions.begin]
 in = ["jobs"]
@@ -196,16 +227,21 @@ out = ["end"]
         for k, drift in enumerate(random.uniform(-0.3, 0.3, 3)):
             for place, begun in (("a", 2.0 * k), ("b", 2.0 * k + 0.5)):
                 end = ("error", f"{place}_again") if k < 2 else ("success", "done")
-                runs.append(RunEntry(place, f"run_{place}", begun, 1.5 + drift, end[0], taken=end[1]))
+                runs.append(
+                    RunEntry(place, f"run_{place}", begun, 1.5 + drift, end[0], taken=end[1])
+                )
         throws.append(Throw(1, 0.0, runs=runs))
-    training = Training.of(loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws)
+    training = Training.of(
+        loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws
+    )
     found = {s["place"]: s["by"] for s in Laws(training).splits() if s["of"] == "outcome"}
     assert found == {"a": "visits of a", "b": "visits of b"}
     assert play(text, throws).completed.all()
 
 
 def test_timers_and_events_race() -> None:
-    """An event at 1 or 3 s against a timer of 2 s: half each; a timer that was never seen to fire counts as it is declared."""
+    """An event at 1 or 3 s against a timer of 2 s: half each; a timer that was never seen to fire
+    counts as it is declared."""
     text = """
 [events.bell]
 scope = "external"
@@ -231,7 +267,10 @@ out = ["end"]
 in = ["b:error"]
 out = ["end"]
 """
-    throws = [Throw(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)]) for wait in (1.0, 3.0)]
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)])
+        for wait in (1.0, 3.0)
+    ]
     played = play(text, throws, task='final = "end == 1"')
     assert set(played.time.tolist()) == {5.0, 2.0}
     assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
@@ -272,8 +311,11 @@ out = ["end"]
 
 
 @pytest.mark.parametrize(("priority", "completes"), [(1, True), (0, False)])
-def test_a_preemption_of_higher_priority_takes_what_has_ended_too(priority: int, completes: bool) -> None:
-    """a has ended and waits for b, which is lost: only a transition above the normal exits takes a then, as in the engine."""
+def test_a_preemption_of_higher_priority_takes_what_has_ended_too(
+    priority: int, completes: bool
+) -> None:
+    """a has ended and waits for b, which is lost: only a transition above the normal exits takes a
+    then, as in the engine."""
     text = f"""
 [places.alarm]
 kind = "control"
@@ -327,9 +369,12 @@ def test_choices_without_a_single_action_are_refused() -> None:
         play(FORK, [Throw(1, 0.0, runs=[entry("a", 1.0)])])
 
 
-@pytest.mark.parametrize(("threshold", "seconds"), [("busy", 3.0), ("busy*2", 2.0), ("busy*3", 1.0)])
+@pytest.mark.parametrize(
+    ("threshold", "seconds"), [("busy", 3.0), ("busy*2", 2.0), ("busy*3", 1.0)]
+)
 def test_an_inhibitor_holds_back_until_its_place_holds_less(threshold: str, seconds: float) -> None:
-    """a ends after 1 s; b empties busy in steps, after 2 and 3 s; what `!busy*k` inhibits fires when fewer than k are left."""
+    """a ends after 1 s; b empties busy in steps, after 2 and 3 s; what `!busy*k` inhibits fires
+    when fewer than k are left."""
     text = """
 [places.busy]
 kind = "control"
@@ -364,7 +409,9 @@ out = ["end"]
     ("left", "right", "late"),
     [("weight = 3.0", "weight = 1.0", 0.25), ("priority = 1", "", 0.0), ("", "priority = 1", 1.0)],
 )
-def test_priority_decides_between_two_that_can_fire_then_weight(left: str, right: str, late: float) -> None:
+def test_priority_decides_between_two_that_can_fire_then_weight(
+    left: str, right: str, late: float
+) -> None:
     """The left way ends at once, the right one a second later."""
     text = """
 [places.fork]
@@ -429,5 +476,7 @@ out = ["end"]
 in = ["b:error"]
 out = ["end"]
 """
-    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])]
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])
+    ]
     assert play(text, throws, n=20).time.tolist() == [2.0] * 20

@@ -1,6 +1,8 @@
-"""Runs that are preempted because another one has ended: the net says when, what they would have come to is censored.
+"""Runs that are preempted because another one has ended: the net says when, what they would have
+come to is censored.
 
-Truth is known here: two runs begin together, each draws how and when it would end, and the first end takes the other run.
+Truth is known here: two runs begin together, each draws how and when it would end, and the first
+end takes the other run.
 """
 
 from __future__ import annotations
@@ -11,20 +13,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coordinator.analysis.stochastic import is_cause, stochastic_view
-from coordinator.campaign.observed import estimates_of
-from coordinator.campaign.rows import Row
-from coordinator.campaign.throws import RunEntry, Throw
-from coordinator.experience.propagation import propagate, unended
-from coordinator.forecast.choices import choices_of
-from coordinator.forecast.history import NONE, Training
-from coordinator.forecast.laws import Laws, with_weights
-from coordinator.forecast.predict import Request, figures, predict
-from coordinator.forecast.residual import measured
-from coordinator.forecast.structure import Structure
-from coordinator.learning.competing import incidences
-from coordinator.task import Task
-from coordinator.taskfile import loads
+from petrobot.coordinator.analysis.stochastic import is_cause, stochastic_view
+from petrobot.coordinator.campaign.observed import estimates_of
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.throws import RunEntry, Throw
+from petrobot.coordinator.experience.propagation import propagate, unended
+from petrobot.coordinator.forecast.choices import choices_of
+from petrobot.coordinator.forecast.history import NONE, Training
+from petrobot.coordinator.forecast.laws import Laws, with_weights
+from petrobot.coordinator.forecast.predict import Request, figures, predict
+from petrobot.coordinator.forecast.residual import measured
+from petrobot.coordinator.forecast.structure import Structure
+from petrobot.coordinator.learning.competing import incidences
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import loads
 
 HEAD = """
 schema = 1
@@ -116,12 +118,16 @@ def one_way(random: np.random.Generator, slow: float = 1.0) -> Throw:
     seen = "success" if random.random() < 0.8 else "failure"
     stem = "lost" if status == "error" else "found"
     if watch > locate:
-        other = RunEntry("watch", "watch_a", 0.0, locate, "", taken=stem, cancelled=True, seconds=locate)
+        other = RunEntry(
+            "watch", "watch_a", 0.0, locate, "", taken=stem, cancelled=True, seconds=locate
+        )
     else:
         stem += "_late"
         other = RunEntry("watch", "watch_a", 0.0, watch, seen, taken=stem, seconds=watch)
     own = RunEntry("locate", "locate_a", 0.0, locate, status, taken=stem, seconds=locate)
-    return Throw(1, 0.0, locate, True, int(stem == "found"), runs=[other, own], fired={"next": 1, stem: 1})
+    return Throw(
+        1, 0.0, locate, True, int(stem == "found"), runs=[other, own], fired={"next": 1, stem: 1}
+    )
 
 
 def both_ways(random: np.random.Generator) -> Throw:
@@ -132,15 +138,34 @@ def both_ways(random: np.random.Generator) -> Throw:
         taken = "lost" if status == "error" else "found"
         runs = [
             RunEntry("locate", "locate_a", 0.0, locate, status, taken=taken, seconds=locate),
-            RunEntry("watch", "watch_a", 0.0, locate, "", taken=taken, cancelled=True, seconds=locate),
+            RunEntry(
+                "watch", "watch_a", 0.0, locate, "", taken=taken, cancelled=True, seconds=locate
+            ),
         ]
     else:
         taken, seen = "late", "success" if random.random() < 0.8 else "failure"
         runs = [
-            RunEntry("locate", "locate_a", 0.0, watch, "failure", taken=taken, cancelled=True, seconds=watch),
+            RunEntry(
+                "locate",
+                "locate_a",
+                0.0,
+                watch,
+                "failure",
+                taken=taken,
+                cancelled=True,
+                seconds=watch,
+            ),
             RunEntry("watch", "watch_a", 0.0, watch, seen, taken=taken, seconds=watch),
         ]
-    return Throw(1, 0.0, min(locate, watch), True, int(taken == "found"), runs=runs, fired={"next": 1, taken: 1})
+    return Throw(
+        1,
+        0.0,
+        min(locate, watch),
+        True,
+        int(taken == "found"),
+        runs=runs,
+        fired={"next": 1, taken: 1},
+    )
 
 
 def throws_of(make: object, n: int, seed: int) -> list[Throw]:
@@ -151,18 +176,24 @@ def throws_of(make: object, n: int, seed: int) -> list[Throw]:
 
 
 FIRST = math.exp(-0.5) - math.exp(-1.5)
-"""Probability that a uniform time on 0.5, 1.5 comes before an exponential one of mean 1: the integral of exp(-t)."""
+"""Probability that a uniform time on 0.5, 1.5 comes before an exponential one of mean 1: the
+integral of exp(-t)."""
 
 
 @pytest.mark.parametrize(
     ("text", "make", "goal", "conj"),
     [
-        pytest.param(ONE_WAY, one_way, 0.9 * FIRST, 0.6 * (FIRST + 0.8 * (1 - FIRST)), id="one way"),
+        pytest.param(
+            ONE_WAY, one_way, 0.9 * FIRST, 0.6 * (FIRST + 0.8 * (1 - FIRST)), id="one way"
+        ),
         pytest.param(BOTH_WAYS, both_ways, 0.9 * FIRST, 0.6 * FIRST, id="both ways"),
     ],
 )
-def test_what_another_end_preempts_is_forecast_as_it_happens(text: str, make: object, goal: float, conj: float) -> None:
-    """Against closed forms, within what 3,000 training throws tell; and played throws do not differ from the training's."""
+def test_what_another_end_preempts_is_forecast_as_it_happens(
+    text: str, make: object, goal: float, conj: float
+) -> None:
+    """Against closed forms, within what 3,000 training throws tell; and played throws do not differ
+    from the training's."""
     task = loads(text, "scan.toml")
     training = Training.of(task, throws_of(make, 3000, 1))
     made = predict(training, Request(400, choices_of(training), replicates=40, point=20_000))
@@ -182,8 +213,11 @@ def test_what_another_end_preempts_is_forecast_as_it_happens(text: str, make: ob
         pytest.param(BOTH_WAYS, both_ways, 0.6 * FIRST, id="both ways"),
     ],
 )
-def test_the_stochastic_view_preempts_when_the_other_has_ended(text: str, make: object, conj: float) -> None:
-    """It always completes, and what is preempted has not ended as it was drawn to; phase-type durations cost it some points."""
+def test_the_stochastic_view_preempts_when_the_other_has_ended(
+    text: str, make: object, conj: float
+) -> None:
+    """It always completes, and what is preempted has not ended as it was drawn to; phase-type
+    durations cost it some points."""
     task = loads(text, "scan.toml")
     rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws_of(make, 1500, 2))]
     task = replace(task, runs_place="parts")
@@ -200,13 +234,16 @@ def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
     training = Training.of(task, throws)
     made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
     assert made["figures"]["P_complete"]["value"] == 1.0
-    assert made["figures"]["R_goal"]["value"] == pytest.approx(np.mean([t.goals for t in throws]), abs=0.02)
+    assert made["figures"]["R_goal"]["value"] == pytest.approx(
+        np.mean([t.goals for t in throws]), abs=0.02
+    )
     rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
     assert propagate(task, estimates_of(task, rows, "t")).complete == pytest.approx(1.0, abs=1e-9)
 
 
 def test_what_was_never_seen_is_told() -> None:
-    """Nothing else takes the run now, so it goes on for longer than any that was seen: the forecast says that it is doubtful."""
+    """Nothing else takes the run now, so it goes on for longer than any that was seen: the forecast
+    says that it is doubtful."""
     alone = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
     text = (
         alone
@@ -225,7 +262,14 @@ out = ["idle"]
     random = np.random.default_rng(1)
     runs = [(min(0.5, t), t < 0.5) for t in random.exponential(1.0, 300)]
     throws = [
-        Throw(1, 0.0, t, True, int(ended), runs=[RunEntry("watch", "watch_a", 0.0, t, "success" if ended else "")])
+        Throw(
+            1,
+            0.0,
+            t,
+            True,
+            int(ended),
+            runs=[RunEntry("watch", "watch_a", 0.0, t, "success" if ended else "")],
+        )
         for t, ended in runs
     ]
     training = Training.of(loads(text, "scan.toml"), throws)
@@ -233,7 +277,7 @@ out = ["idle"]
     assert any("watch" in doubt and "longer" in doubt for doubt in made["doubts"]), made["doubts"]
 
 
-# --- what is a cause -----------------------------------------------------------------------------------------------------
+# --- what is a cause --------------------------------------------------------------------------
 
 EVENTS = """
 [transitions.rung]
@@ -265,7 +309,11 @@ def test_causes_are_events_and_timers_that_take_one_run(more: str, how: str, cau
 @pytest.mark.parametrize(
     ("more", "how", "why"),
     [
-        (', "locate:normal"', 'event = "bell"', "transitions.rung: forecasts know an event that preempts one run"),
+        (
+            ', "locate:normal"',
+            'event = "bell"',
+            "transitions.rung: forecasts know an event that preempts one run",
+        ),
         (
             ', "locate:preempt=none"',
             'event = "bell"',
@@ -283,7 +331,9 @@ def test_what_cannot_be_forecast_truly_is_refused_by_name(more: str, how: str, w
 
 def test_an_event_that_preempts_and_counts_none_happens() -> None:
     """Such runs are a way to end, not mere cut-offs: half of them ring at 1 s, half end at 2 s."""
-    text = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]') + EVENTS.format(more="", how='event = "bell"')
+    text = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]') + EVENTS.format(
+        more="", how='event = "bell"'
+    )
     text += """
 [transitions.found]
 in = ["watch:normal"]
@@ -313,13 +363,16 @@ out = ["idle"]
     for throw in throws:
         throw.runs[0].cancelled = throw.runs[0].taken == "rung"
     training = Training.of(loads(text, "scan.toml"), throws)
-    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))["figures"]
+    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))[
+        "figures"
+    ]
     assert made["R_goal"]["value"] == pytest.approx(0.5, abs=0.03)
     assert made["mean"]["value"] == pytest.approx(1.5, abs=0.03)
 
 
 def test_a_timer_over_two_runs_fires_once_for_both() -> None:
-    """At 1.02 s, as measured, not at the declared 1 s: whichever run goes on then, and only if both do."""
+    """At 1.02 s, as measured, not at the declared 1 s: whichever run goes on then, and only if both
+    do."""
     text = (
         BOTH_WAYS
         + """
@@ -334,8 +387,19 @@ after = 1.0
     for throw in throws_of(both_ways, 1500, 8):
         if throw.time is not None and throw.time > 1.02:
             runs = [
-                RunEntry("locate", "locate_a", 0.0, 1.02, "failure", taken="dog", cancelled=True, seconds=1.02),
-                RunEntry("watch", "watch_a", 0.0, 1.02, "", taken="dog", cancelled=True, seconds=1.02),
+                RunEntry(
+                    "locate",
+                    "locate_a",
+                    0.0,
+                    1.02,
+                    "failure",
+                    taken="dog",
+                    cancelled=True,
+                    seconds=1.02,
+                ),
+                RunEntry(
+                    "watch", "watch_a", 0.0, 1.02, "", taken="dog", cancelled=True, seconds=1.02
+                ),
             ]
             random.shuffle(runs)
             throw = Throw(1, 0.0, 1.02, True, 0, runs=runs, fired={"next": 1, "dog": 1})
@@ -351,11 +415,12 @@ after = 1.0
     assert made["doubts"] == []
 
 
-# --- censoring -----------------------------------------------------------------------------------------------------------
+# --- censoring --------------------------------------------------------------------------------
 
 
 def test_weights_are_the_aalen_johansen_estimate() -> None:
-    """Against the estimator of the stochastic view, and the rest beyond the longest run against Kaplan and Meier by hand."""
+    """Against the estimator of the stochastic view, and the rest beyond the longest run against
+    Kaplan and Meier by hand."""
     random = np.random.default_rng(3)
     training = Training.of(loads(BOTH_WAYS, "scan.toml"), throws_of(both_ways, 200, 4))
     for place in (0, 1):
@@ -367,16 +432,25 @@ def test_weights_are_the_aalen_johansen_estimate() -> None:
         for cause, law in incidences(runs.took.tolist(), causes).items():
             own = ended.outcome == int(cause)
             assert float(ended.weight[own].sum()) == pytest.approx(law.share * (1 - left), abs=1e-9)
-            assert float(np.average(ended.took[own], weights=ended.weight[own])) == pytest.approx(law.mean, rel=1e-9)
+            assert float(np.average(ended.took[own], weights=ended.weight[own])) == pytest.approx(
+                law.mean, rel=1e-9
+            )
         assert unended(runs.took.tolist(), causes) == pytest.approx((left, float(runs.took.max())))
 
 
 def test_beyond_the_longest_run_by_hand() -> None:
-    """An end at 1 s, cut off at 2 and 3 s: two thirds are left there, which a constant rate would have left by 3 s."""
+    """An end at 1 s, cut off at 2 and 3 s: two thirds are left there, which a constant rate would
+    have left by 3 s."""
     task = loads(ONE_WAY, "scan.toml")
     runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
     throws = [
-        Throw(1, 0.0, runs=[RunEntry("watch", "watch_a", 0.0, took, status, taken=taken, cancelled=bool(taken))])
+        Throw(
+            1,
+            0.0,
+            runs=[
+                RunEntry("watch", "watch_a", 0.0, took, status, taken=taken, cancelled=bool(taken))
+            ],
+        )
         for status, took, taken in runs
     ]
     (context,) = Laws(Training.of(task, throws)).contexts.values()
@@ -390,13 +464,14 @@ def test_the_view_without_measurements_still_races(tmp_path: object) -> None:
     declared = ONE_WAY.replace(
         "[primitive_tasks.watch]",
         "[primitive_tasks.locate.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
-        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 }\n[primitive_tasks.watch]",
+        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 "
+        "}\n[primitive_tasks.watch]",
     ).replace(
         "[events.bell]",
         "[primitive_tasks.watch.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
         "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 }\n[events.bell]",
     )
-    from coordinator.analysis.forecast import forecast
+    from petrobot.coordinator.analysis.forecast import forecast
 
     found = forecast(stochastic_view(loads(declared, "scan.toml")))
     assert found.goal_reliability == pytest.approx(0.5, abs=1e-6)

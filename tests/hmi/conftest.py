@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi.journals import JournalHistory
-from coordinator.hmi.server import Page, start_page
-from coordinator.task import Executed, Status
-from coordinator.taskfile import load
+from petrobot.coordinator.hmi.journals import JournalHistory
+from petrobot.coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.task import Executed, Status
+from petrobot.coordinator.taskfile import load
 from tests.hmi.stage import Part, Stage
 from tests.waiting import beat
 
@@ -37,7 +37,9 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-PATIENCE_MS = 60_000  # for a condition: a browser beside other tests on two slow cores is late now and then
+PATIENCE_MS = (
+    60_000  # for a condition: a browser beside other tests on two slow cores is late now and then
+)
 SLIPPED = Part(0.3, Status.ERROR, "slipped", "the part slipped out of the gripper", Executed.YES)
 SCRIPT = {
     "look__edges": [Part(0.3)],
@@ -46,7 +48,13 @@ SCRIPT = {
     "put": [Part(0.3)],
     "clear": [Part(0.4)],
 }
-WHERE = {"look__edges": "vision", "look__template": "vision", "pick": "arm", "put": "arm", "clear": "arm"}
+WHERE = {
+    "look__edges": "vision",
+    "look__template": "vision",
+    "pick": "arm",
+    "put": "arm",
+    "clear": "arm",
+}
 
 
 @pytest.fixture
@@ -71,7 +79,9 @@ async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
 async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
     """The page of a mission, on loopback."""
     history = JournalHistory(runs)
-    made = await start_page(stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, history=history)
+    made = await start_page(
+        stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, history=history
+    )
     yield made
     await made.close()
 
@@ -109,7 +119,8 @@ def shots() -> Path:
 
 @pytest.fixture
 def faults() -> Callable[[Any], list[str]]:
-    """Collect what a browser page complains about: script errors, refused content, error messages on its console."""
+    """Collect what a browser page complains about: script errors, refused content, error messages
+    on its console."""
 
     def watch(tab: Any) -> list[str]:
         found: list[str] = []
@@ -121,7 +132,8 @@ def faults() -> Callable[[Any], list[str]]:
 
 
 def is_fault(message: ConsoleMessage) -> bool:
-    """Whether the page complains; a net that cannot be analysed yet is answered so, which the browser notes (422)."""
+    """Whether the page complains; a net that cannot be analysed yet is answered so, which the
+    browser notes (422)."""
     return message.type == "error" and "422" not in message.text
 
 
@@ -140,7 +152,8 @@ NOTE_TOASTS = """() => {
 
 
 async def note_toasts(tab: Tab) -> None:
-    """Keep what the page says for a few seconds only: whoever looks once a second may be too late."""
+    """Keep what the page says for a few seconds only: whoever looks once a second may be too
+    late."""
     await tab.evaluate(NOTE_TOASTS)
 
 
@@ -150,11 +163,15 @@ async def toasted(tab: Tab, pattern: str) -> None:
     await tab.wait_for_function(script, arg=pattern)
 
 
-PRESS_TWICE = "(button) => { button.click(); const asked = button.textContent; button.click(); return asked; }"
+PRESS_TWICE = (
+    "(button) => { button.click(); const asked = button.textContent; "
+    "button.click(); return asked; }"
+)
 
 
 async def abort(toolbar: Locator) -> None:
-    """Press Abort, which asks, and press it again: in one go, as the page takes the answer for three seconds only."""
+    """Press Abort, which asks, and press it again: in one go, as the page takes the answer for
+    three seconds only."""
     from playwright.async_api import expect
 
     button = toolbar.get_by_role("button", name="Abort")
@@ -164,7 +181,8 @@ async def abort(toolbar: Locator) -> None:
 
 @contextmanager
 def nobody_listens(port: int) -> Iterator[None]:
-    """Keep a port that has just been left from being given to anybody else; it may be listened on again meanwhile."""
+    """Keep a port that has just been left from being given to anybody else; it may be listened on
+    again meanwhile."""
     with socket.socket() as placeholder:
         placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         placeholder.bind(("127.0.0.1", port))

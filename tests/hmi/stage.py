@@ -1,4 +1,5 @@
-"""A mission for tests and measurements: the real engine and narrator, with actions that follow a script instead of nodes."""
+"""A mission for tests and measurements: the real engine and narrator, with actions that follow a
+script instead of nodes."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import (
+from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
     ArmTimer,
@@ -41,14 +42,14 @@ from coordinator.engine import (
     StopConfirmed,
     TimerFired,
 )
-from coordinator.hmi.feed import Feed
-from coordinator.hmi.narrator import Narrator
-from coordinator.record.journal import JournalWriter
-from coordinator.record.recording import JournalStore
-from coordinator.record.runfolder import JOURNAL, header
-from coordinator.task import Executed, Status, Task
-from coordinator.taskfile import TaskFileError, loads
-from services.comm.notice import Progress
+from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.hmi.narrator import Narrator
+from petrobot.coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.record.runfolder import JOURNAL, header
+from petrobot.coordinator.task import Executed, Status, Task
+from petrobot.coordinator.taskfile import TaskFileError, loads
+from petrobot.services.comm.notice import Progress
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 BEAT_S = 0.02
@@ -89,8 +90,9 @@ class Controls:
 class Stage:
     """A mission port (coordinator.hmi.port.MissionPort) that plays tasks of a folder.
 
-    `script` gives the parts of each action, the last repeating; `where` the node of each action. Time goes on in steps
-    of `BEAT_S`, driven by the loop's clock, so that a pause really stops every run.
+    `script` gives the parts of each action, the last repeating; `where` the node of each action.
+    Time goes on in steps of `BEAT_S`, driven by the loop's clock, so that a pause really stops
+    every run.
     """
 
     def __init__(
@@ -119,11 +121,15 @@ class Stage:
         self._over = True
         self._notes: list[str] = []
         self.on_beat: list[Callable[[float], None]] = []
-        self.kept: set[str] = set()  # actions whose runs go on until the test takes them out of here
-        nodes = {node: {"state": "up", "round_trip": 0.0004} for node in sorted(set(where.values()))}
+        self.kept: set[str] = (
+            set()
+        )  # actions whose runs go on until the test takes them out of here
+        nodes = {
+            node: {"state": "up", "round_trip": 0.0004} for node in sorted(set(where.values()))
+        }
         self.feed.replace(nodes=nodes)
 
-    # --- the port --------------------------------------------------------------------------------------------------
+    # --- the port -----------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
         """The state now."""
@@ -142,9 +148,17 @@ class Stage:
         return answer
 
     def offers(self) -> list[dict[str, Any]]:
-        """What the nodes offer: one alternative for each primitive task of the same name, or `task__alternative`."""
+        """What the nodes offer: one alternative for each primitive task of the same name, or
+        `task__alternative`."""
         return [
-            {"action": a, "primitive_task": a.partition("__")[0], "node": n, "device": "", "args": {}, "up": True}
+            {
+                "action": a,
+                "primitive_task": a.partition("__")[0],
+                "node": n,
+                "device": "",
+                "args": {},
+                "up": True,
+            }
             for a, n in sorted(self.where.items())
         ]
 
@@ -156,11 +170,15 @@ class Stage:
         if self._writer is not None:
             self._writer.close()
 
-    # --- commands --------------------------------------------------------------------------------------------------
+    # --- commands -----------------------------------------------------------------------------
 
     async def _take_controls(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
         if self.controls.holder not in (None, who):
-            return {"ok": False, "code": "held", "text": f"{self.controls.holder} holds the controls"}
+            return {
+                "ok": False,
+                "code": "held",
+                "text": f"{self.controls.holder} holds the controls",
+            }
         self.controls.holder = who
         self.controls.asking = [name for name in self.controls.asking if name != who]
         return self._tell_controls()
@@ -172,8 +190,12 @@ class Stage:
 
     async def _release_controls(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
         if self.controls.holder == who:
-            self.controls.holder = data.get("to") if data.get("to") in self.controls.asking else None
-            self.controls.asking = [name for name in self.controls.asking if name != self.controls.holder]
+            self.controls.holder = (
+                data.get("to") if data.get("to") in self.controls.asking else None
+            )
+            self.controls.asking = [
+                name for name in self.controls.asking if name != self.controls.holder
+            ]
         return self._tell_controls()
 
     def _tell_controls(self) -> dict[str, Any]:
@@ -195,7 +217,10 @@ class Stage:
         return {"ok": True}
 
     async def _pause(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
-        return {**self._order(Pause("")), "nodes": dict((self.feed.state["paused"] or {}).get("nodes", {}))}
+        return {
+            **self._order(Pause("")),
+            "nodes": dict((self.feed.state["paused"] or {}).get("nodes", {})),
+        }
 
     async def _resume(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
         return self._order(Resume())
@@ -209,12 +234,20 @@ class Stage:
     async def _estop(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
         if not self._over:
             self._order(Abort("emergency stop"))
-        self.feed.emit("mission", time=self.clock, mission={"state": "stopped", "reason": f"emergency stop by {who}"})
+        self.feed.emit(
+            "mission",
+            time=self.clock,
+            mission={"state": "stopped", "reason": f"emergency stop by {who}"},
+        )
         return {"ok": True}
 
     async def _breakpoint(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
         name = str(data["element"]).partition(".")[2]
-        names = set(self.state.breakpoints) | {name} if data["on"] else set(self.state.breakpoints) - {name}
+        names = (
+            set(self.state.breakpoints) | {name}
+            if data["on"]
+            else set(self.state.breakpoints) - {name}
+        )
         return self._order(SetBreakpoints(tuple(sorted(names))))
 
     async def _add_tokens(self, who: str, data: Mapping[str, Any]) -> dict[str, Any]:
@@ -238,7 +271,7 @@ class Stage:
         self.feed.emit("selector", time=self.clock, name=name, selector=selector)
         return {"ok": True}
 
-    # --- the machine -----------------------------------------------------------------------------------------------
+    # --- the machine --------------------------------------------------------------------------
 
     def load(self, task: Task, text: str = "") -> None:
         """Stand ready to run a task."""
@@ -249,10 +282,18 @@ class Stage:
         self.state = self.engine.initial()
         self.narrator = Narrator(self.feed, task, self.where)
         selectors = {
-            name: {"alternatives": [{"action": a, "probability": 1 / len(p.alternatives)} for a in p.alternatives]}
+            name: {
+                "alternatives": [
+                    {"action": a, "probability": 1 / len(p.alternatives)} for a in p.alternatives
+                ]
+            }
             for name, p in task.primitive_tasks.items()
         }
-        kept = {"nodes": self.feed.state["nodes"], "controls": self.controls.plain(), "selectors": selectors}
+        kept = {
+            "nodes": self.feed.state["nodes"],
+            "controls": self.controls.plain(),
+            "selectors": selectors,
+        }
         mission = f"{task.name}-{self._missions}"
         self.narrator.begin(mission, "realtime", **kept)
         if self.runs_folder is not None and text:
@@ -307,7 +348,13 @@ class Stage:
                     self._playing[run].held = False
             case Choose(key, of=of, alternatives=alternatives):
                 chosen = self._overrides.get(of, alternatives[0])
-                return [Chosen(key, chosen, "operator" if of in self._overrides else "first of the task file")]
+                return [
+                    Chosen(
+                        key,
+                        chosen,
+                        "operator" if of in self._overrides else "first of the task file",
+                    )
+                ]
             case ArmTimer(key, seconds=seconds):
                 self._timers[key] = self.clock + seconds
             case DisarmTimer(key):
@@ -355,7 +402,17 @@ class Stage:
                 continue
             del self._playing[run]
             part = playing.part
-            self._stimulate(RunEnded(run, part.status, part.cause, part.text, part.executed, part.values, part.seconds))
+            self._stimulate(
+                RunEnded(
+                    run,
+                    part.status,
+                    part.cause,
+                    part.text,
+                    part.executed,
+                    part.values,
+                    part.seconds,
+                )
+            )
         for key in [k for k, due in self._timers.items() if due <= self.clock]:
             del self._timers[key]
             self._stimulate(TimerFired(key))

@@ -1,4 +1,5 @@
-"""Steps that a person takes on the page in a real browser, by role and name: open it, take the controls, draw, start."""
+"""Steps that a person takes on the page in a real browser, by role and name: open it, take the
+controls, draw, start."""
 
 from __future__ import annotations
 
@@ -7,22 +8,24 @@ import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final, Literal
 
-from playwright.async_api import Browser, Locator, Route, expect
+from playwright.async_api import Browser, Locator, Route, ViewportSize, expect
 from playwright.async_api import Page as Tab
 
-from coordinator.hmi.server import Page
+from petrobot.coordinator.hmi.server import Page
 from tests.hmi.conftest import PATIENCE_MS, note_toasts
 
 Watch = Callable[[Any], list[str]]
-SIZE = {"width": 1440, "height": 900}
+SIZE: Final[ViewportSize] = {"width": 1440, "height": 900}
 expect.set_options(timeout=PATIENCE_MS)
 
 
-async def opened(browser: Browser, page: Page, theme: str = "light") -> Tab:
+async def opened(browser: Browser, page: Page, theme: Literal["light", "dark"] = "light") -> Tab:
     """A new window on the page, as a new person would open it."""
-    context = await browser.new_context(viewport=SIZE, color_scheme=theme, reduced_motion="no-preference")  # type: ignore[arg-type]
+    context = await browser.new_context(
+        viewport=SIZE, color_scheme=theme, reduced_motion="no-preference"
+    )
     context.set_default_timeout(PATIENCE_MS)
     tab = await context.new_page()
     await tab.goto(page.url)
@@ -37,7 +40,8 @@ async def settled(tab: Tab) -> None:
 
 
 async def checked(tab: Tab, said: str = "May run") -> None:
-    """The server has checked what is drawn now, and says so; before, the list says what was found in what was drawn then."""
+    """The server has checked what is drawn now, and says so; before, the list says what was found
+    in what was drawn then."""
     findings = tab.get_by_role("region", name="Findings")
     await expect(findings).not_to_have_attribute("aria-busy", "true")
     await expect(findings).to_contain_text(said)
@@ -72,7 +76,11 @@ async def rename(tab: Tab, name: str) -> None:
 
 async def draw_transition(tab: Tab, name: str, x: float, y: float) -> None:
     """Put a transition on the drawing and give it its name."""
-    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Transition").click()
+    await (
+        tab.get_by_role("toolbar", name="Drawing tools")
+        .get_by_role("button", name="Transition")
+        .click()
+    )
     await click_canvas(tab, x, y)
     await rename(tab, name)
     await expect(element(tab, f"^Transition {name}")).to_be_visible()
@@ -80,12 +88,18 @@ async def draw_transition(tab: Tab, name: str, x: float, y: float) -> None:
 
 async def draw_arcs(tab: Tab, *chains: str) -> None:
     """Draw arcs along chains such as `a > t > b`, choosing one element after the other."""
-    await tab.get_by_role("toolbar", name="Drawing tools").get_by_role("button", name="Arc", exact=True).click()
+    await (
+        tab.get_by_role("toolbar", name="Drawing tools")
+        .get_by_role("button", name="Arc", exact=True)
+        .click()
+    )
     for chain in chains:
         names = [name.strip() for name in chain.split(">")]
         for start, end in pairwise(names):
             for name in (start, end):
-                await element(tab, f"^(Action place|Resource place|Control place|Transition) {name}\\b").click()
+                await element(
+                    tab, f"^(Action place|Resource place|Control place|Transition) {name}\\b"
+                ).click()
     await tab.keyboard.press("Escape")
 
 
@@ -99,7 +113,9 @@ async def choose_task(tab: Tab, place: str, primitive: str) -> None:
 async def hold_controls(tab: Tab) -> None:
     """Take the controls, and wait until one holds them."""
     await tab.get_by_role("button", name="Take controls").click()
-    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text("You hold the controls")
+    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text(
+        "You hold the controls"
+    )
 
 
 async def take_controls(tab: Tab) -> None:
@@ -116,18 +132,23 @@ async def draw_the_task(tab: Tab) -> None:
     await draw_transition(tab, "begin", 0.2, 0.3)
     for i, name in enumerate(("looking", "picking", "putting")):
         await draw_place(tab, "Action place", name, 0.32 + 0.26 * i, 0.3)
-        await draw_transition(tab, f"{name}_done", 0.45 + 0.26 * i if i < 2 else 0.84, 0.3 if i < 2 else 0.6)
+        await draw_transition(
+            tab, f"{name}_done", 0.45 + 0.26 * i if i < 2 else 0.84, 0.3 if i < 2 else 0.6
+        )
     await draw_place(tab, "Resource place", "arm_free", 0.08, 0.6)
     for place, primitive in (("looking", "look"), ("picking", "pick"), ("putting", "put")):
         await choose_task(tab, place, primitive)
     await draw_arcs(
         tab,
-        "jobs > begin > looking > looking_done > picking > picking_done > putting > putting_done > arm_free > begin",
+        "jobs > begin > looking > looking_done > picking > picking_done > putting > "
+        "putting_done > arm_free > begin",
     )
     for place in ("looking", "picking", "putting"):
         await element(tab, f"^Action place {place}").click()
         await tab.get_by_role("button", name="Add error branch").click()
-    await draw_arcs(tab, *(f"{place}_error > arm_free" for place in ("looking", "picking", "putting")))
+    await draw_arcs(
+        tab, *(f"{place}_error > arm_free" for place in ("looking", "picking", "putting"))
+    )
     await element(tab, "^Control place jobs").click()
     properties = tab.get_by_role("complementary", name="Properties")
     await properties.get_by_label("Tokens at the start").fill("2")

@@ -1,4 +1,5 @@
-"""Further attacks: names that climb, bodies and frames that are no text, replays, secrets in headers, and what nobody may say."""
+"""Further attacks: names that climb, bodies and frames that are no text, replays, secrets in
+headers, and what nobody may say."""
 
 from __future__ import annotations
 
@@ -14,10 +15,10 @@ import aiohttp
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi.doors import HEADERS
-from coordinator.hmi.journals import JournalHistory
-from coordinator.hmi.port import VERBS
-from coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.hmi.doors import HEADERS
+from petrobot.coordinator.hmi.journals import JournalHistory
+from petrobot.coordinator.hmi.port import VERBS
+from petrobot.coordinator.hmi.server import Page, start_page
 from tests.hmi.stage import Stage
 from tests.hmi.test_doors import ask, base, bearer, port_of
 from tests.hmi.test_protocol import joined
@@ -73,12 +74,23 @@ async def cell(tmp_path: Path) -> AsyncIterator[tuple[Simulated, Page]]:
 
 
 @pytest.mark.parametrize("name", CLIMBING)
-async def test_names_of_documents_and_journals_do_not_climb(cell: tuple[Simulated, Page], name: str) -> None:
-    """Neither a run, nor a task, nor a form, nor an export outside its folder; and nothing is written anywhere."""
+async def test_names_of_documents_and_journals_do_not_climb(
+    cell: tuple[Simulated, Page], name: str
+) -> None:
+    """Neither a run, nor a task, nor a form, nor an export outside its folder; and nothing is
+    written anywhere."""
     made, page = cell
     before = sorted(made.folder.rglob("*"))
-    for path in (f"/api/runs/{name}", f"/api/start/{name}", f"/api/tasks/{name}", f"/api/tasks/{name}/export/toml"):
-        head = f"GET {path} HTTP/1.1\nHost: 127.0.0.1:{port_of(page)}\nAuthorization: Bearer {page.token}\nConnection: close"
+    for path in (
+        f"/api/runs/{name}",
+        f"/api/start/{name}",
+        f"/api/tasks/{name}",
+        f"/api/tasks/{name}/export/toml",
+    ):
+        head = (
+            f"GET {path} HTTP/1.1\nHost: 127.0.0.1:{port_of(page)}\nAuthorization: Bearer "
+            f"{page.token}\nConnection: close"
+        )
         answer = await raw(page, head)
         assert answer.split()[1] in (b"400", b"404"), (path, answer[:80])
         assert b"not for you" not in answer and b"<script" not in answer.partition(b"\r\n\r\n")[0]
@@ -86,12 +98,21 @@ async def test_names_of_documents_and_journals_do_not_climb(cell: tuple[Simulate
 
 
 @pytest.mark.parametrize(
-    "run", ["../secret", "secret", "..", "/", "", "\x00", "../runs/../secret", "x" * 3_000, "\ud800"]
+    "run",
+    ["../secret", "secret", "..", "/", "", "\x00", "../runs/../secret", "x" * 3_000, "\ud800"],
 )
-async def test_a_start_from_a_run_elsewhere_is_refused(cell: tuple[Simulated, Page], run: str) -> None:
+async def test_a_start_from_a_run_elsewhere_is_refused(
+    cell: tuple[Simulated, Page], run: str
+) -> None:
     """`from` names a run of this coordinator's folder and nothing else."""
     made, page = cell
-    await ask(page, "/api/command", "POST", headers=bearer(page), json={"verb": "take_controls", "name": "x"})
+    await ask(
+        page,
+        "/api/command",
+        "POST",
+        headers=bearer(page),
+        json={"verb": "take_controls", "name": "x"},
+    )
     order = {"verb": "start", "name": "x", "data": {"from": {"run": run, "record": 0}}}
     body = io.BytesIO(json.dumps(order).encode())
     headers = {**bearer(page), "Content-Type": "application/json"}
@@ -113,10 +134,18 @@ STRANGE: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("data", STRANGE)
-async def test_strange_orders_are_answered_briefly(cell: tuple[Simulated, Page], data: dict[str, Any]) -> None:
+async def test_strange_orders_are_answered_briefly(
+    cell: tuple[Simulated, Page], data: dict[str, Any]
+) -> None:
     """What is no order is refused in a few words, whatever it holds, and leaves nothing behind."""
     made, page = cell
-    await ask(page, "/api/command", "POST", headers=bearer(page), json={"verb": "take_controls", "name": "x"})
+    await ask(
+        page,
+        "/api/command",
+        "POST",
+        headers=bearer(page),
+        json={"verb": "take_controls", "name": "x"},
+    )
     headers = {**bearer(page), "Content-Type": "application/json"}
     body = json.dumps({"verb": "start", "name": "x", "data": data}).encode()
     async with (
@@ -135,23 +164,34 @@ async def test_deep_data_is_refused_or_ignored(page: Page, depth: int) -> None:
     deep = "[" * depth + "]" * depth
     headers = {**bearer(page), "Content-Type": "application/json"}
     body = io.BytesIO(f'{{"verb": "pause", "name": "x", "data": {{"deep": {deep}}}}}'.encode())
-    assert (await ask(page, "/api/command", "POST", headers=headers, data=body)).status in (400, 409)
+    assert (await ask(page, "/api/command", "POST", headers=headers, data=body)).status in (
+        400,
+        409,
+    )
     async with joined(page) as client:
         await client.until(lambda s: True)
-        await client.socket.send_str(f'{{"type": "command", "id": 1, "verb": "pause", "data": {{"deep": {deep}}}}}')
+        await client.socket.send_str(
+            f'{{"type": "command", "id": 1, "verb": "pause", "data": {{"deep": {deep}}}}}'
+        )
         async with asyncio.timeout(60):
             while not client.answers and not client.socket.closed:
                 message = await client.socket.receive()
-                if message.type is aiohttp.WSMsgType.TEXT and json.loads(message.data)["type"] == "answer":
+                if (
+                    message.type is aiohttp.WSMsgType.TEXT
+                    and json.loads(message.data)["type"] == "answer"
+                ):
                     break
     assert (await ask(page, "/api/snapshot", headers=bearer(page))).status == 200
 
 
 async def test_a_compressed_body_may_not_swell(page: Page) -> None:
-    """A hundred megabytes of nothing, sent as a hundred kilobytes, are given up at the bound of any body."""
+    """A hundred megabytes of nothing, sent as a hundred kilobytes, are given up at the bound of any
+    body."""
     bomb = gzip.compress(b'{"a": "' + b" " * 100_000_000 + b'"}', 1)
     headers = {**bearer(page), "Content-Type": "application/json", "Content-Encoding": "gzip"}
-    assert (await ask(page, "/api/command", "POST", headers=headers, data=io.BytesIO(bomb))).status in (400, 413)
+    assert (
+        await ask(page, "/api/command", "POST", headers=headers, data=io.BytesIO(bomb))
+    ).status in (400, 413)
 
 
 NO_TEXT = [b"\x00\x01", b"{}", b"\xff" * 1_000, b""]
@@ -188,7 +228,9 @@ async def test_binary_frames_end_their_connection_alone(page: Page, frame: bytes
         3,
     ],
 )
-async def test_only_the_verbs_of_the_protocol_are_commands(page: Page, stage: Stage, verb: Any) -> None:
+async def test_only_the_verbs_of_the_protocol_are_commands(
+    page: Page, stage: Stage, verb: Any
+) -> None:
     """No method of the mission is reached by its name."""
     async with joined(page) as client:
         answer = await client.command(verb)
@@ -198,8 +240,14 @@ async def test_only_the_verbs_of_the_protocol_are_commands(page: Page, stage: St
 
 
 async def test_a_replayed_command_is_carried_out_once(page: Page, stage: Stage) -> None:
-    """The same frame again does nothing more, on its connection or, without the controls, on another."""
-    frame = {"type": "command", "id": 7, "verb": "add_tokens", "data": {"place": "parts", "count": 1}}
+    """The same frame again does nothing more, on its connection or, without the controls, on
+    another."""
+    frame = {
+        "type": "command",
+        "id": 7,
+        "verb": "add_tokens",
+        "data": {"place": "parts", "count": 1},
+    }
     async with joined(page) as ana, joined(page, "ana", "2") as thief:
         await ana.command("take_controls")
         assert (await ana.command("start"))["ok"]
@@ -210,7 +258,13 @@ async def test_a_replayed_command_is_carried_out_once(page: Page, stage: Stage) 
         async with asyncio.timeout(60):
             while ana.answers.get(7, {}).get("code") != "replayed":
                 await ana.hear()
-    assert sum(verb == "add_tokens" and who.endswith(ana.state["you"][-4:]) for who, verb, _ in stage.commands) == 1
+    assert (
+        sum(
+            verb == "add_tokens" and who.endswith(ana.state["you"][-4:])
+            for who, verb, _ in stage.commands
+        )
+        == 1
+    )
 
 
 async def test_a_name_alone_is_nobody(page: Page, stage: Stage) -> None:
@@ -223,9 +277,12 @@ async def test_a_name_alone_is_nobody(page: Page, stage: Stage) -> None:
 
 
 async def test_the_token_leaves_by_no_header(page: Page) -> None:
-    """No referrer is sent from any answer, the first redirect included; a token in a Referer opens nothing."""
+    """No referrer is sent from any answer, the first redirect included; a token in a Referer opens
+    nothing."""
     first = await ask(page, f"/?token={page.token}", allow_redirects=False)
-    assert first.headers["Referrer-Policy"] == "no-referrer" and page.token not in str(first.headers)
+    assert first.headers["Referrer-Policy"] == "no-referrer" and page.token not in str(
+        first.headers
+    )
     assert first.headers["Location"] == "/"
     headers = {"Referer": f"{base(page)}/?token={page.token}"}
     for path in ("/", "/api/snapshot", "/page/js/main.js"):
@@ -234,7 +291,8 @@ async def test_the_token_leaves_by_no_header(page: Page) -> None:
 
 @pytest.mark.parametrize("method", ["OPTIONS", "TRACE", "PUT", "DELETE", "PATCH", "PROPFIND"])
 async def test_no_other_site_is_ever_invited(page: Page, method: str) -> None:
-    """A preflight of another origin is refused, and no answer carries a word that would let it read."""
+    """A preflight of another origin is refused, and no answer carries a word that would let it
+    read."""
     headers = {"Origin": "http://evil.example", "Access-Control-Request-Method": "POST"}
     answer = await ask(page, "/api/command", method, cookie=True, headers=headers)
     assert answer.status in (400, 403, 405)
@@ -242,13 +300,17 @@ async def test_no_other_site_is_ever_invited(page: Page, method: str) -> None:
     assert {name: answer.headers.get(name) for name in HEADERS} == HEADERS
 
 
-@pytest.mark.parametrize("header", ["X-Forwarded-Host", "X-Host", "Forwarded", "X-Original-URL", "X-Rewrite-URL"])
+@pytest.mark.parametrize(
+    "header", ["X-Forwarded-Host", "X-Host", "Forwarded", "X-Original-URL", "X-Rewrite-URL"]
+)
 async def test_no_header_stands_in_for_the_host(page: Page, header: str) -> None:
     """What a proxy might say changes neither whom the server answers nor what."""
     good = f"127.0.0.1:{port_of(page)}"
     headers = {**bearer(page), "Host": "evil.example", header: good}
     assert (await ask(page, "/api/snapshot", headers=headers)).status == 421
-    assert (await ask(page, "/nowhere", headers={**bearer(page), header: "/api/snapshot"})).status == 404
+    assert (
+        await ask(page, "/nowhere", headers={**bearer(page), header: "/api/snapshot"})
+    ).status == 404
 
 
 @pytest.mark.parametrize(
@@ -266,7 +328,10 @@ async def test_no_header_stands_in_for_the_host(page: Page, header: str) -> None
 )
 async def test_requests_of_two_minds_are_refused(page: Page, stage: Stage, lines: str) -> None:
     """What two servers would read differently (request smuggling) is not read at all."""
-    head = f"POST /api/command HTTP/1.1\nHost: 127.0.0.1:{port_of(page)}\nAuthorization: Bearer {page.token}\n"
+    head = (
+        f"POST /api/command HTTP/1.1\nHost: 127.0.0.1:{port_of(page)}\nAuthorization: "
+        f"Bearer {page.token}\n"
+    )
     head += f"Content-Type: application/json\nConnection: close\n{lines}"
     answer = await raw(page, head, b'0\r\n\r\n{"verb": "estop"}')
     assert not answer or answer.split()[1] in (b"400", b"411", b"413", b"431")
@@ -282,5 +347,7 @@ async def test_the_token_counts_as_bearer_alone(page: Page, pass_as: str) -> Non
         "lower": {"Authorization": f"bearer {page.token}"},
     }.get(pass_as, {})
     path = f"/api/command?token={page.token}" if pass_as == "query" else "/api/command"
-    answer = await ask(page, path, "POST", headers=headers, json={"verb": "estop", "token": page.token})
+    answer = await ask(
+        page, path, "POST", headers=headers, json={"verb": "estop", "token": page.token}
+    )
     assert answer.status == 401

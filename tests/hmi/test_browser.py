@@ -1,4 +1,5 @@
-"""End to end in a real browser, by role and name: draw, run, pause, step, feed tokens, and find out why something failed."""
+"""End to end in a real browser, by role and name: draw, run, pause, step, feed tokens, and find out
+why something failed."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ import pytest
 import pytest_asyncio
 from hypothesis import Phase, given, settings
 
-from coordinator.hmi.changes import apply, empty_state
-from coordinator.hmi.server import Page, start_page
-from coordinator.hmi.sessions import Session
-from coordinator.task import Executed, Status
+from petrobot.coordinator.hmi.changes import apply, empty_state
+from petrobot.coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.hmi.sessions import Session
+from petrobot.coordinator.task import Executed, Status
 from tests.bench.hmi import SyntheticMission, ticking
 from tests.hmi.conftest import (
     PATIENCE_MS,
@@ -51,7 +52,10 @@ from tests.hmi.steps import (
     take_controls,
 )
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
+pytestmark = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.usefixtures("_windows_are_closed"),
+]
 
 
 @pytest_asyncio.fixture(loop_scope="module")
@@ -71,7 +75,8 @@ async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]
 async def test_a_new_user_draws_runs_and_understands(
     browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
 ) -> None:
-    """The whole way without the manual: three actions with an error branch, run, pause, step, a run more, and why it failed."""
+    """The whole way without the manual: three actions with an error branch, run, pause, step, a run
+    more, and why it failed."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     await tab.get_by_role("tab", name="Design").click()
@@ -102,7 +107,9 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     before = stage.state.firings
     stage.kept.clear()
     await toolbar.get_by_role("button", name="Step").click()
-    await expect(tab.get_by_role("region", name="Last firings").get_by_role("listitem")).to_have_count(before + 1)
+    await expect(
+        tab.get_by_role("region", name="Last firings").get_by_role("listitem")
+    ).to_have_count(before + 1)
     await expect(toolbar).to_contain_text("Paused after one firing")
     await expect(mission).to_contain_text("Paused")
     assert stage.state.firings == before + 1
@@ -112,15 +119,22 @@ async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
     await tab.screenshot(path=shots / "paused.png")
     await toolbar.get_by_role("button", name="Resume").click()
     await expect(mission).to_contain_text("Success")
-    why = tab.get_by_role("region", name="Last firings").get_by_role("listitem").filter(has_text="slipped")
+    why = (
+        tab.get_by_role("region", name="Last firings")
+        .get_by_role("listitem")
+        .filter(has_text="slipped")
+    )
     await expect(why).to_contain_text("pick on arm: the part slipped out of the gripper")
     await why.get_by_role("button").click()
-    await expect(tab.get_by_role("region", name="Selected")).to_contain_text("the part slipped out of the gripper")
+    await expect(tab.get_by_role("region", name="Selected")).to_contain_text(
+        "the part slipped out of the gripper"
+    )
     await tab.screenshot(path=shots / "why.png")
 
 
 async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
-    """One holds the controls, the other watches the same, asks, and is handed them; the stop key is everybody's."""
+    """One holds the controls, the other watches the same, asks, and is handed them; the stop key is
+    everybody's."""
     ana, ben = await opened(browser, page), await opened(browser, page)
     await start_mission(ana)
     await expect(ben.get_by_role("status", name="Mission state")).to_contain_text("Running")
@@ -135,11 +149,14 @@ async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None
     await ana.get_by_role("searchbox", name="Find a place or transition").focus()
     await ana.keyboard.press("F9")
     for tab in (ana, ben):
-        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Emergency stop")
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text(
+            "Emergency stop"
+        )
 
 
 async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: Stage) -> None:
-    """Raise an event, stop at a breakpoint set beforehand, choose the alternative, force a way out, abort."""
+    """Raise an event, stop at a breakpoint set beforehand, choose the alternative, force a way out,
+    abort."""
     stage.script["pick"].clear()
     stage.script["pick"].append(Part(0.3))
     stage.kept.update({"look__template", "pick", "put"})
@@ -151,7 +168,9 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
     await tab.get_by_label("Alternative for look").select_option("look__template")
     await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
     await element(tab, "^Transition begin", "Task net").click()
-    await expect(tab.get_by_role("region", name="Selected")).to_contain_text("waits for the event part there")
+    await expect(tab.get_by_role("region", name="Selected")).to_contain_text(
+        "waits for the event part there"
+    )
     await tab.get_by_role("button", name="Raise part there").click()
     running = tab.get_by_role("region", name="Running now")
     await expect(running).to_contain_text("look template")
@@ -172,7 +191,8 @@ async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: St
 async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
     browser: Browser, page: Page, stage: Stage
 ) -> None:
-    """Probabilities alter under an open list; a choice that is refused does not stand there as if it had been taken."""
+    """Probabilities alter under an open list; a choice that is refused does not stand there as if
+    it had been taken."""
     tab = await opened(browser, page)
     await hold_controls(tab)
     choose = tab.get_by_label("Alternative for look")
@@ -180,9 +200,19 @@ async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
     held = await choose.element_handle()
     known = stage.feed.state["selectors"]["look"]
     for share in (0.25, 0.75):
-        alternatives = [{**known["alternatives"][0], "probability": share}, *known["alternatives"][1:]]
-        stage.feed.emit("selector", time=stage.clock, name="look", selector={**known, "alternatives": alternatives})
-        await expect(tab.locator(".selector", has=choose)).to_contain_text(f"{round(100 * share)} %")
+        alternatives = [
+            {**known["alternatives"][0], "probability": share},
+            *known["alternatives"][1:],
+        ]
+        stage.feed.emit(
+            "selector",
+            time=stage.clock,
+            name="look",
+            selector={**known, "alternatives": alternatives},
+        )
+        await expect(tab.locator(".selector", has=choose)).to_contain_text(
+            f"{round(100 * share)} %"
+        )
     assert held is not None
     assert await held.evaluate("(list) => list === document.activeElement")
 
@@ -195,7 +225,9 @@ async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
     await expect(choose).to_have_value("")
 
 
-async def test_a_folded_error_branch_turns_red(browser: Browser, page: Page, stage: Stage, shots: Path) -> None:
+async def test_a_folded_error_branch_turns_red(
+    browser: Browser, page: Page, stage: Stage, shots: Path
+) -> None:
     """Error branches are hidden behind a badge until a token enters one; a press shows them."""
     stage.kept.add("clear")
     tab = await opened(browser, page, "dark")
@@ -214,14 +246,20 @@ async def test_a_folded_error_branch_turns_red(browser: Browser, page: Page, sta
 EVIL = "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>"
 
 
-async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page, stage: Stage, faults: Watch) -> None:
+async def test_script_in_names_and_reasons_is_text(
+    browser: Browser, page: Page, stage: Stage, faults: Watch
+) -> None:
     """Whatever a node, a task file or another operator calls things, the page shows it as text."""
     text = (stage.tasks / "pick_and_place.toml").read_text()
     quoted = EVIL.replace('"', '\\"')
     (stage.tasks / "evil.toml").write_text(
-        text.replace("x = 560\ny = 180", f'label = "{quoted}"\nx = 560\ny = 180').replace("The part lies", quoted)
+        text.replace("x = 560\ny = 180", f'label = "{quoted}"\nx = 560\ny = 180').replace(
+            "The part lies", quoted
+        )
     )
-    stage.script["pick"] = type(stage.script["pick"])([Part(0.2, Status.ERROR, "evil", EVIL, Executed.NO), Part(0.2)])
+    stage.script["pick"] = type(stage.script["pick"])(
+        [Part(0.2, Status.ERROR, "evil", EVIL, Executed.NO), Part(0.2)]
+    )
     stage.where["pick"] = EVIL
     tab = await opened(browser, page)
     complaints = faults(tab)
@@ -234,7 +272,9 @@ async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page,
     stage.happen("part_there")
     stage.feed.emit("variable", name=EVIL, value=EVIL)
     stage.feed.emit("notice", notice={"level": "error", "text": EVIL})
-    await expect(tab.get_by_role("region", name="Last firings")).to_contain_text("<img src=x onerror=")
+    await expect(tab.get_by_role("region", name="Last firings")).to_contain_text(
+        "<img src=x onerror="
+    )
     await tab.get_by_role("tab", name="Variables").click()
     await expect(tab.get_by_role("tabpanel", name="Variables")).to_contain_text("<script>")
     await tab.get_by_role("tab", name="Design").click()
@@ -250,7 +290,8 @@ async def test_script_in_names_and_reasons_is_text(browser: Browser, page: Page,
 async def test_a_lost_connection_is_plain_to_see(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """When the coordinator goes away without a word the page says so at once, and it catches up when it is back."""
+    """When the coordinator goes away without a word the page says so at once, and it catches up
+    when it is back."""
 
     async def vanish(session: Session) -> None:
         """Say no goodbye."""
@@ -278,7 +319,10 @@ async def labels_are_clear_of_each_other(tab: Tab) -> None:
     boxes = [box for label in labels if (box := await label.bounding_box())]
     assert picture is not None and len(boxes) == 3
     for box in boxes:
-        assert box["x"] >= picture["x"] - 1 and box["x"] + box["width"] <= picture["x"] + picture["width"] + 1
+        assert (
+            box["x"] >= picture["x"] - 1
+            and box["x"] + box["width"] <= picture["x"] + picture["width"] + 1
+        )
     for i, a in enumerate(boxes):
         for b in boxes[i + 1 :]:
             beside = a["x"] + a["width"] <= b["x"] + 1 or b["x"] + b["width"] <= a["x"] + 1
@@ -286,8 +330,11 @@ async def labels_are_clear_of_each_other(tab: Tab) -> None:
             assert beside or above
 
 
-async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch) -> None:
-    """Camera with detections, devices, set-point latency, learning curves, events, variables; on a wall screen too."""
+async def test_details(
+    browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
+) -> None:
+    """Camera with detections, devices, set-point latency, learning curves, events, variables; on a
+    wall screen too."""
     tab = await opened(browser, page, "dark")
     complaints = faults(tab)
     await start_mission(tab)
@@ -298,14 +345,29 @@ async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, 
         {"kind": "circle", "x": 628, "y": 180, "r": 10, "label": "ball"},
         {"kind": "point", "role": "predicted", "x": 634, "y": 186, "label": "predicted exit"},
     ]
-    image = {"mime": "image/png", "data": pixel, "width": 640, "height": 360, "age": 0.02, "detections": seen}
+    image = {
+        "mime": "image/png",
+        "data": pixel,
+        "width": 640,
+        "height": 360,
+        "age": 0.02,
+        "detections": seen,
+    }
     stage.feed.emit("image", name="table", image=image)
     stage.feed.emit(
-        "device", name="arm", device={"state": "enabled", "joints": [0.1, -1.2, 0.5], "values": {"load": 0.3}}
+        "device",
+        name="arm",
+        device={"state": "enabled", "joints": [0.1, -1.2, 0.5], "values": {"load": 0.3}},
     )
-    stage.feed.emit("setpoint", stream="point", samples=[[i / 10, 0.01 + i / 1e4] for i in range(60)])
+    stage.feed.emit(
+        "setpoint", stream="point", samples=[[i / 10, 0.01 + i / 1e4] for i in range(60)]
+    )
     curve = {"kind": "curve", "title": "Choice", "x": "runs", "y": "p", "series": ["a", "b"]}
-    stage.feed.emit("report", name="c", report={**curve, "columns": [[1, 2, 3], [0.5, 0.6, 0.7], [0.5, 0.4, 0.3]]})
+    stage.feed.emit(
+        "report",
+        name="c",
+        report={**curve, "columns": [[1, 2, 3], [0.5, 0.6, 0.7], [0.5, 0.4, 0.3]]},
+    )
     await tab.get_by_role("tab", name="Camera").click()
     await expect(tab.get_by_role("img", name="Image of table")).to_be_visible()
     await expect(tab.get_by_role("tabpanel", name="Camera")).to_contain_text("20 ms old")
@@ -314,7 +376,9 @@ async def test_details(browser: Browser, page: Page, stage: Stage, shots: Path, 
     await tab.get_by_role("tab", name="Devices").click()
     await expect(tab.get_by_role("tabpanel", name="Devices")).to_contain_text("enabled")
     await tab.get_by_role("tab", name="Set points").click()
-    await expect(tab.get_by_role("figure", name="Age of the newest set point").locator("canvas")).to_be_visible()
+    await expect(
+        tab.get_by_role("figure", name="Age of the newest set point").locator("canvas")
+    ).to_be_visible()
     await tab.get_by_role("tab", name="Learning").click()
     await expect(tab.get_by_role("figure", name="Choice").locator("canvas")).to_be_visible()
     await tab.get_by_role("tab", name="Events").click()
@@ -333,18 +397,27 @@ def mission_of(stage: Stage) -> tuple[str, str]:
     return mission["id"], mission["state"]
 
 
-async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch) -> None:
-    """Scrub a finished run forwards and backwards, jump to its error, compare it with another, start one from a point."""
+async def test_history(
+    browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
+) -> None:
+    """Scrub a finished run forwards and backwards, jump to its error, compare it with another,
+    start one from a point."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     stage.on_beat.append(
-        lambda _: None if stage.feed.state["events"]["part_there"]["armed"] else stage.happen("part_there")
+        lambda _: (
+            None
+            if stage.feed.state["events"]["part_there"]["armed"]
+            else stage.happen("part_there")
+        )
     )
     await hold_controls(tab)
     for run in ("pick_and_place-2", "pick_and_place-3"):
         await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
         await until(lambda run=run: mission_of(stage) == (run, "success"))  # type: ignore[misc]
-        await expect(tab.locator("html")).to_have_attribute("data-sequence", str(stage.feed.state["sequence"]))
+        await expect(tab.locator("html")).to_have_attribute(
+            "data-sequence", str(stage.feed.state["sequence"])
+        )
         await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Success")
     await tab.get_by_role("tab", name="History").click()
     runs = tab.get_by_role("navigation", name="Runs")
@@ -362,7 +435,9 @@ async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, 
     await scrub.get_by_role("button", name="Last record").click()
     await expect(element(tab, "^Control place parts, 0 tokens", net)).to_be_visible()
     await runs.get_by_role("button", name="Compare with pick_and_place-3").click()
-    await expect(tab.get_by_role("status").filter(has_text="differ from firing 3")).to_contain_text("pick failed here")
+    await expect(tab.get_by_role("status").filter(has_text="differ from firing 3")).to_contain_text(
+        "pick failed here"
+    )
     await scrub.get_by_role("button", name="Previous error").click()
     await tab.screenshot(path=shots / "history.png")
     await scrub.get_by_role("button", name="Simulate from here").click()
@@ -376,8 +451,11 @@ async def test_history(browser: Browser, page: Page, stage: Stage, shots: Path, 
     assert complaints == []
 
 
-async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(browser: Browser, page: Page, stage: Stage) -> None:
-    """Between press and release offers, findings and tokens come in: the form under the pointer waits, and the press counts."""
+async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Between press and release offers, findings and tokens come in: the form under the pointer
+    waits, and the press counts."""
     tab = await designer(browser, page)
     await element(tab, "^Transition pick_failed").click()
     await tab.keyboard.press("Delete")
@@ -401,7 +479,8 @@ async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(browser: Browser, 
 
 
 async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, page: Page) -> None:
-    """The two copies of the rules, in Python and in the page, lead to one state on random runs of changes."""
+    """The two copies of the rules, in Python and in the page, lead to one state on random runs of
+    changes."""
     tab = await opened(browser, page)
     script = """async ([state, changes]) => {
       const { apply } = await import("/page/js/state.js");
@@ -428,8 +507,11 @@ def some_changes() -> list[list[dict[str, Any]]]:
     return found
 
 
-async def test_fifty_updates_a_second_leave_no_gap(browser: Browser, page: Page, stage: Stage) -> None:
-    """A hundred nodes under steady fire: every number arrives, merged deltas only, and the page ends at the newest."""
+async def test_fifty_updates_a_second_leave_no_gap(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """A hundred nodes under steady fire: every number arrives, merged deltas only, and the page
+    ends at the newest."""
     tab = await opened(browser, page)
     mission = SyntheticMission(100)
     stage.feed.replace(**{k: v for k, v in mission.snapshot().items() if k != "sequence"})
@@ -437,15 +519,20 @@ async def test_fifty_updates_a_second_leave_no_gap(browser: Browser, page: Page,
     mission.feed = stage.feed
     await ticking(mission, 2.0)
     async with asyncio.timeout(PATIENCE_MS / 1000):
-        while await tab.evaluate("petrobot.link.deltas") <= 10:  # a starved browser gets them in few heaps
+        while (
+            await tab.evaluate("petrobot.link.deltas") <= 10
+        ):  # a starved browser gets them in few heaps
             await ticking(mission, 0.5)
     last = str(stage.feed.state["sequence"])
     await expect(tab.locator("html")).to_have_attribute("data-sequence", last)
     assert await tab.evaluate("petrobot.link.gaps") == 0
 
 
-async def test_the_stop_is_within_reach_of_every_dialog(browser: Browser, page: Page, stage: Stage) -> None:
-    """Whatever is asked, the emergency stop can be pressed, and Escape closes the question without an answer."""
+async def test_the_stop_is_within_reach_of_every_dialog(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Whatever is asked, the emergency stop can be pressed, and Escape closes the question without
+    an answer."""
     tab = await designer(browser, page)
     await tab.get_by_role("button", name="Keyboard").click()
     dialog = tab.get_by_role("dialog", name="Keyboard")

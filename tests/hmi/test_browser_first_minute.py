@@ -1,4 +1,5 @@
-"""The first minute on the page, where a slip costs trust: run what was drawn, draw arcs, fill in a form, answer a question."""
+"""The first minute on the page, where a slip costs trust: run what was drawn, draw arcs, fill in a
+form, answer a question."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.hmi.server import Page, start_page
 from tests.hmi.conftest import browser_missing, served, staged, toasted
 from tests.hmi.stage import Stage
 from tests.station.test_starting import Simulated
@@ -23,7 +24,10 @@ from playwright.async_api import Page as Tab
 
 from tests.hmi.steps import checked, designer, element, hold_controls, opened, settled
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
+pytestmark = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.usefixtures("_windows_are_closed"),
+]
 
 CORNERS = """\
 schema = 1
@@ -68,7 +72,9 @@ async def cell(tmp_path: Path) -> AsyncIterator[Simulated]:
 @pytest_asyncio.fixture(loop_scope="module")
 async def own_page(cell: Simulated) -> AsyncIterator[Page]:
     """Its page."""
-    made = await start_page(cell.station, tasks_folder=cell.folder / "tasks", starts=cell.station.form)
+    made = await start_page(
+        cell.station, tasks_folder=cell.folder / "tasks", starts=cell.station.form
+    )
     yield made
     await made.close()
 
@@ -83,18 +89,26 @@ async def on_the_desk(browser: Browser, page: Page, task: str) -> Tab:
     return tab
 
 
-# ---- run ----------------------------------------------------------------------------------------------------------------
+# ---- run
+# ----------------------------------------------------------------------------------------------------------------
 
 
-async def test_run_this_task_takes_free_controls(browser: Browser, page: Page, stage: Stage) -> None:
+async def test_run_this_task_takes_free_controls(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
     tab = await designer(browser, page)
     await tab.get_by_role("button", name="Run this task").click()
     await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
-    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text("You hold the controls")
+    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text(
+        "You hold the controls"
+    )
 
 
-async def test_what_is_run_from_the_designer_is_seen_whole(browser: Browser, own_page: Page, cell: Simulated) -> None:
-    """Live was not shown while its task was drawn: it is fitted when it is shown, with nothing under the bar or cut off."""
+async def test_what_is_run_from_the_designer_is_seen_whole(
+    browser: Browser, own_page: Page, cell: Simulated
+) -> None:
+    """Live was not shown while its task was drawn: it is fitted when it is shown, with nothing
+    under the bar or cut off."""
     tab = await opened(browser, own_page)
     await tab.get_by_role("tab", name="Design").click()
     await settled(tab)
@@ -102,11 +116,16 @@ async def test_what_is_run_from_the_designer_is_seen_whole(browser: Browser, own
     assert (await cell.station.command("ana", "load", {"task": "moving"}))["ok"]
     await tab.get_by_role("tab", name="Live").click()
     await expect(element(tab, "^Control place jobs", "Task net")).to_be_visible()
-    fits = "() => { const { view } = petrobot.tabs.Live; return view.view === view.fitted && view.view.x !== 0; }"
+    fits = (
+        "() => { const { view } = petrobot.tabs.Live; return view.view === view.fitted && "
+        "view.view.x !== 0; }"
+    )
     await tab.wait_for_function(fits)
 
 
-async def test_run_this_task_says_who_holds_the_controls(browser: Browser, page: Page, stage: Stage) -> None:
+async def test_run_this_task_says_who_holds_the_controls(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
     await stage.command("ana", "take_controls", {})
     tab = await designer(browser, page)
     await tab.get_by_role("button", name="Run this task").click()
@@ -115,7 +134,8 @@ async def test_run_this_task_says_who_holds_the_controls(browser: Browser, page:
     assert stage.feed.state["mission"]["state"] == "idle"
 
 
-# ---- arcs ---------------------------------------------------------------------------------------------------------------
+# ---- arcs
+# ---------------------------------------------------------------------------------------------------------------
 
 
 async def centre(tab: Tab, name: str) -> tuple[float, float]:
@@ -130,11 +150,15 @@ DRAWN = """() => Object.entries(petrobot.tabs.Design.model.data.transitions).fla
 
 
 @pytest.mark.parametrize("key", ["a", "i"])
-async def test_an_arc_goes_from_where_the_drag_began_to_where_it_ended(browser: Browser, page: Page, key: str) -> None:
+async def test_an_arc_goes_from_where_the_drag_began_to_where_it_ended(
+    browser: Browser, page: Page, key: str
+) -> None:
     """Whatever is selected when the tool is taken: every selection, every pair."""
     tab = await on_the_desk(browser, page, "corners")
     at = {name: await centre(tab, name) for name in NAMES}
-    pairs = [(a, b) for a, b in product(NAMES, NAMES) if a[0] != b[0] and (key == "a" or a[0] == "p")]
+    pairs = [
+        (a, b) for a, b in product(NAMES, NAMES) if a[0] != b[0] and (key == "a" or a[0] == "p")
+    ]
     wrong = []
     for selected, (start, end) in product(NAMES, pairs):
         await tab.keyboard.press("v")
@@ -152,8 +176,11 @@ async def test_an_arc_goes_from_where_the_drag_began_to_where_it_ended(browser: 
     assert wrong == []
 
 
-async def test_arcs_by_choosing_one_after_the_other_go_on_as_ever(browser: Browser, page: Page) -> None:
-    """From the selected element with a key, or with two presses; Escape in the middle of a drag draws nothing."""
+async def test_arcs_by_choosing_one_after_the_other_go_on_as_ever(
+    browser: Browser, page: Page
+) -> None:
+    """From the selected element with a key, or with two presses; Escape in the middle of a drag
+    draws nothing."""
     tab = await on_the_desk(browser, page, "corners")
     at = {name: await centre(tab, name) for name in NAMES}
     await tab.mouse.click(*at["p1"])
@@ -171,7 +198,8 @@ async def test_arcs_by_choosing_one_after_the_other_go_on_as_ever(browser: Brows
     assert await tab.evaluate(DRAWN) == ["t1 > p2", "p1 > t2"]
 
 
-# ---- fields -------------------------------------------------------------------------------------------------------------
+# ---- fields
+# -------------------------------------------------------------------------------------------------------------
 
 
 FOCUSED = """() => { const at = document.activeElement;
@@ -179,7 +207,8 @@ FOCUSED = """() => { const at = document.activeElement;
 
 
 async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, page: Page) -> None:
-    """Through a whole form: whatever was changed, the next field has the focus, and digits are text."""
+    """Through a whole form: whatever was changed, the next field has the focus, and digits are
+    text."""
     tab = await designer(browser, page)
     await element(tab, "^Control place parts").click()
     form = tab.get_by_role("complementary", name="Properties")
@@ -202,7 +231,10 @@ async def test_tab_goes_on_to_the_next_field_after_a_change(browser: Browser, pa
     place = await tab.evaluate("() => petrobot.tabs.Design.model.data.places.pieces")
     assert (place["label"], place["tokens"], place["capacity"]) == ("12 pieces", 3, 14)
     assert await tab.evaluate("() => petrobot.tabs.Design.tools.tool") == "select"
-    assert await tab.evaluate("() => Object.keys(petrobot.tabs.Design.model.data.places).length") == before
+    assert (
+        await tab.evaluate("() => Object.keys(petrobot.tabs.Design.model.data.places).length")
+        == before
+    )
 
 
 async def test_a_choice_keeps_the_focus(browser: Browser, page: Page) -> None:
@@ -216,7 +248,8 @@ async def test_a_choice_keeps_the_focus(browser: Browser, page: Page) -> None:
     assert await tab.evaluate(FOCUSED) == "Kind"
 
 
-# ---- questions ----------------------------------------------------------------------------------------------------------
+# ---- questions
+# ----------------------------------------------------------------------------------------------------------
 
 
 async def test_the_safe_answer_has_the_focus(browser: Browser, page: Page, tasks: Path) -> None:
@@ -239,16 +272,21 @@ async def test_the_safe_answer_has_the_focus(browser: Browser, page: Page, tasks
     await expect(tab.get_by_label("Task", exact=True)).to_have_value("corners")
 
 
-async def test_an_emergency_stop_is_not_cleared_by_enter(browser: Browser, own_page: Page, cell: Simulated) -> None:
+async def test_an_emergency_stop_is_not_cleared_by_enter(
+    browser: Browser, own_page: Page, cell: Simulated
+) -> None:
     tab = await opened(browser, own_page)
     await hold_controls(tab)
-    cell.station.feed.emit("mission", mission={"state": "stopped", "reason": "emergency stop by ana"})
+    cell.station.feed.emit(
+        "mission", mission={"state": "stopped", "reason": "emergency stop by ana"}
+    )
     await tab.get_by_role("button", name="Clear the stop").click()
     dialog = tab.get_by_role("dialog", name="Clear the emergency stop?")
     await expect(dialog.get_by_role("button", name="Cancel")).to_be_focused()
 
 
-# ---- files that are edited outside ----------------------------------------------------------------------------------------
+# ---- files that are edited outside
+# ----------------------------------------------------------------------------------------
 
 
 def altered(cell: Simulated) -> str:
@@ -273,12 +311,17 @@ async def test_a_loaded_task_that_was_changed_outside_is_shown_before_it_runs(
     await toasted(tab, "changed outside")
     await expect(element(tab, "^Control place jobs, 1 token", "Task net")).to_be_visible()
     assert not list(cell.runs.glob("*")), "nothing has run"
-    answer = await cell.station.command(cell.station.controls.holder or "", "start", {"mode": "lockstep", "pace": 0})
+    answer = await cell.station.command(
+        cell.station.controls.holder or "", "start", {"mode": "lockstep", "pace": 0}
+    )
     assert answer["ok"], "what is seen now may be started"
 
 
-async def test_run_this_task_never_runs_another_text(browser: Browser, own_page: Page, cell: Simulated) -> None:
-    """The designer says that its file was changed outside, refuses to run it unseen, and loads it when asked to."""
+async def test_run_this_task_never_runs_another_text(
+    browser: Browser, own_page: Page, cell: Simulated
+) -> None:
+    """The designer says that its file was changed outside, refuses to run it unseen, and loads it
+    when asked to."""
     tab = await opened(browser, own_page)
     await tab.get_by_role("tab", name="Design").click()
     await settled(tab)
@@ -294,7 +337,9 @@ async def test_run_this_task_never_runs_another_text(browser: Browser, own_page:
     assert (cell.folder / "tasks" / "moving.toml").read_text(encoding="utf-8") == text
 
 
-async def test_a_change_outside_is_noticed_while_one_looks(browser: Browser, own_page: Page, cell: Simulated) -> None:
+async def test_a_change_outside_is_noticed_while_one_looks(
+    browser: Browser, own_page: Page, cell: Simulated
+) -> None:
     tab = await opened(browser, own_page)
     await tab.get_by_role("tab", name="Design").click()
     await settled(tab)

@@ -1,4 +1,5 @@
-"""The page never stands still without a word: numbers that JSON has not, messages that it cannot read or show, closed doors."""
+"""The page never stands still without a word: numbers that JSON has not, messages that it cannot
+read or show, closed doors."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.hmi.server import Page, start_page
 from tests.hmi.conftest import browser_missing, nobody_listens, served, staged, until
 from tests.hmi.stage import Stage
 
@@ -23,7 +24,10 @@ from playwright.async_api import Page as Tab
 
 from tests.hmi.steps import SIZE, Watch, element, opened, start_mission
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
+pytestmark = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.usefixtures("_windows_are_closed"),
+]
 Mangle = Callable[[str], str | bytes]
 
 
@@ -45,7 +49,8 @@ DETAILS = ("Camera", "Devices", "Set points", "Learning", "Variables", "Events",
 
 
 def emit_everything(stage: Stage, bad: float) -> None:
-    """Every kind of change that carries numbers, with one that is not finite wherever a number may stand."""
+    """Every kind of change that carries numbers, with one that is not finite wherever a number may
+    stand."""
     feed = stage.feed
     values = {"setpoint_age": bad, "load": 0.25, "list": [bad, {"deep": [bad]}]}
     feed.emit("device", name="arm", device={"state": "on", "joints": [0.1, bad], "limits": [[bad, 1.0]], "age": bad}
@@ -55,16 +60,40 @@ def emit_everything(stage: Stage, bad: float) -> None:
     feed.emit("setpoint", stream="point", samples=[[0.1, 0.01], [0.2, bad], [0.3, 0.02]])
     curve = {"kind": "curve", "title": "Choice", "x": "runs", "y": "p", "series": ["a"]}
     feed.emit("report", name="c", report={**curve, "columns": [[1, 2, 3], [0.5, bad, 0.7]]})
-    known = [{"action": a, "probability": bad, "reliability": bad, "cost": bad, "j": bad} for a in ("a", "b")]
+    known = [
+        {"action": a, "probability": bad, "reliability": bad, "cost": bad, "j": bad}
+        for a in ("a", "b")
+    ]
     feed.emit("selector", name="look", selector={"alternatives": known, "override": None})
     found = [{"kind": "circle", "x": bad, "y": 2, "r": bad, "label": "part"}]
-    image = {"mime": "image/png", "data": "", "width": 640, "height": 360, "age": bad, "detections": found}
+    image = {
+        "mime": "image/png",
+        "data": "",
+        "width": 640,
+        "height": 360,
+        "age": bad,
+        "detections": found,
+    }
     feed.emit("image", name="table", image=image)
     feed.emit("node", name="vision", node={"state": "up", "round_trip": bad})
-    run = {"id": "x#1", "place": "look", "primitive_task": "look", "action": "a", "node": "n", "why": ""}
+    run = {
+        "id": "x#1",
+        "place": "look",
+        "primitive_task": "look",
+        "action": "a",
+        "node": "n",
+        "why": "",
+    }
     feed.emit("run_started", run={**run, "started": bad, "deadline": bad, "progress": bad})
     feed.emit("run_progress", id="x#1", progress=bad)
-    event = {"scope": "external", "memory": "pulse", "armed": False, "count": 1, "last": bad, "data": {"v": bad}}
+    event = {
+        "scope": "external",
+        "memory": "pulse",
+        "armed": False,
+        "count": 1,
+        "last": bad,
+        "data": {"v": bad},
+    }
     feed.emit("event", name="part_there", event=event)
     feed.emit("result", result={"status": "success", "score": bad, "learned": {"R": [bad]}})
     feed.emit("notice", notice={"level": "info", "text": "done", "at": bad})
@@ -74,7 +103,8 @@ def emit_everything(stage: Stage, bad: float) -> None:
 async def test_numbers_that_are_not_finite_leave_the_page_alive(
     browser: Browser, page: Page, stage: Stage, faults: Watch, bad: float
 ) -> None:
-    """As deltas to one that looks, and in the snapshot of one that comes later: no value is shown, and all else goes on."""
+    """As deltas to one that looks, and in the snapshot of one that comes later: no value is shown,
+    and all else goes on."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     emit_everything(stage, bad)
@@ -96,7 +126,9 @@ async def test_numbers_that_are_not_finite_leave_the_page_alive(
     assert complaints == complaints_late == []
 
 
-async def test_history_and_http_carry_no_infinity(browser: Browser, page: Page, stage: Stage) -> None:
+async def test_history_and_http_carry_no_infinity(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
     """The same for what is asked for over HTTP: a browser reads it."""
     tab = await opened(browser, page)
     stage.feed.emit("result", result={"score": inf, "deep": [{"x": nan}]})
@@ -106,7 +138,7 @@ async def test_history_and_http_carry_no_infinity(browser: Browser, page: Page, 
 
 async def through_a_proxy(browser: Browser, page: Page, mangle: Mangle) -> tuple[Tab, list[str]]:
     """A window whose live messages pass something that may alter them; also what passed."""
-    context = await browser.new_context(viewport=SIZE)  # type: ignore[arg-type]
+    context = await browser.new_context(viewport=SIZE)
     passed: list[str] = []
 
     def carry(socket: WebSocketRoute) -> None:
@@ -144,7 +176,9 @@ ALTERED: dict[str, Callable[[str], str | bytes]] = {
     "no object": lambda _: "null",
     "bytes": lambda m: m.encode(),
     "without its changes": lambda m: json.dumps({**json.loads(m), "changes": None}),
-    "with a change that cannot be applied": lambda m: json.dumps({**json.loads(m), "changes": [None]}),
+    "with a change that cannot be applied": lambda m: json.dumps(
+        {**json.loads(m), "changes": [None]}
+    ),
 }
 
 
@@ -152,14 +186,17 @@ ALTERED: dict[str, Callable[[str], str | bytes]] = {
 async def test_a_message_that_cannot_be_read_is_a_lost_connection(
     browser: Browser, page: Page, stage: Stage, how: str
 ) -> None:
-    """The bar says so, and the page comes back with a fresh snapshot: what the message said is not missing."""
+    """The bar says so, and the page comes back with a fresh snapshot: what the message said is not
+    missing."""
     tab, passed = await through_a_proxy(browser, page, once(ALTERED[how]))
     await tab.evaluate(NOTE_BAR)
     stage.feed.emit("marking", marking={"parts": 5})
     await expect(element(tab, "^Control place parts, 5 tokens", "Task net")).to_be_visible()
     await expect(tab.get_by_role("alert")).to_be_hidden()
     assert any("could not show" in said for said in await tab.evaluate("window.barSaid"))
-    assert sum('"type":"snapshot"' in message for message in passed) == 2, "the one at the beginning and a fresh one"
+    assert sum('"type":"snapshot"' in message for message in passed) == 2, (
+        "the one at the beginning and a fresh one"
+    )
     stage.feed.emit("marking", marking={"parts": 4})
     await expect(element(tab, "^Control place parts, 4 tokens", "Task net")).to_be_visible()
 
@@ -190,8 +227,11 @@ async def test_a_page_that_receives_only_what_it_cannot_read_says_so_and_keeps_t
     await expect(element(tab, "^Control place parts, 5 tokens", "Task net")).to_be_visible()
 
 
-async def test_a_fault_of_the_page_itself_is_said_and_mended(browser: Browser, page: Page, stage: Stage) -> None:
-    """A handler of the page that throws does not leave a picture that stands still: it says so and begins again."""
+async def test_a_fault_of_the_page_itself_is_said_and_mended(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """A handler of the page that throws does not leave a picture that stands still: it says so and
+    begins again."""
     tab = await opened(browser, page)
     await start_mission(tab)
     await tab.evaluate(NOTE_BAR)
@@ -220,8 +260,9 @@ async def test_the_emergency_stop_goes_past_a_link_that_cannot_be_read(
 
 
 async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page) -> None:
-    """Its files came, but no live connection does: a bar, not an idle mission; it goes when there is one."""
-    context = await browser.new_context(viewport=SIZE)  # type: ignore[arg-type]
+    """Its files came, but no live connection does: a bar, not an idle mission; it goes when there
+    is one."""
+    context = await browser.new_context(viewport=SIZE)
     shut = [True]
 
     def carry(socket: WebSocketRoute) -> None:
@@ -237,7 +278,7 @@ async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page)
 
 
 async def test_a_page_whose_script_does_not_arrive_says_so(browser: Browser, page: Page) -> None:
-    context = await browser.new_context(viewport=SIZE)  # type: ignore[arg-type]
+    context = await browser.new_context(viewport=SIZE)
     await context.route("**/page/js/state.js", lambda route: route.abort())
     tab = await context.new_page()
     await tab.goto(page.url)
@@ -248,7 +289,8 @@ async def test_a_page_whose_script_does_not_arrive_says_so(browser: Browser, pag
 async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
     browser: Browser, stage: Stage, tasks: Path, tmp_path: Path
 ) -> None:
-    """The key is drawn at each start. An old window says so, and follows again once the new address was opened."""
+    """The key is drawn at each start. An old window says so, and follows again once the new address
+    was opened."""
     async with served(stage, tasks, tmp_path / "runs") as first:
         tab = await opened(browser, first)
         port = int(first.url.rpartition(":")[2].partition("/")[0])

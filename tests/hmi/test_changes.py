@@ -1,4 +1,5 @@
-"""Changes applied one by one and merged lead to the same state; a client that is far behind stays small."""
+"""Changes applied one by one and merged lead to the same state; a client that is far behind stays
+small."""
 
 from __future__ import annotations
 
@@ -7,8 +8,16 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.hmi.changes import KINDS, PENDING_LIMIT, SNAPSHOT_KEYS, Pending, apply, copy_state, empty_state
-from coordinator.hmi.feed import Feed
+from petrobot.coordinator.hmi.changes import (
+    KINDS,
+    PENDING_LIMIT,
+    SNAPSHOT_KEYS,
+    Pending,
+    apply,
+    copy_state,
+    empty_state,
+)
+from petrobot.coordinator.hmi.feed import Feed
 
 NAMES = st.sampled_from(["a", "b", "c"])
 SMALL = st.integers(0, 5)
@@ -24,7 +33,8 @@ NAMED = {
 
 @st.composite
 def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
-    """A run of numbered changes as a mission would emit them: a run begins before it goes on and ends."""
+    """A run of numbered changes as a mission would emit them: a run begins before it goes on and
+    ends."""
     made: list[dict[str, Any]] = []
     going: list[str] = []
     for number in range(1, draw(st.integers(1, 40)) + 1):
@@ -43,21 +53,33 @@ def _fields(draw: st.DrawFn, kind: str, number: int, going: list[str]) -> dict[s
         going.append(f"r{number}")
         return {"run": {"id": f"r{number}", "place": draw(NAMES), "progress": 0.0}}
     if kind == "run_progress":
-        return {"id": draw(st.sampled_from(going)), draw(st.sampled_from(["progress", "state"])): draw(SMALL)}
+        return {
+            "id": draw(st.sampled_from(going)),
+            draw(st.sampled_from(["progress", "state"])): draw(SMALL),
+        }
     if kind == "run_ended":
         return {"id": going.pop(), "status": "success", "ended": number}
     if kind == "run_judged":
-        return {"id": f"r{draw(st.integers(1, number))}", "status": draw(st.sampled_from(["success", "failure"]))}
+        return {
+            "id": f"r{draw(st.integers(1, number))}",
+            "status": draw(st.sampled_from(["success", "failure"])),
+        }
     if kind == "marking":
         return {"marking": draw(st.dictionaries(NAMES, SMALL))}
     if kind == "mission":
-        return {"mission": draw(st.dictionaries(st.sampled_from(["state", "reason", "firings"]), SMALL))}
+        return {
+            "mission": draw(st.dictionaries(st.sampled_from(["state", "reason", "firings"]), SMALL))
+        }
     if kind == "fired":
         return {"firing": {"number": number, "transition": draw(NAMES)}}
     if kind == "notice":
         return {"notice": {"level": "info", "text": draw(NAMES)}}
     if kind == "setpoint":
-        return {"stream": draw(NAMES), "samples": [[number, draw(SMALL)]], "setpoint": {"period": draw(SMALL)}}
+        return {
+            "stream": draw(NAMES),
+            "samples": [[number, draw(SMALL)]],
+            "setpoint": {"period": draw(SMALL)},
+        }
     if kind == "selector":
         return {"name": draw(NAMES), "selector": {"override": draw(NAMES)}}
     if kind in NAMED:
@@ -67,7 +89,8 @@ def _fields(draw: st.DrawFn, kind: str, number: int, going: list[str]) -> dict[s
 
 @given(changes(), st.lists(st.integers(1, 40), max_size=6))
 def test_merged_deltas_lead_to_the_same_state(made: list[dict[str, Any]], cuts: list[int]) -> None:
-    """However the changes are cut into deltas, a client ends where the server is, and numbers have no gap."""
+    """However the changes are cut into deltas, a client ends where the server is, and numbers have
+    no gap."""
     server, client = empty_state(), empty_state()
     pending = Pending()
     seen = 0
@@ -100,7 +123,8 @@ def test_a_snapshot_is_out_of_reach_of_later_changes(made: list[dict[str, Any]])
 
 
 def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
-    """What the page shows of a provisional run is what it came to; one that has left the list stays away."""
+    """What the page shows of a provisional run is what it came to; one that has left the list stays
+    away."""
     state = empty_state()
     for change in (
         {"kind": "run_started", "run": {"id": "a#1", "place": "a"}},
@@ -119,7 +143,8 @@ def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
 
 
 def test_what_waits_for_a_slow_client_is_bounded() -> None:
-    """Ten thousand firings that nobody fetches leave no backlog: the client gets a snapshot instead."""
+    """Ten thousand firings that nobody fetches leave no backlog: the client gets a snapshot
+    instead."""
     pending = Pending()
     for number in range(1, 10_001):
         pending.add({"kind": "fired", "sequence": number, "firing": {"number": number}})
@@ -135,7 +160,15 @@ def test_values_that_only_have_a_newest_take_no_room() -> None:
     for number in range(1, 50 * PENDING_LIMIT):
         kind = ("image", "run_progress", "variable", "marking")[number % 4]
         pending.add(
-            {"kind": kind, "sequence": number, "name": "x", "id": "r", "image": number, "value": 1, "marking": {}}
+            {
+                "kind": kind,
+                "sequence": number,
+                "name": "x",
+                "id": "r",
+                "image": number,
+                "value": 1,
+                "marking": {},
+            }
         )
     assert not pending.stale
     assert len(pending.take()["changes"]) == 4

@@ -1,4 +1,5 @@
-"""The designer in a real browser on tasks that it was not made for: macro places, odd files, large nets, other tools' nets."""
+"""The designer in a real browser on tasks that it was not made for: macro places, odd files, large
+nets, other tools' nets."""
 
 from __future__ import annotations
 
@@ -14,12 +15,21 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from coordinator.drawing.layout import lay_out
-from coordinator.hmi.edits import edited, parse, plain
-from coordinator.hmi.server import Page
-from coordinator.taskfile import load
+from petrobot.coordinator.drawing.layout import lay_out
+from petrobot.coordinator.hmi.edits import edited, parse, plain
+from petrobot.coordinator.hmi.server import Page
+from petrobot.coordinator.taskfile import load
 from tests.drawing.conftest import random_task
-from tests.hmi.conftest import PATIENCE_MS, browser_missing, is_fault, note_toasts, served, staged, toasted, until
+from tests.hmi.conftest import (
+    PATIENCE_MS,
+    browser_missing,
+    is_fault,
+    note_toasts,
+    served,
+    staged,
+    toasted,
+    until,
+)
 from tests.hmi.stage import Stage
 
 if browser_missing() and os.environ.get("CI") != "true":
@@ -30,7 +40,10 @@ from playwright.async_api import Page as Tab
 
 from tests.hmi.steps import element, settled
 
-pytestmark = [pytest.mark.asyncio(loop_scope="module"), pytest.mark.usefixtures("_windows_are_closed")]
+pytestmark = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.usefixtures("_windows_are_closed"),
+]
 DRAWING = "Drawing of the task"
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 expect.set_options(timeout=PATIENCE_MS)
@@ -50,14 +63,18 @@ async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]
         yield made
 
 
-async def designing(browser: Browser, page: Page, task: str = "pick_and_place") -> tuple[Tab, list[str]]:
+async def designing(
+    browser: Browser, page: Page, task: str = "pick_and_place"
+) -> tuple[Tab, list[str]]:
     """The designer with a task open, and what its window complains about."""
     context = await browser.new_context(viewport={"width": 1440, "height": 900})
     context.set_default_timeout(PATIENCE_MS)
     tab = await context.new_page()
     complaints: list[str] = []
     tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.on("console", lambda message: complaints.append(message.text) if is_fault(message) else None)
+    tab.on(
+        "console", lambda message: complaints.append(message.text) if is_fault(message) else None
+    )
     await tab.goto(f"{page.url}#Design")
     await settled(tab)
     await expect(tab.get_by_label("Task", exact=True)).to_have_value("pick_and_place")
@@ -100,16 +117,22 @@ async def drag(tab: Tab, name: str, dx: float, dy: float) -> None:
 
 async def save(tab: Tab) -> None:
     """Save, and wait until the server has it; what was saved before may say so already."""
-    async with tab.expect_response(lambda answer: answer.request.method == "PUT" and "/api/tasks/" in answer.url):
+    async with tab.expect_response(
+        lambda answer: answer.request.method == "PUT" and "/api/tasks/" in answer.url
+    ):
         await tab.keyboard.press("Control+s")
     await expect(tab.locator(".saved")).to_have_text("saved")
 
 
-# ---- arranging --------------------------------------------------------------------------------------------------------
+# ---- arranging
+# --------------------------------------------------------------------------------------------------------
 
 
-async def test_a_task_that_is_opened_is_seen_whole(browser: Browser, page: Page, tasks: Path) -> None:
-    """Every element with its words and arcs within the drawing, no field beyond the form, on a laptop's screen."""
+async def test_a_task_that_is_opened_is_seen_whole(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """Every element with its words and arcs within the drawing, no field beyond the form, on a
+    laptop's screen."""
     shutil.copy(SHIPPED, tasks)
     tab, complaints = await designing(browser, page, "catch_ball")
     beyond = """(drawing) => {
@@ -138,7 +161,9 @@ async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, ta
     async def arranged(button: str) -> list[tuple[float, float]]:
         await properties(tab).get_by_role("button", name=button).click()
         await save(tab)
-        return [(place.x or 0.0, place.y or 0.0) for place in map(load(path).places.__getitem__, names)]
+        return [
+            (place.x or 0.0, place.y or 0.0) for place in map(load(path).places.__getitem__, names)
+        ]
 
     row = await arranged("Align in a row")
     assert len({y for _, y in row}) == 1 and row[0][1] % 10 == 0
@@ -154,8 +179,11 @@ async def test_chosen_elements_are_put_in_order(browser: Browser, page: Page, ta
     assert not complaints
 
 
-async def test_the_task_that_runs_is_opened_first(browser: Browser, page: Page, tasks: Path) -> None:
-    """Loaded with the designer in front the page waits until it knows which task runs, however many stand before it."""
+async def test_the_task_that_runs_is_opened_first(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """Loaded with the designer in front the page waits until it knows which task runs, however many
+    stand before it."""
     (tasks / "earlier.toml").write_text((tasks / "pick_and_place.toml").read_text())
     tab = await browser.new_page()
     held: list[Callable[[], None]] = []
@@ -178,7 +206,9 @@ async def test_the_task_that_runs_is_opened_first(browser: Browser, page: Page, 
     await expect(picker).to_have_value("pick_and_place")
 
 
-async def test_a_dragged_element_lands_on_the_grid(browser: Browser, page: Page, tasks: Path) -> None:
+async def test_a_dragged_element_lands_on_the_grid(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
     """Whatever the zoom: positions are multiples of ten."""
     path = tasks / "pick_and_place.toml"
     tab, complaints = await designing(browser, page)
@@ -192,11 +222,15 @@ async def test_a_dragged_element_lands_on_the_grid(browser: Browser, page: Page,
     assert not complaints
 
 
-# ---- macro places -----------------------------------------------------------------------------------------------------
+# ---- macro places
+# -----------------------------------------------------------------------------------------------------
 
 
-async def test_a_part_of_the_net_becomes_a_macro_place(browser: Browser, page: Page, stage: Stage, tasks: Path) -> None:
-    """Grouped, opened, nested, saved, undone and dissolved; in the live view it folds with its tokens summed."""
+async def test_a_part_of_the_net_becomes_a_macro_place(
+    browser: Browser, page: Page, stage: Stage, tasks: Path
+) -> None:
+    """Grouped, opened, nested, saved, undone and dissolved; in the live view it folds with its
+    tokens summed."""
     path = tasks / "pick_and_place.toml"
     before, flat = path.read_text(), load(path).flat.net
     tab, complaints = await designing(browser, page)
@@ -210,7 +244,9 @@ async def test_a_part_of_the_net_becomes_a_macro_place(browser: Browser, page: P
     await save(tab)
     grouped = load(path)
     assert grouped.places["pick"].macro == grouped.places["put"].macro == "handling"
-    assert grouped.transitions["picked"].macro == "handling" and not grouped.transitions["begin"].macro
+    assert (
+        grouped.transitions["picked"].macro == "handling" and not grouped.transitions["begin"].macro
+    )
     assert grouped.flat.net == flat, "grouping is a matter of the drawing alone"
     left = iter(path.read_text().splitlines())
     assert all(line in left for line in before.splitlines()), "a line was lost or moved"
@@ -221,7 +257,11 @@ async def test_a_part_of_the_net_becomes_a_macro_place(browser: Browser, page: P
     await choose(tab, "^Action place pick,")
     await tab.keyboard.press("Control+g")
     await expect(element(tab, "^Macro place macro")).to_be_visible()
-    await tab.get_by_role("navigation", name="Opened macro places").get_by_role("button", name="pick and place").click()
+    await (
+        tab.get_by_role("navigation", name="Opened macro places")
+        .get_by_role("button", name="pick and place")
+        .click()
+    )
     await tab.get_by_role("searchbox", name="Find a place or transition").fill("pick")
     found = tab.get_by_role("option", name=re.compile("^pick ?action in macro"))
     await found.click()
@@ -233,7 +273,9 @@ async def test_a_part_of_the_net_becomes_a_macro_place(browser: Browser, page: P
     stage.load(nested, path.read_text())
     await tab.get_by_role("tab", name="Live").click()
     await tab.get_by_role("button", name="Take controls").click()
-    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text("You hold the controls")
+    await expect(tab.get_by_role("toolbar", name="Mission")).to_contain_text(
+        "You hold the controls"
+    )
     holder = stage.controls.holder
     assert holder is not None
     stage.kept.update({"pick", "put"})
@@ -257,8 +299,11 @@ async def test_a_part_of_the_net_becomes_a_macro_place(browser: Browser, page: P
     assert complaints == []
 
 
-async def test_macro_places_by_keyboard_and_their_rules(browser: Browser, page: Page, tasks: Path) -> None:
-    """An empty macro place is opened and drawn in; arcs go to places inside; what reaches out stays out; it goes whole."""
+async def test_macro_places_by_keyboard_and_their_rules(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """An empty macro place is opened and drawn in; arcs go to places inside; what reaches out stays
+    out; it goes whole."""
     tab, complaints = await designing(browser, page)
     await tab.get_by_role("button", name="New task").press("Enter")
     await tab.get_by_role("application", name=DRAWING).focus()
@@ -273,7 +318,11 @@ async def test_macro_places_by_keyboard_and_their_rules(browser: Browser, page: 
         await tab.keyboard.press("Enter")
     await expect(element(tab, "^Control place control")).to_be_visible()
     await tab.keyboard.press("Escape")
-    await tab.get_by_role("navigation", name="Opened macro places").get_by_role("button").first.press("Enter")
+    await (
+        tab.get_by_role("navigation", name="Opened macro places")
+        .get_by_role("button")
+        .first.press("Enter")
+    )
     await expect(element(tab, "^Macro place macro, 1 token")).to_be_visible()
     await tab.get_by_role("application", name=DRAWING).focus()
     await tab.keyboard.press("]")
@@ -286,7 +335,9 @@ async def test_macro_places_by_keyboard_and_their_rules(browser: Browser, page: 
     await expect(element(tab, "^Arc from transition to macro")).to_have_count(1)
     await element(tab, "^Macro place macro").press("o")
     await expect(element(tab, "^Arc from transition to control")).to_have_count(1)
-    await expect(element(tab, "^Transition transition")).to_be_visible()  # drawn beside, as what is around it
+    await expect(
+        element(tab, "^Transition transition")
+    ).to_be_visible()  # drawn beside, as what is around it
     await tab.keyboard.press("Backspace")
     await element(tab, "^Macro place macro").click()
     await tab.keyboard.press("Delete")
@@ -303,8 +354,11 @@ async def test_macro_places_by_keyboard_and_their_rules(browser: Browser, page: 
     assert complaints == []
 
 
-async def test_what_the_nodes_offer_now_can_be_chosen(browser: Browser, page: Page, stage: Stage) -> None:
-    """A node that joins while one draws brings its primitive tasks and arguments; one that goes leaves a finding."""
+async def test_what_the_nodes_offer_now_can_be_chosen(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """A node that joins while one draws brings its primitive tasks and arguments; one that goes
+    leaves a finding."""
     tab, complaints = await designing(browser, page)
     await element(tab, "^Action place put").click()
     choice = properties(tab).get_by_label("Primitive task")
@@ -321,7 +375,8 @@ async def test_what_the_nodes_offer_now_can_be_chosen(browser: Browser, page: Pa
     assert complaints == []
 
 
-# ---- files written by people ------------------------------------------------------------------------------------------
+# ---- files written by people
+# ------------------------------------------------------------------------------------------
 
 ODD = """# a file that has seen several editors\r
 schema = 1   # the only one\r
@@ -358,8 +413,11 @@ alternatives = ["pick"]\r
 deadline = 5.0 # s"""
 
 
-async def test_an_odd_file_keeps_every_byte_but_the_edited(browser: Browser, page: Page, tasks: Path) -> None:
-    """CR LF, inline tables, arrays of several lines, unicode, quotes, no positions: saved unedited it is the same file."""
+async def test_an_odd_file_keeps_every_byte_but_the_edited(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """CR LF, inline tables, arrays of several lines, unicode, quotes, no positions: saved unedited
+    it is the same file."""
     path = tasks / "odd.toml"
     path.write_bytes(ODD.encode())
     tab, complaints = await designing(browser, page, "odd")
@@ -383,7 +441,8 @@ async def test_an_odd_file_keeps_every_byte_but_the_edited(browser: Browser, pag
 
 
 async def test_a_broken_file_leaves_what_is_open(browser: Browser, page: Page, tasks: Path) -> None:
-    """A file that is no TOML is refused with its line; the task on the desk and its unsaved edit stay."""
+    """A file that is no TOML is refused with its line; the task on the desk and its unsaved edit
+    stay."""
     (tasks / "broken.toml").write_text('[task]\nname = "x\n')
     tab, _ = await designing(browser, page)
     await tab.get_by_label("Task", exact=True).select_option("broken")
@@ -401,14 +460,19 @@ def long_task(places: int) -> str:
     last = places - 2
     for i in range(last + 1):
         source = f"p{i}:normal" if i else "p0"
-        lines.append(f'[transitions.t{i}]\nin = ["{source}"]\nout = ["p{i + 1 if i < last else 0}"]\n')
+        lines.append(
+            f'[transitions.t{i}]\nin = ["{source}"]\nout = ["p{i + 1 if i < last else 0}"]\n'
+        )
         if i:
             lines.append(f'[transitions.e{i}]\nin = ["p{i}:error"]\nout = ["stuck"]\n')
     return "".join(lines)
 
 
-async def test_a_hundred_and_twenty_places_without_positions(browser: Browser, page: Page, tasks: Path) -> None:
-    """Laid out without overlap, found by search, in the minimap, folded and unfolded, undone as one step."""
+async def test_a_hundred_and_twenty_places_without_positions(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """Laid out without overlap, found by search, in the minimap, folded and unfolded, undone as one
+    step."""
     (tasks / "long.toml").write_text(long_task(120))
     tab, complaints = await designing(browser, page, "long")
     await expect(element(tab, "^Action place ")).to_have_count(118)
@@ -435,7 +499,8 @@ async def test_a_hundred_and_twenty_places_without_positions(browser: Browser, p
 
 
 async def test_the_page_lays_out_as_the_drawing_does(browser: Browser, page: Page) -> None:
-    """The two copies of the layout, in Python and in the page, put random nets in the same places."""
+    """The two copies of the layout, in Python and in the page, put random nets in the same
+    places."""
     tab, _ = await designing(browser, page)
     script = """async ([names, edges, sources]) => {
       const { layered } = await import("/page/js/layers.js");
@@ -443,8 +508,16 @@ async def test_the_page_lays_out_as_the_drawing_does(browser: Browser, page: Pag
     }"""
     for seed in range(12):
         net = random_task(np.random.default_rng(seed), 3)
-        edges = [(net.places[p], t) for t, takes in zip(net.transitions, net.consume, strict=True) for p, _ in takes]
-        edges += [(t, net.places[p]) for t, gives in zip(net.transitions, net.produce, strict=True) for p, _ in gives]
+        edges = [
+            (net.places[p], t)
+            for t, takes in zip(net.transitions, net.consume, strict=True)
+            for p, _ in takes
+        ]
+        edges += [
+            (t, net.places[p])
+            for t, gives in zip(net.transitions, net.produce, strict=True)
+            for p, _ in gives
+        ]
         names = [*net.places, *net.transitions]
         sources = [p for p, n in zip(net.places, net.initial, strict=True) if n]
         here = lay_out(dict.fromkeys(names), edges, sources).at
@@ -457,20 +530,25 @@ COVERED = (Path(__file__).parent / "covered_words.js").read_text(encoding="utf-8
 
 
 async def test_words_on_the_page_cover_nothing(browser: Browser, page: Page, tasks: Path) -> None:
-    """Random nets laid out by the page: measured in the browser no words cover words or elements, and few arcs strike words."""
+    """Random nets laid out by the page: measured in the browser no words cover words or elements,
+    and few arcs strike words."""
     tab, _ = await designing(browser, page)
     total: Counter[str] = Counter()
     for seed in range(40, 45):
         net = random_task(np.random.default_rng(seed), 3)
         arcs = [
-            f"in = {[net.places[p] for p, _ in net.consume[t]]}\nout = {[net.places[p] for p, _ in net.produce[t]]}\n"
+            f"in = {[net.places[p] for p, _ in net.consume[t]]}\nout = "
+            f"{[net.places[p] for p, _ in net.produce[t]]}\n"
             for t in range(len(net.transitions))
         ]
         text = 'schema = 1\n[task]\nname = "random"\nfinal = "false"\n'
         text += "".join(
-            f'[places.{p}]\nkind = "control"\ntokens = {n}\n' for p, n in zip(net.places, net.initial, strict=True)
+            f'[places.{p}]\nkind = "control"\ntokens = {n}\n'
+            for p, n in zip(net.places, net.initial, strict=True)
         )
-        text += "".join(f"[transitions.{t}]\n{a}" for t, a in zip(net.transitions, arcs, strict=True))
+        text += "".join(
+            f"[transitions.{t}]\n{a}" for t, a in zip(net.transitions, arcs, strict=True)
+        )
         (tasks / f"random_{seed}.toml").write_text(text)
         await tab.reload()
         await settled(tab)
@@ -479,15 +557,21 @@ async def test_words_on_the_page_cover_nothing(browser: Browser, page: Page, tas
         await expect(element(tab, "^Transition ")).to_have_count(len(net.transitions))
         total.update(await tab.evaluate(COVERED))
     assert total["words"] > 80
-    assert total["words_on_words"] == total["words_on_elements"] == total["elements_on_elements"] == 0, total
+    assert (
+        total["words_on_words"] == total["words_on_elements"] == total["elements_on_elements"] == 0
+    ), total
     assert total["struck"] <= 0.1 * total["words"], total
 
 
-# ---- while something else goes on -------------------------------------------------------------------------------------
+# ---- while something else goes on
+# -------------------------------------------------------------------------------------
 
 
-async def test_pasted_elsewhere_it_means_the_same(browser: Browser, page: Page, tasks: Path) -> None:
-    """An action place pasted into another task brings its primitive task, its event and the arcs among what was copied."""
+async def test_pasted_elsewhere_it_means_the_same(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """An action place pasted into another task brings its primitive task, its event and the arcs
+    among what was copied."""
     tab, complaints = await designing(browser, page)
     await choose(tab, "^Action place look", "^Transition begin", "^Control place parts")
     await tab.keyboard.press("Control+c")
@@ -506,7 +590,8 @@ async def test_pasted_elsewhere_it_means_the_same(browser: Browser, page: Page, 
 
 
 async def test_deleted_under_the_pointer(browser: Browser, page: Page) -> None:
-    """What is deleted, undone or renamed while it is dragged does not come back and breaks nothing."""
+    """What is deleted, undone or renamed while it is dragged does not come back and breaks
+    nothing."""
     tab, complaints = await designing(browser, page)
     box = await element(tab, "^Action place put").bounding_box()
     assert box is not None
@@ -520,7 +605,9 @@ async def test_deleted_under_the_pointer(browser: Browser, page: Page) -> None:
     await expect(element(tab, "^Action place put")).to_have_count(0)
     await tab.get_by_role("button", name="Undo").click()
     await expect(element(tab, "^Action place put")).to_be_visible()
-    await expect(tab.get_by_role("region", name="Findings")).not_to_have_attribute("aria-busy", "true")
+    await expect(tab.get_by_role("region", name="Findings")).not_to_have_attribute(
+        "aria-busy", "true"
+    )
     after = await element(tab, "^Action place put").bounding_box()
     assert after is not None and abs(after["x"] - box["x"]) < 1 and abs(after["y"] - box["y"]) < 1
     await expect(tab.locator(".saved")).to_have_text("saved")
@@ -528,14 +615,19 @@ async def test_deleted_under_the_pointer(browser: Browser, page: Page) -> None:
 
 
 async def test_two_saves_at_once(browser: Browser, page: Page, tasks: Path) -> None:
-    """Of two people who save in one moment one is refused with both versions in view, and nothing is half written."""
+    """Of two people who save in one moment one is refused with both versions in view, and nothing
+    is half written."""
     (ana, _), (ben, _) = await designing(browser, page), await designing(browser, page)
     for tab, goal in ((ana, "from ana"), (ben, "from ben")):
         await tab.get_by_label("Goal", exact=True).fill(goal)  # saved from within the field
     await asyncio.gather(ana.keyboard.press("Control+s"), ben.keyboard.press("Control+s"))
-    either = ana.get_by_role("dialog", name="Conflict").or_(ana.locator(".saved", has_text=re.compile("^saved$")))
+    either = ana.get_by_role("dialog", name="Conflict").or_(
+        ana.locator(".saved", has_text=re.compile("^saved$"))
+    )
     await expect(either).to_be_visible()
-    won, lost = (ben, ana) if await ana.get_by_role("dialog", name="Conflict").count() else (ana, ben)
+    won, lost = (
+        (ben, ana) if await ana.get_by_role("dialog", name="Conflict").count() else (ana, ben)
+    )
     conflict = lost.get_by_role("dialog", name="Conflict")
     await expect(conflict).to_contain_text('goal = "from ana"')
     await expect(conflict).to_contain_text('goal = "from ben"')
@@ -545,8 +637,11 @@ async def test_two_saves_at_once(browser: Browser, page: Page, tasks: Path) -> N
     await expect(lost.get_by_label("Goal", exact=True)).to_have_value(kept)
 
 
-async def test_what_a_condition_needs_can_be_declared(browser: Browser, page: Page, tasks: Path) -> None:
-    """A variable and a latched event made on the page; a condition on them is checked while it is typed; all undoable."""
+async def test_what_a_condition_needs_can_be_declared(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """A variable and a latched event made on the page; a condition on them is checked while it is
+    typed; all undoable."""
     tab, complaints = await designing(browser, page)
     form = properties(tab)
     await form.get_by_label("New variable", exact=True).fill("seen")
@@ -573,8 +668,11 @@ async def test_what_a_condition_needs_can_be_declared(browser: Browser, page: Pa
 EDITS = (Path(__file__).parent / "random_edits.js").read_text(encoding="utf-8")
 
 
-async def test_everything_can_be_undone_and_done_again(browser: Browser, page: Page, tasks: Path) -> None:
-    """Random edits of every kind: each is undone exactly, done again, and what comes of them is a file that says the same."""
+async def test_everything_can_be_undone_and_done_again(
+    browser: Browser, page: Page, tasks: Path
+) -> None:
+    """Random edits of every kind: each is undone exactly, done again, and what comes of them is a
+    file that says the same."""
     tab, _ = await designing(browser, page)
     document = plain(parse((tasks / "pick_and_place.toml").read_text()))
     for seed in range(1, 13):
@@ -585,7 +683,8 @@ async def test_everything_can_be_undone_and_done_again(browser: Browser, page: P
         assert {k: v for k, v in kept.items() if v} == {k: v for k, v in made["final"].items() if v}
 
 
-# ---- other tools' nets ------------------------------------------------------------------------------------------------
+# ---- other tools' nets
+# ------------------------------------------------------------------------------------------------
 
 PIPE = """<?xml version="1.0" encoding="ISO-8859-1"?><pnml><net id="Net-One" type="P/T net"><token id="Default" red="0"/>
 <place id="P0"><graphics><position x="105.0" y="90.0"/></graphics><name><value>P0</value></name>
@@ -610,13 +709,23 @@ PM4PY = """<?xml version='1.0' encoding='UTF-8'?><pnml>
 <finalmarkings><marking><place idref="sink"><text>1</text></place></marking></finalmarkings></net></pnml>"""
 
 
-@pytest.mark.parametrize(("text", "places", "transitions"), [(PIPE, 2, 1), (PM4PY, 2, 2)], ids=["pipe", "pm4py"])
+@pytest.mark.parametrize(
+    ("text", "places", "transitions"), [(PIPE, 2, 1), (PM4PY, 2, 2)], ids=["pipe", "pm4py"]
+)
 async def test_a_net_of_another_tool_comes_in_and_goes_out_again(
-    browser: Browser, page: Page, tasks: Path, tmp_path: Path, text: str, places: int, transitions: int
+    browser: Browser,
+    page: Page,
+    tasks: Path,
+    tmp_path: Path,
+    text: str,
+    places: int,
+    transitions: int,
 ) -> None:
-    """Imported, saved, exported, and imported once more: the same places, transitions, arcs, marking and weights.
+    """Imported, saved, exported, and imported once more: the same places, transitions, arcs,
+    marking and weights.
 
-    Nobody waits for an import, which is slow here: Ctrl+S means what was imported, not what lay on the desk before.
+    Nobody waits for an import, which is slow here: Ctrl+S means what was imported, not what lay on
+    the desk before.
     """
     (tmp_path / "net.pnml").write_text(text)
     tab, complaints = await designing(browser, page)
@@ -643,6 +752,8 @@ async def test_a_net_of_another_tool_comes_in_and_goes_out_again(
     first, second = (load(tasks / f"{name}.toml") for name in ("first", "second"))
     assert first.net == second.net
     assert {n: (p.x, p.y) for n, p in first.places.items() if p.x is not None} == {
-        n: (p.x, p.y) for n, p in second.places.items() if n in first.places and first.places[n].x is not None
+        n: (p.x, p.y)
+        for n, p in second.places.items()
+        if n in first.places and first.places[n].x is not None
     }
     assert complaints == []

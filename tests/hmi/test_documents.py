@@ -1,4 +1,5 @@
-"""Task files over HTTP: revisions, conflicts with both versions, findings, other formats, offers and journals."""
+"""Task files over HTTP: revisions, conflicts with both versions, findings, other formats, offers
+and journals."""
 
 from __future__ import annotations
 
@@ -12,12 +13,12 @@ import aiohttp
 import pytest
 import pytest_asyncio
 
-from coordinator.analysis.pnml_reading import parse_pnml
-from coordinator.hmi import edits, journals, store, verdicts
-from coordinator.hmi.doors import HEADERS
-from coordinator.hmi.netfiles import as_task_file
-from coordinator.hmi.server import Page
-from coordinator.taskfile import load, loads
+from petrobot.coordinator.analysis.pnml_reading import parse_pnml
+from petrobot.coordinator.hmi import edits, journals, store, verdicts
+from petrobot.coordinator.hmi.doors import HEADERS
+from petrobot.coordinator.hmi.netfiles import as_task_file
+from petrobot.coordinator.hmi.server import Page
+from petrobot.coordinator.taskfile import load, loads
 from tests.hmi.stage import Stage
 
 pytestmark = pytest.mark.processes
@@ -60,24 +61,34 @@ async def opened(http: aiohttp.ClientSession, name: str = TASK) -> dict[str, Any
 async def save(http: aiohttp.ClientSession, name: str, **body: Any) -> tuple[int, Any]:
     """Save; gives status and answer."""
     async with http.put(f"/api/tasks/{name}", json=body) as answer:
-        value = await answer.json() if answer.content_type == "application/json" else await answer.text()
+        value = (
+            await answer.json()
+            if answer.content_type == "application/json"
+            else await answer.text()
+        )
         return answer.status, value
 
 
 async def test_open_edit_save(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """One deadline edited in the page is one line altered on disk, and the revision changes with it."""
+    """One deadline edited in the page is one line altered on disk, and the revision changes with
+    it."""
     before = (tasks / f"{TASK}.toml").read_text()
     task = await opened(http)
     task["document"]["primitive_tasks"]["pick"]["deadline"] = 7.5
     status, saved = await save(http, TASK, base=task["revision"], document=task["document"])
     assert status == 200 and saved["revision"] != task["revision"]
     after = (tasks / f"{TASK}.toml").read_text()
-    assert after == before.replace('alternatives = ["pick"]\ndeadline = 5.0', 'alternatives = ["pick"]\ndeadline = 7.5')
+    assert after == before.replace(
+        'alternatives = ["pick"]\ndeadline = 5.0', 'alternatives = ["pick"]\ndeadline = 7.5'
+    )
     assert load(tasks / f"{TASK}.toml").primitive_tasks["pick"].deadline == 7.5
 
 
-async def test_a_conflict_is_refused_with_both_versions(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """Two people edit; the second save writes nothing and shows both; afterwards either may be chosen."""
+async def test_a_conflict_is_refused_with_both_versions(
+    http: aiohttp.ClientSession, tasks: Path
+) -> None:
+    """Two people edit; the second save writes nothing and shows both; afterwards either may be
+    chosen."""
     first, second = await opened(http), await opened(http)
     first["document"]["task"]["goal"] = "theirs"
     second["document"]["task"]["goal"] = "mine"
@@ -96,13 +107,17 @@ async def test_a_new_file_does_not_replace_one(http: aiohttp.ClientSession) -> N
     """Saving under a name that exists, without having opened it, is a conflict."""
     assert (await save(http, TASK, base=None, document={"schema": 1}))[0] == 409
     status, made = await save(
-        http, "fresh", base=None, document={"schema": 1, "task": {"name": "fresh", "final": "false"}}
+        http,
+        "fresh",
+        base=None,
+        document={"schema": 1, "task": {"name": "fresh", "final": "false"}},
     )
     assert status == 200 and made["revision"]
 
 
 async def test_faults_name_the_element(http: aiohttp.ClientSession) -> None:
-    """A document that is being drawn is checked as it would be saved, and every finding has its key and remedy."""
+    """A document that is being drawn is checked as it would be saved, and every finding has its key
+    and remedy."""
     task = await opened(http)
     document = task["document"]
     assert [f for f in task["findings"] if f["severity"] == "error"] == []
@@ -116,7 +131,9 @@ async def test_faults_name_the_element(http: aiohttp.ClientSession) -> None:
     assert "[transitions.pick_failed]" not in said["text"]
 
 
-async def test_editing_does_not_touch_the_running_net(http: aiohttp.ClientSession, stage: Stage) -> None:
+async def test_editing_does_not_touch_the_running_net(
+    http: aiohttp.ClientSession, stage: Stage
+) -> None:
     """A save during a run alters the file; the mission goes on with what it was started with."""
     await stage.command("ana", "take_controls", {})
     assert (await stage.command("ana", "start", {}))["ok"]
@@ -138,7 +155,9 @@ async def test_a_broken_file_says_what_is_wrong(http: aiohttp.ClientSession, tas
     assert (await opened(http))["name"] == TASK
 
 
-async def test_saving_keeps_the_files_mode_and_leaves_no_rubbish(http: aiohttp.ClientSession, tasks: Path) -> None:
+async def test_saving_keeps_the_files_mode_and_leaves_no_rubbish(
+    http: aiohttp.ClientSession, tasks: Path
+) -> None:
     """Saves are atomic: no temporary file stays, and permissions are those of before."""
     path = tasks / f"{TASK}.toml"
     os.chmod(path, 0o640)  # noqa: PTH101
@@ -159,7 +178,8 @@ async def test_offers_are_those_of_the_nodes(http: aiohttp.ClientSession) -> Non
 
 
 async def test_pnml_goes_out_and_comes_back(http: aiohttp.ClientSession, tasks: Path) -> None:
-    """The ordinary net with marking, weights, inhibitors and positions survives the way through PNML."""
+    """The ordinary net with marking, weights, inhibitors and positions survives the way through
+    PNML."""
     async with http.get(f"/api/tasks/{TASK}/export/pnml") as answer:
         text = await answer.text()
         assert 'filename="pick_and_place.pnml"' in answer.headers["Content-Disposition"]
@@ -178,7 +198,8 @@ BAD_PNML = (
     "<pnml/>",
     "<html/>",
     '<!DOCTYPE x [<!ENTITY a "b">]><pnml><net id="n"/></pnml>',
-    '<pnml><net id="n"><place id="p"/><place id="q"/><arc id="a" source="p" target="q"/></net></pnml>',
+    '<pnml><net id="n"><place id="p"/><place id="q"/><arc id="a" source="p" '
+    'target="q"/></net></pnml>',
 )
 
 
@@ -192,7 +213,8 @@ async def test_bad_pnml_is_refused(http: aiohttp.ClientSession, text: str) -> No
 def test_names_from_elsewhere_become_names_of_ours() -> None:
     """Names with spaces, twice, or beginning with a digit are made usable and stay apart."""
     nodes = "".join(
-        f'<place id="p{i}"><name><text>{name}</text></name></place>' for i, name in enumerate(["a b", "a-b", "1", ""])
+        f'<place id="p{i}"><name><text>{name}</text></name></place>'
+        for i, name in enumerate(["a b", "a-b", "1", ""])
     )
     arcs = '<arc id="a" source="p0" target="t"><inscription><text>3</text></inscription></arc>'
     text = f'<pnml><net id="n"><page id="g">{nodes}<transition id="t"/>{arcs}</page></net></pnml>'
@@ -214,13 +236,16 @@ async def finished(stage: Stage) -> None:
             stage.happen("part_there")
 
     stage.on_beat.append(beat)
-    stop = stage.subscribe(lambda c: over.set() if c["kind"] == "mission" and "reason" in c["mission"] else None)
+    stop = stage.subscribe(
+        lambda c: over.set() if c["kind"] == "mission" and "reason" in c["mission"] else None
+    )
     await asyncio.wait_for(over.wait(), 60)
     stop()
 
 
 async def test_a_finished_run_can_be_scrubbed(http: aiohttp.ClientSession, stage: Stage) -> None:
-    """The journal gives every marking again: stepping through its changes ends in the marking of the end, with reasons."""
+    """The journal gives every marking again: stepping through its changes ends in the marking of
+    the end, with reasons."""
     await finished(stage)
     async with http.get("/api/runs") as answer:
         runs = await answer.json()
@@ -231,12 +256,16 @@ async def test_a_finished_run_can_be_scrubbed(http: aiohttp.ClientSession, stage
         marking.update(record["marking"])
     assert marking == stage.snapshot()["marking"] and run["fault"] == ""
     wrong = [f for record in run["records"] for f in record["firings"] if f["error"]]
-    assert [(f["transition"], f["reason"]["code"], f["action"]) for f in wrong] == [("pick_failed", "slipped", "pick")]
+    assert [(f["transition"], f["reason"]["code"], f["action"]) for f in wrong] == [
+        ("pick_failed", "slipped", "pick")
+    ]
     async with http.get("/api/runs/..%2f..") as answer:
         assert answer.status == 404
 
 
-async def test_the_page_and_the_journal_tell_the_same(http: aiohttp.ClientSession, stage: Stage) -> None:
+async def test_the_page_and_the_journal_tell_the_same(
+    http: aiohttp.ClientSession, stage: Stage
+) -> None:
     """Firings that clients saw live are those that the journal gives afterwards."""
     await finished(stage)
     live = [(f["transition"], f["error"]) for f in stage.snapshot()["firings"]]
@@ -250,7 +279,8 @@ async def test_the_page_and_the_journal_tell_the_same(http: aiohttp.ClientSessio
 async def test_nothing_that_takes_long_is_done_in_the_coordinator(
     http: aiohttp.ClientSession, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither in its loop nor in a thread of it, which would share the interpreter with the mission that is running."""
+    """Neither in its loop nor in a thread of it, which would share the interpreter with the mission
+    that is running."""
     await stage.command("ana", "take_controls", {})
     await stage.command("ana", "start", {"task": TASK})
 

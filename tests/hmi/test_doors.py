@@ -1,4 +1,5 @@
-"""Attacks on the page's server: each is refused or harmless, and those who may come in are still served."""
+"""Attacks on the page's server: each is refused or harmless, and those who may come in are still
+served."""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ from typing import Any
 import aiohttp
 import pytest
 
-from coordinator.hmi import requests
-from coordinator.hmi.doors import HEADERS, is_loopback, names_for
-from coordinator.hmi.feeds import CLIENTS
-from coordinator.hmi.gate import CONNECTIONS, Gate
-from coordinator.hmi.port import PROTOCOL
-from coordinator.hmi.server import Page, start_page
-from coordinator.hmi.sessions import LARGEST_MESSAGE
+from petrobot.coordinator.hmi import requests
+from petrobot.coordinator.hmi.doors import HEADERS, is_loopback, names_for
+from petrobot.coordinator.hmi.feeds import CLIENTS
+from petrobot.coordinator.hmi.gate import CONNECTIONS, Gate
+from petrobot.coordinator.hmi.port import PROTOCOL
+from petrobot.coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.hmi.sessions import LARGEST_MESSAGE
 from tests.hmi.stage import Stage
 from tests.waiting import beat
 
@@ -67,7 +68,9 @@ PATHS = (
 
 
 @pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize("wrong", ["", "?token=", "?token=wrong", "?token=open+sesam", "?token=%00%ff"])
+@pytest.mark.parametrize(
+    "wrong", ["", "?token=", "?token=wrong", "?token=open+sesam", "?token=%00%ff"]
+)
 async def test_without_the_token_nothing_is_given(page: Page, path: str, wrong: str) -> None:
     """Not even which files there are."""
     response = await ask(page, path + wrong)
@@ -76,7 +79,8 @@ async def test_without_the_token_nothing_is_given(page: Page, path: str, wrong: 
 
 
 async def test_the_token_becomes_a_cookie_and_leaves_the_address(page: Page) -> None:
-    """The first visit is answered by a redirect with a cookie that scripts cannot read and other sites do not send."""
+    """The first visit is answered by a redirect with a cookie that scripts cannot read and other
+    sites do not send."""
     first = await ask(page, "/?token=" + page.token, allow_redirects=False)
     assert (first.status, first.headers["Location"]) == (303, "/")
     cookie = first.headers["Set-Cookie"]
@@ -91,7 +95,15 @@ async def test_a_token_elsewhere_in_an_address_is_no_key(page: Page) -> None:
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "", "localhost.evil:{port}"]
+    "host",
+    [
+        "evil.example",
+        "evil.example:{port}",
+        "127.0.0.1",
+        "127.0.0.1:1",
+        "",
+        "localhost.evil:{port}",
+    ],
 )
 async def test_dns_rebinding_is_refused(page: Page, host: str) -> None:
     """A name that an attacker points at this machine gets nothing, whatever else is right."""
@@ -108,12 +120,15 @@ async def test_own_names_are_let_in(page: Page, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "origin", [EVIL, "null", "https://127.0.0.1:{port}", "http://127.0.0.1", "http://127.0.0.1:{port}.evil"]
+    "origin",
+    [EVIL, "null", "https://127.0.0.1:{port}", "http://127.0.0.1", "http://127.0.0.1:{port}.evil"],
 )
 async def test_other_origins_are_refused(page: Page, origin: str) -> None:
     """A page of another origin cannot use the operator's cookie, for WebSocket or POST."""
     headers = {"Origin": origin.format(port=port_of(page))}
-    assert (await ask(page, "/api/command", "POST", cookie=True, headers=headers, json={})).status == 403
+    assert (
+        await ask(page, "/api/command", "POST", cookie=True, headers=headers, json={})
+    ).status == 403
     async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
         await http.get(page.url)
         with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
@@ -124,7 +139,9 @@ async def test_other_origins_are_refused(page: Page, origin: str) -> None:
 async def test_a_browser_without_origin_cannot_change_anything(page: Page) -> None:
     """A cookie alone opens no WebSocket and posts nothing: every browser says its origin there."""
     assert (await ask(page, "/api/command", "POST", cookie=True, json={})).status == 403
-    assert (await ask(page, "/api/live", cookie=True, headers={"Upgrade": "websocket"})).status == 403
+    assert (
+        await ask(page, "/api/live", cookie=True, headers={"Upgrade": "websocket"})
+    ).status == 403
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
@@ -134,7 +151,9 @@ async def test_other_sites_get_nothing(page: Page, site: str, path: str) -> None
     assert (await ask(page, path, cookie=True, headers={"Sec-Fetch-Site": site})).status == 403
 
 
-@pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"])
+@pytest.mark.parametrize(
+    "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"]
+)
 async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
     """What a plain form of another site could send is no JSON, so it is not even read."""
     headers = {**bearer(page), "Content-Type": kind}
@@ -144,19 +163,25 @@ async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["/page/../server.py", "/page/%2e%2e/server.py", "/page/..%2fserver.py", "/page//etc/passwd"]
+    "path",
+    ["/page/../server.py", "/page/%2e%2e/server.py", "/page/..%2fserver.py", "/page//etc/passwd"],
 )
 async def test_files_beside_the_page_stay_hidden(page: Page, path: str) -> None:
     """Paths do not climb."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
-    head = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: Bearer {page.token}\r\n"
+    head = (
+        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: Bearer "
+        f"{page.token}\r\n"
+    )
     writer.write((head + "Connection: close\r\n\r\n").encode())
     answer = await reader.read()
     writer.close()
     assert answer.split()[1] in (b"403", b"404", b"400")
 
 
-@pytest.mark.parametrize("name", ["..%2f..%2fetc%2fpasswd", ".hidden", "a.b", "a" * 65, "%00", "-x"])
+@pytest.mark.parametrize(
+    "name", ["..%2f..%2fetc%2fpasswd", ".hidden", "a.b", "a" * 65, "%00", "-x"]
+)
 async def test_task_names_do_not_climb(page: Page, name: str) -> None:
     """A task's name is a name, not a path."""
     assert (await ask(page, f"/api/tasks/{name}", headers=bearer(page))).status in (400, 404)
@@ -169,32 +194,48 @@ async def test_task_names_do_not_climb(page: Page, name: str) -> None:
 async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
     """What is no JSON object, too deep or too large ends in one clear refusal."""
     headers = {**bearer(page), "Content-Type": "application/json"}
-    assert (await ask(page, "/api/check", "POST", headers=headers, data=io.BytesIO(body.encode()))).status in (400, 413)
+    assert (
+        await ask(page, "/api/check", "POST", headers=headers, data=io.BytesIO(body.encode()))
+    ).status in (400, 413)
 
 
 async def test_every_answer_carries_the_headers(page: Page) -> None:
     """Strict content policy, no sniffing, no framing, no referrer: on pages, data and refusals."""
-    for path, headers in (("/", bearer(page)), ("/api/tasks", bearer(page)), ("/nowhere", bearer(page)), ("/", {})):
+    for path, headers in (
+        ("/", bearer(page)),
+        ("/api/tasks", bearer(page)),
+        ("/nowhere", bearer(page)),
+        ("/", {}),
+    ):
         response = await ask(page, path, headers=headers)
         assert {name: response.headers.get(name) for name in HEADERS} == HEADERS
     policy = HEADERS["Content-Security-Policy"]
-    assert "unsafe" not in policy and "default-src 'none'" in policy and "frame-ancestors 'none'" in policy
+    assert (
+        "unsafe" not in policy
+        and "default-src 'none'" in policy
+        and "frame-ancestors 'none'" in policy
+    )
 
 
 async def test_a_thousand_sockets_do_not_keep_the_operator_out(page: Page) -> None:
-    """Connections beyond the bound are closed at once; those that say nothing are closed later; a command gets through."""
+    """Connections beyond the bound are closed at once; those that say nothing are closed later; a
+    command gets through."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
     crowd: list[socket.socket] = []
     async with aiohttp.ClientSession(headers=bearer(page)) as http:
-        assert (await http.get(base(page) + "/api/snapshot")).status == 200  # the operator's connection is open
+        assert (
+            await http.get(base(page) + "/api/snapshot")
+        ).status == 200  # the operator's connection is open
         try:
             for _ in range(1_000):
                 crowd.append(socket.socket())
                 crowd[-1].setblocking(False)
                 crowd[-1].connect_ex(("127.0.0.1", port_of(page)))
                 await beat(0)
-            async with http.post(base(page) + "/api/command", json={"verb": "estop", "name": "ana"}) as answer:
+            async with http.post(
+                base(page) + "/api/command", json={"verb": "estop", "name": "ana"}
+            ) as answer:
                 assert answer.status == 200
             assert page.gate.turned_away >= 1_000 - CONNECTIONS
             assert page.gate.open_connections <= CONNECTIONS
@@ -215,13 +256,20 @@ async def test_silent_connections_are_closed(page: Page) -> None:
 
 
 async def test_scripts_use_the_token(page: Page, stage: Stage) -> None:
-    """A command over plain HTTP with a Bearer token, as the command line gives it; it has a name of its own."""
+    """A command over plain HTTP with a Bearer token, as the command line gives it; it has a name of
+    its own."""
     answer = await ask(
-        page, "/api/command", "POST", headers=bearer(page), json={"verb": "take_controls", "name": "cli"}
+        page,
+        "/api/command",
+        "POST",
+        headers=bearer(page),
+        json={"verb": "take_controls", "name": "cli"},
     )
     assert answer.status == 200
     assert stage.controls.holder is not None and stage.controls.holder.startswith("cli ")
-    refused = await ask(page, "/api/command", "POST", headers=bearer(page), json={"verb": "step", "name": "other"})
+    refused = await ask(
+        page, "/api/command", "POST", headers=bearer(page), json={"verb": "step", "name": "other"}
+    )
     assert refused.status == 409
 
 
@@ -229,7 +277,9 @@ INSIDE = ("127.0.0.1", "localhost", "::1", "127.3.4.5")
 OUTSIDE = ("0.0.0.0", "10.0.0.7", "robot.lab")
 
 
-@pytest.mark.parametrize(("host", "loopback"), [*((h, True) for h in INSIDE), *((h, False) for h in OUTSIDE)])
+@pytest.mark.parametrize(
+    ("host", "loopback"), [*((h, True) for h in INSIDE), *((h, False) for h in OUTSIDE)]
+)
 def test_loopback(host: str, loopback: bool) -> None:
     """Which addresses only this machine reaches."""
     assert is_loopback(host) is loopback
@@ -256,15 +306,22 @@ async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None
         await two.close()
 
 
-@pytest.mark.parametrize("path", ["/", "/page/index.html", "/page/js/main.js", "/api/tasks", "/api/runs", "/api/check"])
-async def test_without_the_page_only_the_protocol_is_served(stage: Stage, tasks: Any, path: str) -> None:
-    """`--no-page` leaves no file and no document within reach, even with the token; commands go on."""
+@pytest.mark.parametrize(
+    "path", ["/", "/page/index.html", "/page/js/main.js", "/api/tasks", "/api/runs", "/api/check"]
+)
+async def test_without_the_page_only_the_protocol_is_served(
+    stage: Stage, tasks: Any, path: str
+) -> None:
+    """`--no-page` leaves no file and no document within reach, even with the token; commands go
+    on."""
     bare = await start_page(stage, tasks_folder=tasks, page=False)
     try:
         assert (await ask(bare, path, headers=bearer(bare))).status == 404
         assert (await ask(bare, "/api/snapshot", headers=bearer(bare))).status == 200
         assert (await ask(bare, "/api/snapshot")).status == 401
-        answer = await ask(bare, "/api/command", "POST", headers=bearer(bare), json={"verb": "take_controls"})
+        answer = await ask(
+            bare, "/api/command", "POST", headers=bearer(bare), json={"verb": "take_controls"}
+        )
         assert answer.status == 200
     finally:
         await bare.close()
@@ -287,7 +344,10 @@ async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: 
         async with asyncio.timeout(60):
             while not bad.closed:
                 await bad.receive()
-        assert bad.close_code in (aiohttp.WSCloseCode.MESSAGE_TOO_BIG, aiohttp.WSCloseCode.ABNORMAL_CLOSURE)
+        assert bad.close_code in (
+            aiohttp.WSCloseCode.MESSAGE_TOO_BIG,
+            aiohttp.WSCloseCode.ABNORMAL_CLOSURE,
+        )
         await good.send_json({"type": "command", "id": 1, "verb": "take_controls"})
         async with asyncio.timeout(60):
             while (await good.receive_json())["type"] != "answer":
@@ -297,24 +357,33 @@ async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: 
 async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> None:
     """One more than there is room for is told so; a script's emergency stop needs no seat."""
     hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
-    async with aiohttp.ClientSession(headers=bearer(page), connector=aiohttp.TCPConnector(limit=0)) as http:
+    async with aiohttp.ClientSession(
+        headers=bearer(page), connector=aiohttp.TCPConnector(limit=0)
+    ) as http:
         seats = [await http.ws_connect(base(page) + "/api/live") for _ in range(CLIENTS)]
         for socket in seats:
             await socket.send_json(hello)
         with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
             await http.ws_connect(base(page) + "/api/live")
         assert refused.value.status == 503
-        async with http.post(base(page) + "/api/command", json={"verb": "estop", "name": "ana"}) as answer:
+        async with http.post(
+            base(page) + "/api/command", json={"verb": "estop", "name": "ana"}
+        ) as answer:
             assert answer.status == 200
         for socket in seats:
             await socket.close()
 
 
-async def test_a_body_that_never_ends_is_given_up(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_body_that_never_ends_is_given_up(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A command whose body drips in does not hold its handler for ever."""
     monkeypatch.setattr(requests, "BODY_S", 0.2)
     reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
-    head = f"POST /api/command HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: Bearer {page.token}\r\n"
+    head = (
+        f"POST /api/command HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: "
+        f"Bearer {page.token}\r\n"
+    )
     writer.write((head + "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{").encode())
     answer = await asyncio.wait_for(reader.readline(), 60)
     assert b"408" in answer

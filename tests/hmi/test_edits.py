@@ -1,4 +1,5 @@
-"""Editing a task file changes what was edited and nothing else: comments, order, spacing and every other byte stay."""
+"""Editing a task file changes what was edited and nothing else: comments, order, spacing and every
+other byte stay."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.hmi.edits import EditError, Rename, edited, parse, plain
+from petrobot.coordinator.hmi.edits import EditError, Rename, edited, parse, plain
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 FILES = [*sorted(SHIPPED.glob("*.toml")), *sorted((Path(__file__).parent / "tasks").glob("*.toml"))]
@@ -25,7 +26,9 @@ scalars = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False, width=32),
     st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=12),
 )
-values = st.recursive(scalars, lambda v: st.lists(v, max_size=3) | st.dictionaries(names, v, max_size=3), max_leaves=6)
+values = st.recursive(
+    scalars, lambda v: st.lists(v, max_size=3) | st.dictionaries(names, v, max_size=3), max_leaves=6
+)
 blanks = st.sampled_from(["", " ", "  "])
 comments = st.sampled_from(["", "  # why it is so", ' # 1 [not.a.header] = "text"'])
 
@@ -66,7 +69,9 @@ def files(draw: st.DrawFn) -> str:
             lines += ["# about " + name] if draw(st.booleans()) else []
             lines.append(f"[{group}.{name}]" + draw(comments))
             for key, value in draw(st.dictionaries(names, values, max_size=4)).items():
-                lines.append(f"{draw(blanks)}{key}{draw(blanks)}={draw(blanks)}{written(value)}{draw(comments)}")
+                lines.append(
+                    f"{draw(blanks)}{key}{draw(blanks)}={draw(blanks)}{written(value)}{draw(comments)}"
+                )
             lines += [""] * draw(st.integers(0, 2))
     return "\n".join(lines) + draw(st.sampled_from(["", "\n", "\n\n# end\n"]))
 
@@ -90,14 +95,18 @@ def test_saving_any_file_without_an_edit_changes_nothing(text: str) -> None:
 def test_one_edit_changes_one_line(text: str, data: st.DataObject) -> None:
     """A changed value replaces its own line and no other, and its comment stays."""
     document = plain(parse(text))
-    group = data.draw(st.sampled_from([g for g in ("places", "transitions", "events") if document.get(g)]))
+    group = data.draw(
+        st.sampled_from([g for g in ("places", "transitions", "events") if document.get(g)])
+    )
     table = document[group][data.draw(st.sampled_from(sorted(document[group])))]
     if not table:
         return
     key = data.draw(st.sampled_from(sorted(table)))
     if isinstance(table[key], dict):
         return
-    from_a_page = scalars.filter(lambda v: not isinstance(v, float) and (not isinstance(v, int) or abs(v) < 2**53))
+    from_a_page = scalars.filter(
+        lambda v: not isinstance(v, float) and (not isinstance(v, int) or abs(v) < 2**53)
+    )
     table[key] = data.draw(from_a_page.filter(lambda v: v != table[key]))
     result = edited(text, through_a_browser(document))
     before, after = text.split("\n"), result.split("\n")
@@ -119,7 +128,9 @@ def test_other_lines_outlive_a_new_and_a_deleted_element(text: str, data: st.Dat
     grown["places"][name] = {"kind": "control", "x": 10, "y": 20, "args": {"p": {"var": "q"}}}
     result = edited(text, grown)
     left = iter(result.split("\n"))
-    assert all(line in left for line in text.split("\n") if line.strip()), "a line was lost or moved"
+    assert all(line in left for line in text.split("\n") if line.strip()), (
+        "a line was lost or moved"
+    )
     back = plain(parse(edited(result, document)))
     assert back == document
 
@@ -136,7 +147,9 @@ def test_a_renamed_element_keeps_its_place_and_comments() -> None:
 def test_a_rename_that_cannot_be_done_in_place_is_written_anew() -> None:
     """Inline tables have no header to rename; the document is right all the same."""
     text = "schema = 1\n[places]\na = {kind = 'control'} # first\n"
-    result = edited(text, {"schema": 1, "places": {"b": {"kind": "control"}}}, [Rename(("places",), "a", "b")])
+    result = edited(
+        text, {"schema": 1, "places": {"b": {"kind": "control"}}}, [Rename(("places",), "a", "b")]
+    )
     assert plain(parse(result)) == {"schema": 1, "places": {"b": {"kind": "control"}}}
 
 
@@ -157,7 +170,8 @@ def test_lists_keep_their_layout() -> None:
 
 
 def test_what_json_cannot_hold_survives() -> None:
-    """Dates, infinities and huge integers go to the page as text and are not altered by coming back."""
+    """Dates, infinities and huge integers go to the page as text and are not altered by coming
+    back."""
     text = "when = 2026-01-02T03:04:05Z\nlimit = inf\nbig = 123456789012345678901\nodd = nan\n"
     assert edited(text, through_a_browser(plain(parse(text)))) == text
 

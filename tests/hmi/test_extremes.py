@@ -1,5 +1,6 @@
-"""What nobody designed for: names of eighty letters, markup and other alphabets, sixty places, twelve nodes, hundreds of errors;
-on a laptop, a wall, and zoomed to twice the size: nothing is cut off, nothing runs over its neighbour, all of it is text."""
+"""What nobody designed for: names of eighty letters, markup and other alphabets, sixty places,
+twelve nodes, hundreds of errors; on a laptop, a wall, and zoomed to twice the size: nothing is cut
+off, nothing runs over its neighbour, all of it is text."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi.server import Page
+from petrobot.coordinator.hmi.server import Page
 from tests.hmi.conftest import PATIENCE_MS, browser_missing, served, staged
 from tests.hmi.stage import Stage
 
@@ -28,13 +29,21 @@ LONG = ("a_name_that_somebody_wrote_down_without_any_thought_of_screens_or_of_re
 OTHER = "Überprüfung_der_Zange_für_日本語_und_العربية"
 MARKUP = "<img src=x onerror=\"document.title='owned'\"><b>bold</b> &amp; &lt;"
 NAMES = (LONG, OTHER, MARKUP)
-SIZES = [(1280, 720, 1, "light"), (1920, 1080, 1, "dark"), (640, 360, 2, "light"), (640, 360, 2, "dark")]
+SIZES = [
+    (1280, 720, 1, "light"),
+    (1920, 1080, 1, "dark"),
+    (640, 360, 2, "light"),
+    (640, 360, 2, "dark"),
+]
 
 
 @pytest_asyncio.fixture(loop_scope="module")
 async def page(tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
     """A mission of extremes."""
-    async with staged(tasks, tmp_path / "runs") as stage, served(stage, tasks, tmp_path / "runs") as made:
+    async with (
+        staged(tasks, tmp_path / "runs") as stage,
+        served(stage, tasks, tmp_path / "runs") as made,
+    ):
         crowd(stage)
         yield made
 
@@ -44,7 +53,14 @@ def crowd(stage: Stage) -> None:
     drawn = stage.feed.state["task"]
     kinds = ("control", "resource", "action")
     like = {p["kind"]: p for p in drawn["places"]}
-    place: dict[str, Any] = {"tokens": 0, "capacity": None, "label": "", "in_macro": "", "args": {}, "error": False}
+    place: dict[str, Any] = {
+        "tokens": 0,
+        "capacity": None,
+        "label": "",
+        "in_macro": "",
+        "args": {},
+        "error": False,
+    }
     places = [
         {
             **like.get(kinds[i % 3], like["control"]),
@@ -53,13 +69,22 @@ def crowd(stage: Stage) -> None:
             "kind": kinds[i % 3],
             "label": NAMES[i % 3] if i % 4 else "",
         }
-        | {"x": 80 + i % 10 * 170, "y": 80 + i // 10 * 130, "primitive_task": "look" if i % 3 == 2 else ""}
+        | {
+            "x": 80 + i % 10 * 170,
+            "y": 80 + i // 10 * 130,
+            "primitive_task": "look" if i % 3 == 2 else "",
+        }
         for i in range(60)
     ]
     task = {**drawn, "name": LONG, "places": places, "transitions": [], "arcs": []}
-    nodes = {f"{NAMES[i % 3]} {i}": {"state": ("up", "lost", "connecting")[i % 3], "text": LONG} for i in range(12)}
+    nodes = {
+        f"{NAMES[i % 3]} {i}": {"state": ("up", "lost", "connecting")[i % 3], "text": LONG}
+        for i in range(12)
+    }
     known = {"probability": 0.5, "reliability": 0.9, "cost": 1.25, "j": 0.3}
-    selectors = {"look": {"alternatives": [{"action": name, **known} for name in NAMES], "override": None}}
+    selectors = {
+        "look": {"alternatives": [{"action": name, **known} for name in NAMES], "override": None}
+    }
     mission = {
         **stage.feed.state["mission"],
         "state": "running",
@@ -68,7 +93,9 @@ def crowd(stage: Stage) -> None:
         "from": {"run": LONG, "record": 123456},
     }
     controls = {"holder": f"{OTHER[:24]} 1234", "asking": [f"{LONG[:24]} 5678"]}
-    stage.feed.replace(task=task, mission=mission, nodes=nodes, selectors=selectors, controls=controls)
+    stage.feed.replace(
+        task=task, mission=mission, nodes=nodes, selectors=selectors, controls=controls
+    )
     reason = {"status": "error", "code": LONG, "text": MARKUP * 5, "executed": "unknown"}
     for i in range(500):
         run = {
@@ -86,7 +113,12 @@ def crowd(stage: Stage) -> None:
         )
         if i < 495:
             stage.feed.emit(
-                "run_ended", id=f"p2#{i}", status="error", ended=i / 10 + 0.08, reason=reason, cancelled=False
+                "run_ended",
+                id=f"p2#{i}",
+                status="error",
+                ended=i / 10 + 0.08,
+                reason=reason,
+                cancelled=False,
             )
         firing = {
             "number": i,
@@ -109,9 +141,17 @@ def crowd(stage: Stage) -> None:
             "y": "probability",
             "series": [LONG, OTHER],
         }
-        stage.feed.emit("report", name=name, report={**curve, "columns": [[1, 2, 3], [0.5, 0.6, 0.7], [0.5, 0.4, 0.3]]})
+        stage.feed.emit(
+            "report",
+            name=name,
+            report={**curve, "columns": [[1, 2, 3], [0.5, 0.6, 0.7], [0.5, 0.4, 0.3]]},
+        )
     answers = ("held", "cannot_hold", "stopped", "lost")
-    paused = {"reason": LONG, "at": 3.0, "nodes": {node: answers[i % 4] for i, node in enumerate(nodes)}}
+    paused = {
+        "reason": LONG,
+        "at": 3.0,
+        "nodes": {node: answers[i % 4] for i, node in enumerate(nodes)},
+    }
     stage.feed.emit("paused", paused=paused)
     stage.feed.emit("marking", marking={"p0": 123456, "p2": 1})
 
@@ -135,7 +175,8 @@ OVERLAP = """(box) => {
 
 
 async def nothing_is_cut(tab: Tab) -> None:
-    """No control of header, bars and lists is outside the window or over another; the emergency stop is in sight."""
+    """No control of header, bars and lists is outside the window or over another; the emergency
+    stop is in sight."""
     assert await tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
     for box in (
         ".top button",
@@ -151,13 +192,22 @@ async def nothing_is_cut(tab: Tab) -> None:
     size = tab.viewport_size
     assert stop is not None and size is not None
     assert (
-        stop["y"] >= 0 and stop["y"] + stop["height"] <= size["height"] and stop["x"] + stop["width"] <= size["width"]
+        stop["y"] >= 0
+        and stop["y"] + stop["height"] <= size["height"]
+        and stop["x"] + stop["width"] <= size["width"]
     )
 
 
 @pytest.mark.parametrize(("width", "height", "zoom", "theme"), SIZES)
 async def test_nothing_is_cut(
-    browser: Browser, page: Page, shots: Path, faults: Watch, width: int, height: int, zoom: int, theme: Any
+    browser: Browser,
+    page: Page,
+    shots: Path,
+    faults: Watch,
+    width: int,
+    height: int,
+    zoom: int,
+    theme: Any,
 ) -> None:
     """Every tab of the page, in both colours, at every size."""
     context = await browser.new_context(

@@ -1,4 +1,5 @@
-"""Task files as different people format them: nothing edited, nothing changed; one thing edited, the rest stays as it was."""
+"""Task files as different people format them: nothing edited, nothing changed; one thing edited,
+the rest stays as it was."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Any
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from coordinator.hmi.edits import edited, parse, plain
+from petrobot.coordinator.hmi.edits import edited, parse, plain
 
 comments = st.sampled_from(["", " # why", '   # [places.p0] = "1"', "\t# tab"])
 equals = st.sampled_from([" = ", "=", "  =  ", " =\t"])
@@ -38,13 +39,20 @@ def place(draw: st.DrawFn, name: str, way: str) -> tuple[str, str]:
         position = f", x = {draw(numbers)}, y={draw(numbers)}" if where else ""
         return "", f"{name}{eq}{{kind={kind}{position}}}{end}\n"
     if way == "dotted":
-        return "", f"{name}.kind{eq}{kind}{end}\n" + (f"{name}.x = {draw(numbers)}\n" if where else "")
+        return "", f"{name}.kind{eq}{kind}{end}\n" + (
+            f"{name}.x = {draw(numbers)}\n" if where else ""
+        )
     key = json.dumps(name) if way == "quoted" else name
-    lines = [f"{draw(st.sampled_from(['', '  ']))}[ places . {key} ]{end}", f"kind{eq}{kind}{draw(comments)}"]
+    lines = [
+        f"{draw(st.sampled_from(['', '  ']))}[ places . {key} ]{end}",
+        f"kind{eq}{kind}{draw(comments)}",
+    ]
     lines += [f"x{eq}{draw(numbers)}{draw(comments)}", "y = 2"] if where else []
     lines += draw(
         st.lists(
-            st.sampled_from(["args = { v = {var='q'}, w= [1,2 ,3] } # args", "", "# said after it"]),
+            st.sampled_from(
+                ["args = { v = {var='q'}, w= [1,2 ,3] } # args", "", "# said after it"]
+            ),
             max_size=2,
             unique=True,
         )
@@ -58,7 +66,12 @@ def transition(draw: st.DrawFn, name: str) -> str:
     """One transition with its arcs on one line or several."""
     took = draw(
         st.sampled_from(
-            ['in = ["p0"]', 'in = [\n  "p0", # first\n]', "in=['p0' , ]", 'in = [\n\t"p0",\n\n\t"p1*2" # two\n\t]']
+            [
+                'in = ["p0"]',
+                'in = [\n  "p0", # first\n]',
+                "in=['p0' , ]",
+                'in = [\n\t"p0",\n\n\t"p1*2" # two\n\t]',
+            ]
         )
     )
     gave = draw(st.sampled_from(["out = []", 'out = ["p0*2"]', "out = [ # none\n]"]))
@@ -68,16 +81,26 @@ def transition(draw: st.DrawFn, name: str) -> str:
 @st.composite
 def task_files(draw: st.DrawFn) -> str:
     """A whole file: sections in any order, LF or CR LF, with or without an end of the last line."""
-    made = [draw(place(f"p{i}", draw(st.sampled_from(WAYS)))) for i in range(draw(st.integers(1, 4)))]
+    made = [
+        draw(place(f"p{i}", draw(st.sampled_from(WAYS)))) for i in range(draw(st.integers(1, 4)))
+    ]
     common = "".join(lines for _, lines in made)
-    text = draw(st.sampled_from(["", "text = '''\nof\n lines'''\n", 'text = """a \\\n   b"""\n', "parameters.a = 1\n"]))
+    text = draw(
+        st.sampled_from(
+            ["", "text = '''\nof\n lines'''\n", 'text = """a \\\n   b"""\n', "parameters.a = 1\n"]
+        )
+    )
     blocks = [block for block, _ in made if block] + ([f"[places]\n{common}"] if common else [])
     blocks += [draw(transition(f"t{i}")) for i in range(draw(st.integers(1, 3)))]
     blocks.append(f"[task]{draw(comments)}\nname{draw(equals)}'x'\nfinal = \"p0 == 1\"\n{text}")
-    blocks += draw(st.sampled_from([[], ["[[extra]]\na = 1\n", "[[extra]]\na = 2 # two\n[extra.sub]\nb=1\n"]]))
+    blocks += draw(
+        st.sampled_from([[], ["[[extra]]\na = 1\n", "[[extra]]\na = 2 # two\n[extra.sub]\nb=1\n"]])
+    )
     if len(blocks) < 4 or not blocks[-1].startswith("[[extra]]"):
         blocks = draw(st.permutations(blocks))
-    whole = f"# top\nschema = 1{draw(comments)}\n" + "".join(draw(blank) + block for block in blocks)
+    whole = f"# top\nschema = 1{draw(comments)}\n" + "".join(
+        draw(blank) + block for block in blocks
+    )
     whole = whole if draw(st.booleans()) else whole.rstrip("\n")
     return whole.replace("\n", draw(st.sampled_from(["\n", "\r\n"])))
 
@@ -92,7 +115,9 @@ def document_of(text: str) -> dict[str, Any]:
 
 
 many = settings(
-    max_examples=60, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much], deadline=None
+    max_examples=60,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+    deadline=None,
 )
 
 
@@ -106,7 +131,8 @@ def test_what_was_not_edited_is_the_same_file(text: str) -> None:
 @many
 @given(task_files(), st.data())
 def test_an_edit_keeps_all_other_lines_and_comments(text: str, data: st.DataObject) -> None:
-    """A place moved, put into a macro place, an arc or element added: no line of others is lost, and line ends are kept."""
+    """A place moved, put into a macro place, an arc or element added: no line of others is lost,
+    and line ends are kept."""
     document = document_of(text)
     wanted = copy.deepcopy(document)
     name = data.draw(st.sampled_from(sorted(document["places"])))
@@ -124,9 +150,13 @@ def test_an_edit_keeps_all_other_lines_and_comments(text: str, data: st.DataObje
         wanted["transitions"]["fresh"] = {"in": ["p0"], "out": [], "x": 1, "y": 2}
     result = edited(text, sent_back(wanted))
     assert sent_back(plain(parse(result))) == sent_back(wanted)
-    assert ("\r\n" in text) == ("\r\n" in result) and (("\r\n" not in text) or "\n" not in result.replace("\r\n", ""))
+    assert ("\r\n" in text) == ("\r\n" in result) and (
+        ("\r\n" not in text) or "\n" not in result.replace("\r\n", "")
+    )
     assert result.count("#") >= text.count("#"), "a comment was lost"
     kept = result.splitlines()
     changed = [line for line in text.splitlines() if line.strip() and line not in kept]
     assert len(changed) <= 2, changed
-    assert sent_back(plain(parse(edited(result, sent_back(document))))) == sent_back(document), "undone"
+    assert sent_back(plain(parse(edited(result, sent_back(document))))) == sent_back(document), (
+        "undone"
+    )

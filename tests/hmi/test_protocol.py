@@ -1,4 +1,5 @@
-"""The live protocol over a real WebSocket: snapshot first, no gaps, slow clients, commands and who may give them."""
+"""The live protocol over a real WebSocket: snapshot first, no gaps, slow clients, commands and who
+may give them."""
 
 from __future__ import annotations
 
@@ -11,9 +12,9 @@ from typing import Any
 import aiohttp
 import pytest
 
-from coordinator.hmi import house, sessions
-from coordinator.hmi.changes import apply
-from coordinator.hmi.server import Page
+from petrobot.coordinator.hmi import house, sessions
+from petrobot.coordinator.hmi.changes import apply
+from petrobot.coordinator.hmi.server import Page
 from tests.hmi.stage import Stage
 from tests.waiting import beat
 
@@ -56,7 +57,9 @@ class Client:
     async def command(self, verb: str, **data: Any) -> dict[str, Any]:
         """Give a command and wait for its answer."""
         self._number += 1
-        await self.socket.send_json({"type": "command", "id": self._number, "verb": verb, "data": data})
+        await self.socket.send_json(
+            {"type": "command", "id": self._number, "verb": verb, "data": data}
+        )
         async with asyncio.timeout(60):
             while self._number not in self.answers:
                 await self.hear()
@@ -83,16 +86,21 @@ async def test_late_joiners_see_the_same(page: Page, stage: Stage) -> None:
         async with joined(page, "ben", "2") as late:
             await late.until(lambda s: len(s["firings"]) >= 3)
             target = stage.feed.state["sequence"]
-            await asyncio.gather(*(c.until(lambda s: s["sequence"] >= target) for c in (first, late)))
+            await asyncio.gather(
+                *(c.until(lambda s: s["sequence"] >= target) for c in (first, late))
+            )
             assert (await first.command("pause"))["ok"]
             last = stage.feed.state["sequence"]
             await asyncio.gather(*(c.until(lambda s: s["sequence"] >= last) for c in (first, late)))
             for client in (first, late):
-                assert {k: v for k, v in client.state.items() if k != "you"} == json.loads(json.dumps(stage.snapshot()))
+                assert {k: v for k, v in client.state.items() if k != "you"} == json.loads(
+                    json.dumps(stage.snapshot())
+                )
 
 
 async def test_a_slow_client_gets_less_and_holds_nobody_up(page: Page, stage: Stage) -> None:
-    """One client that reads nothing for thousands of changes costs bounded room and is caught up by one message."""
+    """One client that reads nothing for thousands of changes costs bounded room and is caught up by
+    one message."""
     async with joined(page, "slow") as slow, joined(page, "quick", "2") as quick:
         await slow.until(lambda s: True)
         await quick.until(lambda s: True)
@@ -114,14 +122,17 @@ async def test_firings_beyond_bounds_become_a_snapshot(page: Page, stage: Stage)
     async with joined(page) as client:
         await client.until(lambda s: True)
         for number in range(5_000):
-            stage.feed.emit("fired", firing={"number": number, "transition": "begin", "at": 0.0, "error": False})
+            stage.feed.emit(
+                "fired", firing={"number": number, "transition": "begin", "at": 0.0, "error": False}
+            )
         await client.until(lambda s: s["sequence"] == stage.feed.state["sequence"])
         assert client.snapshots == 2
         assert client.state["firings"][-1]["number"] == 4_999
 
 
 async def test_controls_are_held_by_one_and_asked_for(page: Page, stage: Stage) -> None:
-    """A second operator is refused, asks, and is handed the controls; an emergency stop is everybody's."""
+    """A second operator is refused, asks, and is handed the controls; an emergency stop is
+    everybody's."""
     async with joined(page) as ana, joined(page, "ben", "2") as ben:
         await ben.until(lambda s: True)
         assert (await ana.command("take_controls"))["ok"]
@@ -140,7 +151,8 @@ async def test_controls_are_held_by_one_and_asked_for(page: Page, stage: Stage) 
 async def test_controls_go_free_when_their_holder_is_gone(
     page: Page, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A holder whose last window was closed does not block the others for ever; one that only reloads keeps them."""
+    """A holder whose last window was closed does not block the others for ever; one that only
+    reloads keeps them."""
     monkeypatch.setattr(house, "ABSENT_S", 0.3)
     async with joined(page, "ben", "2") as ben:
         async with joined(page) as ana:
@@ -173,7 +185,8 @@ async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage)
 
 
 async def test_the_command_that_ends_the_run_is_answered(page: Page, stage: Stage) -> None:
-    """The coordinator closes while it is still being carried out: whoever gave it hears that it was."""
+    """The coordinator closes while it is still being carried out: whoever gave it hears that it
+    was."""
     begun, closing = asyncio.Event(), asyncio.Event()
 
     async def last(who: str, data: Any) -> dict[str, Any]:
@@ -243,14 +256,18 @@ async def test_hello_comes_first(page: Page) -> None:
     address = page.url.partition("?")[0] + "api/live"
     headers = {"Authorization": f"Bearer {page.token}"}
     for first in ({"type": "command", "id": 1, "verb": "estop"}, {"type": "hello", "protocol": 99}):
-        async with aiohttp.ClientSession() as http, http.ws_connect(address, headers=headers) as socket:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(address, headers=headers) as socket,
+        ):
             await socket.send_json(first)
             message = await socket.receive(timeout=60)
             assert message.type is aiohttp.WSMsgType.CLOSE
 
 
 async def test_strange_values_do_not_end_the_feed(page: Page, stage: Stage) -> None:
-    """Infinities, not-a-numbers and objects that JSON does not know still reach the client as something readable."""
+    """Infinities, not-a-numbers and objects that JSON does not know still reach the client as
+    something readable."""
     async with joined(page) as client:
         await client.until(lambda s: True)
         stage.feed.emit("variable", name="odd", value=[float("inf"), float("nan"), {1, 2}, 1 + 2j])

@@ -1,4 +1,5 @@
-"""`petrobot serve` as its own process over node processes, driven through the page alone: draw, run, step in, look back."""
+"""`petrobot serve` as its own process over node processes, driven through the page alone: draw,
+run, step in, look back."""
 
 from __future__ import annotations
 
@@ -88,7 +89,12 @@ async def serving(folder: Path) -> AsyncIterator[Served]:
     """`petrobot serve --up --mock` in a folder of its own."""
     (folder / "services.toml").write_text(SERVICES.format(*free_ports(2)), encoding="utf-8")
     (folder / "script.toml").write_text(SCRIPT, encoding="utf-8")
-    command = ["-c", "import sys; from coordinator.cli import main; sys.exit(main())", "serve", "--up"]
+    command = [
+        "-c",
+        "import sys; from petrobot.coordinator.cli import main; sys.exit(main())",
+        "serve",
+        "--up",
+    ]
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, *command, "--mock", "script.toml"),
         cwd=folder,
@@ -128,7 +134,8 @@ async def window(browser: Browser, served: Served, theme: str = "light") -> Asyn
 async def test_a_new_user_draws_a_task_and_runs_it_on_the_cell(
     browser: Browser, served: Served, shots: Path, faults: Watch
 ) -> None:
-    """The whole way on real nodes: draw, start, pause, step, one run more, why it failed, start again, look back, goodbye."""
+    """The whole way on real nodes: draw, start, pause, step, one run more, why it failed, start
+    again, look back, goodbye."""
     async with window(browser, served) as tab:
         complaints = faults(tab)
         await expect(tab.get_by_role("region", name="Nodes")).to_contain_text("2 of 2 up")
@@ -175,15 +182,20 @@ async def lead_by_hand(tab: Tab, shots: Path) -> None:
     why = fired.filter(has_text="slipped").first
     await expect(why).to_contain_text("pick part on arm: the part slipped out of the gripper")
     await why.get_by_role("button").click()
-    await expect(tab.get_by_role("region", name="Selected")).to_contain_text("the part slipped out of the gripper")
+    await expect(tab.get_by_role("region", name="Selected")).to_contain_text(
+        "the part slipped out of the gripper"
+    )
     await tab.screenshot(path=shots / "serve-why.png")
 
 
 async def start_again(tab: Tab, shots: Path) -> None:
-    """Choose the task in the bar and start it once more, with a breakpoint set before; the shipped tasks are listed."""
+    """Choose the task in the bar and start it once more, with a breakpoint set before; the shipped
+    tasks are listed."""
     toolbar = tab.get_by_role("toolbar", name="Mission")
     mission = tab.get_by_role("status", name="Mission state")
-    await expect(toolbar.get_by_label("Task to start").locator("option", has_text="(shipped)").first).to_be_attached()
+    await expect(
+        toolbar.get_by_label("Task to start").locator("option", has_text="(shipped)").first
+    ).to_be_attached()
     await toolbar.get_by_label("Task to start").select_option("")
     await toolbar.get_by_label("Task to start").select_option("drawn")
     await expect(mission).to_contain_text("Idle")
@@ -198,16 +210,23 @@ async def start_again(tab: Tab, shots: Path) -> None:
 async def look_back(tab: Tab, shots: Path) -> None:
     """Both runs are in the history; the first one holds the error."""
     await tab.get_by_role("tab", name="History").click()
-    runs = tab.get_by_role("navigation", name="Runs").get_by_role("button", name=re.compile("^drawn-"))
+    runs = tab.get_by_role("navigation", name="Runs").get_by_role(
+        "button", name=re.compile("^drawn-")
+    )
     await expect(runs).to_have_count(2)
     await runs.last.click()
     await tab.get_by_role("button", name="Previous error").click()
-    await expect(tab.get_by_role("complementary", name="Records")).to_contain_text("slipped out of the gripper")
+    await expect(tab.get_by_role("complementary", name="Records")).to_contain_text(
+        "slipped out of the gripper"
+    )
     await tab.screenshot(path=shots / "serve-history.png")
 
 
-async def test_what_cannot_start_says_why_on_the_page(browser: Browser, served: Served, shots: Path) -> None:
-    """A shipped task for which this cell has no nodes is listed, drawn, and refused with the reason; its copy is one's own."""
+async def test_what_cannot_start_says_why_on_the_page(
+    browser: Browser, served: Served, shots: Path
+) -> None:
+    """A shipped task for which this cell has no nodes is listed, drawn, and refused with the
+    reason; its copy is one's own."""
     async with window(browser, served, "dark") as tab:
         await tab.get_by_role("button", name="Take controls").click()
         toolbar = tab.get_by_role("toolbar", name="Mission")
@@ -225,4 +244,6 @@ async def test_what_cannot_start_says_why_on_the_page(browser: Browser, served: 
         await expect(tab.get_by_label("Task", exact=True).locator("option:checked")).to_have_text(
             "catch ball (my copy)"
         )
-        assert 'goal = "mine"' in (served.folder / "tasks" / "catch_ball.toml").read_text(encoding="utf-8")
+        assert 'goal = "mine"' in (served.folder / "tasks" / "catch_ball.toml").read_text(
+            encoding="utf-8"
+        )

@@ -1,4 +1,5 @@
-"""From the page alone, in a real browser, by role and name: start with options, learn, set out from a point, stop and clear."""
+"""From the page alone, in a real browser, by role and name: start with options, learn, set out from
+a point, stop and clear."""
 
 from __future__ import annotations
 
@@ -10,10 +11,10 @@ from pathlib import Path
 import pytest
 import pytest_asyncio
 
-from coordinator.hmi.journals import JournalHistory
-from coordinator.hmi.server import Page, start_page
-from coordinator.record.journal import read_journal
-from coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.hmi.journals import JournalHistory
+from petrobot.coordinator.hmi.server import Page, start_page
+from petrobot.coordinator.record.journal import read_journal
+from petrobot.coordinator.record.runfolder import JOURNAL
 from tests.hmi.conftest import PATIENCE_MS, browser_missing
 from tests.station.conftest import TASK
 from tests.station.test_starting import REMARKED, Simulated
@@ -44,7 +45,11 @@ async def page(cell: Simulated) -> AsyncIterator[Page]:
     """Its page."""
     history, offers, form = JournalHistory(cell.runs), cell.station.offers, cell.station.form
     made = await start_page(
-        cell.station, tasks_folder=cell.folder / "tasks", offers=offers, history=history, starts=form
+        cell.station,
+        tasks_folder=cell.folder / "tasks",
+        offers=offers,
+        history=history,
+        starts=form,
     )
     yield made
     await made.close()
@@ -69,7 +74,8 @@ async def chosen(tab: Tab, task: str) -> Locator:
 async def test_everything_that_the_command_line_takes(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """Mode, runs, seed, parameters of each type and learning; what is wrong is told in the form, which stays open."""
+    """Mode, runs, seed, parameters of each type and learning; what is wrong is told in the form,
+    which stays open."""
     tab = await opened(browser, page)
     complaints = faults(tab)
     await expect(mission(tab)).to_contain_text("Idle")
@@ -101,22 +107,36 @@ async def test_everything_that_the_command_line_takes(
     [folder] = cell.runs.iterdir()
     header = read_journal(folder / JOURNAL).header
     assert (header["mode"], header["runs"], header["seed"]) == ("lockstep", 8, 77)
-    assert header["parameters"] == {"speed": 0.25, "quiet": True, "batch": "<b>B</b>", "count": 3, "regime": "calm"}
-    assert header["learning"]["selector"] == "thompson" and (cell.folder / "estimates" / "known.db").exists()
+    assert header["parameters"] == {
+        "speed": 0.25,
+        "quiet": True,
+        "batch": "<b>B</b>",
+        "count": 3,
+        "regime": "calm",
+    }
+    assert (
+        header["learning"]["selector"] == "thompson"
+        and (cell.folder / "estimates" / "known.db").exists()
+    )
     await learning_view(tab, shots)
     assert complaints == []
 
 
 async def learning_view(tab: Tab, shots: Path) -> None:
-    """Curves of probability and of J, what is known of each alternative, places coloured by J, and the choice fixed by hand."""
+    """Curves of probability and of J, what is known of each alternative, places coloured by J, and
+    the choice fixed by hand."""
     await tab.get_by_role("tab", name="Learning").click()
     panel = tab.get_by_role("tabpanel", name="Learning")
     await expect(
         panel.get_by_role("figure", name="look: probability of each alternative").locator("canvas")
     ).to_be_visible()
     await panel.get_by_label("Curves of").select_option("objective J")
-    await expect(panel.get_by_role("figure", name="look: J of each alternative").locator("canvas")).to_be_visible()
-    await expect(panel.get_by_role("figure", name="look: probability of each alternative")).to_have_count(0)
+    await expect(
+        panel.get_by_role("figure", name="look: J of each alternative").locator("canvas")
+    ).to_be_visible()
+    await expect(
+        panel.get_by_role("figure", name="look: probability of each alternative")
+    ).to_have_count(0)
     table = panel.get_by_role("table", name="What is known of the alternatives")
     await expect(table.get_by_role("row", name=re.compile("look at table"))).to_be_attached()
     await expect(table).to_contain_text("least J")
@@ -132,7 +152,8 @@ async def learning_view(tab: Tab, shots: Path) -> None:
 async def test_the_selector_is_overridden_and_frozen_from_the_page(
     browser: Browser, page: Page, cell: Simulated
 ) -> None:
-    """The reason of each choice is shown where the run is: the operator's, or the best of what was learned."""
+    """The reason of each choice is shown where the run is: the operator's, or the best of what was
+    learned."""
     await cell.say("take_controls")
     await cell.simulate(runs=4, learn={"file": "known", "selector": "nikolic_fu"})
     await cell.say("release_controls")
@@ -167,7 +188,9 @@ async def test_the_selector_is_overridden_and_frozen_from_the_page(
 
 async def again(tab: Tab, task: str) -> Locator:
     """The start form once more."""
-    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start with").click()
+    await (
+        tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start with").click()
+    )
     dialog = tab.get_by_role("dialog", name=f"Start {task}")
     await expect(dialog).to_be_visible()
     return dialog
@@ -176,7 +199,8 @@ async def again(tab: Tab, task: str) -> Locator:
 async def test_a_run_sets_out_from_a_point_of_another(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """Scrub to a moment, say what becomes of what went on, simulate, and see it live; its journal says where it comes from."""
+    """Scrub to a moment, say what becomes of what went on, simulate, and see it live; its journal
+    says where it comes from."""
     await cell.say("take_controls")
     first, _ = await cell.simulate(runs=3)
     await cell.say("release_controls")
@@ -188,7 +212,11 @@ async def test_a_run_sets_out_from_a_point_of_another(
     await tab.get_by_role("tab", name="Live").click()
     await tab.get_by_role("button", name="Take controls").click()
     await tab.get_by_role("tab", name="History").click()
-    await tab.get_by_role("navigation", name="Runs").get_by_role("button", name=re.compile(f"^{first}")).click()
+    await (
+        tab.get_by_role("navigation", name="Runs")
+        .get_by_role("button", name=re.compile(f"^{first}"))
+        .click()
+    )
     await expect(tab.locator(".history")).not_to_have_attribute("aria-busy", "true")
     await tab.get_by_role("button", name="First record").click()
     await tab.get_by_role("button", name="Next record").click()
@@ -205,11 +233,17 @@ async def test_a_run_sets_out_from_a_point_of_another(
     source = read_journal(cell.runs / made / JOURNAL).header["from"]
     assert (source["run"], source["going"]) == (first, {"look": "error"})
     await tab.get_by_role("tab", name="History").click()
-    await tab.get_by_role("navigation", name="Runs").get_by_role("button", name=re.compile(f"^{made}")).click()
+    await (
+        tab.get_by_role("navigation", name="Runs")
+        .get_by_role("button", name=re.compile(f"^{made}"))
+        .click()
+    )
     about = tab.get_by_role("complementary", name="Records").get_by_role("status")
     await expect(about).to_contain_text(f"from {first}")
     await tab.get_by_role("button", name=f"Compare with {first}").click()
-    await expect(about).to_contain_text("compared from there. The runs differ from firing 1: unseen here, seen there")
+    await expect(about).to_contain_text(
+        "compared from there. The runs differ from firing 1: unseen here, seen there"
+    )
     await tab.get_by_role("button", name="Go there").click()
     await tab.screenshot(path=shots / "compare-from.png")
     assert complaints == []
@@ -218,8 +252,11 @@ async def test_a_run_sets_out_from_a_point_of_another(
 async def test_the_emergency_stop_is_cleared_by_who_holds_the_controls(
     browser: Browser, page: Page, cell: Simulated, shots: Path, faults: Watch
 ) -> None:
-    """It stands until then, whatever the run came to; nothing starts; clearing asks once more; keyboard alone."""
-    cell.tasks.save_text("long", None, TASK.replace("[transitions.begin]", "[transitions.begin]\nafter = 3600.0"))
+    """It stands until then, whatever the run came to; nothing starts; clearing asks once more;
+    keyboard alone."""
+    cell.tasks.save_text(
+        "long", None, TASK.replace("[transitions.begin]", "[transitions.begin]\nafter = 3600.0")
+    )
     ana, ben = await opened(browser, page), await opened(browser, page)
     complaints = faults(ana)
     dialog = await chosen(ana, "long")
@@ -231,7 +268,9 @@ async def test_the_emergency_stop_is_cleared_by_who_holds_the_controls(
         await expect(mission(tab)).to_contain_text("Emergency stop")
         await expect(tab.get_by_role("button", name="Start", exact=True)).to_be_disabled()
     await expect(ben.get_by_role("button", name="Clear the stop")).to_be_disabled()
-    await expect(ben.get_by_role("button", name="Clear the stop")).to_have_attribute("title", "Take the controls first")
+    await expect(ben.get_by_role("button", name="Clear the stop")).to_have_attribute(
+        "title", "Take the controls first"
+    )
     await cell.until(lambda: cell.station._going is None)
     await expect(mission(ana)).to_contain_text("Emergency stop")
     clear = ana.get_by_role("button", name="Clear the stop")

@@ -12,11 +12,14 @@ import pytest
 PAGE = Path(__file__).parents[2] / "coordinator" / "hmi" / "page"
 VENDOR = PAGE / "vendor"
 LIST = tomllib.loads((VENDOR / "vendored.toml").read_text(encoding="utf-8"))
-OWN = sorted(p for p in PAGE.rglob("*") if p.suffix in (".js", ".css", ".html") and VENDOR not in p.parents)
+OWN = sorted(
+    p for p in PAGE.rglob("*") if p.suffix in (".js", ".css", ".html") and VENDOR not in p.parents
+)
 
 
 def test_each_file_is_the_one_that_was_taken() -> None:
-    """Hashes of all vendored files, none missing, none more; each library names its version and licence."""
+    """Hashes of all vendored files, none missing, none more; each library names its version and
+    licence."""
     listed: dict[str, str] = {}
     for name, library in LIST.items():
         assert library["version"] and library["licence"] and library["package"]
@@ -33,12 +36,25 @@ def test_each_file_is_the_one_that_was_taken() -> None:
 def test_nothing_comes_from_elsewhere(path: Path) -> None:
     """No address of another host, no markup built from text, no inline handler or style."""
     text = path.read_text(encoding="utf-8")
-    addresses = [a for a in re.findall(r"https?://[^\s\"'`)]+", text) if "www.w3.org" not in a and "${" not in a]
+    addresses = [
+        a
+        for a in re.findall(r"https?://[^\s\"'`)]+", text)
+        if "www.w3.org" not in a and "${" not in a
+    ]
     assert addresses == []
-    for forbidden in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval(", "new Function"):
+    for forbidden in (
+        "innerHTML",
+        "outerHTML",
+        "insertAdjacentHTML",
+        "document.write",
+        "eval(",
+        "new Function",
+    ):
         assert forbidden not in text
     if path.suffix == ".html":
-        assert not re.search(r"<(?:script|style)(?![^>]*(?:src|href))[^>]*>|\son\w+=|\sstyle=", text)
+        assert not re.search(
+            r"<(?:script|style)(?![^>]*(?:src|href))[^>]*>|\son\w+=|\sstyle=", text
+        )
 
 
 @pytest.mark.parametrize("path", [p for p in OWN if p.suffix == ".js"], ids=lambda p: p.name)

@@ -1,4 +1,5 @@
-"""Toys that hang for good, as badly as a process can: in C, with the interpreter held, so that nothing of Python runs any more."""
+"""Toys that hang for good, as badly as a process can: in C, with the interpreter held, so that
+nothing of Python runs any more."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from services.action import Context, Result, success
+from petrobot.services.action import Context, Result, success
 
 _HOLDING_THE_INTERPRETER = ctypes.PyDLL(None)
 
@@ -19,7 +20,8 @@ def hang() -> None:
 
 
 class Stand:
-    """A device that hangs in its cycle once a file is there; without `period` in its configuration it has no cycle."""
+    """A device that hangs in its cycle once a file is there; without `period` in its configuration
+    it has no cycle."""
 
     def __init__(self, config: Mapping[str, Any], ports: object) -> None:
         self.period = config.get("period")

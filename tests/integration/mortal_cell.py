@@ -1,8 +1,10 @@
-"""The catching task in lock step with a coordinator that is killed (SIGKILL) at given places of its journal, and resumed each time.
+"""The catching task in lock step with a coordinator that is killed (SIGKILL) at given places of its
+journal, and resumed each time.
 
-A process for itself, so that it forks from one thread: `mortal_cell.py FOLDER SERVICES SEED RUNS KILLS` with KILLS a JSON list of
-experiments, each a list of numbers: the first life of the coordinator is killed after its n-th operation on the journal (append,
-flush or sync), the next life after its own next number, the last one lives to the end. The laboratory and the nodes live in one
+A process for itself, so that it forks from one thread: `mortal_cell.py FOLDER SERVICES SEED RUNS
+KILLS` with KILLS a JSON list of experiments, each a list of numbers: the first life of the
+coordinator is killed after its n-th operation on the journal (append, flush or sync), the next life
+after its own next number, the last one lives to the end. The laboratory and the nodes live in one
 process of their own, which no kill touches. Prints one JSON line for each experiment.
 """
 
@@ -18,26 +20,33 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coordinator import launch
-from coordinator.cli.loading import load_task
-from coordinator.cli.replaying import recorded
-from coordinator.engine import Engine, Fired, Instruction, RunRecorded, State, Stimulus
-from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
-from coordinator.mission.lockstep_party import NAME, CoordinatorParty
-from coordinator.mission.mission import Mission
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import JournalStore
-from coordinator.record.runfolder import header
-from services.comm.cell import Delays
-from services.comm.directory import Directory, load, resolve
-from services.comm.lockstep import Member
+from petrobot.coordinator import launch
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.engine import Engine, Fired, Instruction, RunRecorded, State, Stimulus
+from petrobot.coordinator.launch import (
+    Setting,
+    lockstep_party,
+    make_mission,
+    resumed_mission,
+    with_runs,
+)
+from petrobot.coordinator.mission.lockstep_party import NAME, CoordinatorParty
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.record.runfolder import header
+from petrobot.services.comm.cell import Delays
+from petrobot.services.comm.directory import Directory, load, resolve
+from petrobot.services.comm.lockstep import Member
 from tests.ports import free_ports
 
 CELL = "cell"
 TASK = "catch_ball"
 SURVIVOR = 10**9
 PATIENCE = 120.0
-"""Seconds for a tick: the laboratory prepares an experiment between two of them, on a machine that may be busy."""
+"""Seconds for a tick: the laboratory prepares an experiment between two of them, on a machine that
+may be busy."""
 
 
 class MortalStore(JournalStore):
@@ -53,7 +62,9 @@ class MortalStore(JournalStore):
         if cls.operations == cls.lives:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+    def append(
+        self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
+    ) -> None:
         """An append, and perhaps the end."""
         super().append(now, stimulus, instructions, state)
         self.count()
@@ -106,7 +117,10 @@ class Experiment:
         folder.mkdir(parents=True)
         self._log = folder / "executed.txt"
         self._log.touch()
-        self._addresses = {name: ("127.0.0.1", port) for name, port in zip((CELL, NAME), free_ports(2), strict=True)}
+        self._addresses = {
+            name: ("127.0.0.1", port)
+            for name, port in zip((CELL, NAME), free_ports(2), strict=True)
+        }
         self._hosts = {**dict.fromkeys(self.directory.nodes, CELL), NAME: NAME}
 
     def run(self, kills: Sequence[int]) -> dict[str, Any]:
@@ -141,7 +155,9 @@ class Experiment:
 
     def _cell(self) -> None:
         counted = counting(self.directory, self._log)
-        parties = [lockstep_party(self.directory, node, counted) for node in self.directory.nodes.values()]
+        parties = [
+            lockstep_party(self.directory, node, counted) for node in self.directory.nodes.values()
+        ]
         member = self._member(CELL, parties, returning={NAME})
         member.open()
         member.run()
@@ -159,16 +175,25 @@ class Experiment:
     def _new(self) -> Mission:
         setting = Setting(self.task, runs=self.runs, seed=self._seed)
         given = {"services_path": str(self.directory.source), "seed": self._seed, "runs": self.runs}
-        text = Path(launch.__file__).with_name("tasks").joinpath(f"{TASK}.toml").read_text(encoding="utf-8")
+        text = (
+            Path(launch.__file__)
+            .with_name("tasks")
+            .joinpath(f"{TASK}.toml")
+            .read_text(encoding="utf-8")
+        )
         services = self.directory.source.read_text(encoding="utf-8")
-        first = header("m", text, services, "lockstep", {**given, "parameters": dict(self.task.parameters)})
+        first = header(
+            "m", text, services, "lockstep", {**given, "parameters": dict(self.task.parameters)}
+        )
         store = MortalStore(JournalWriter(self.folder / "run.journal", first), 0.0)
         return make_mission(self.directory, setting, "m", "lock step", store)
 
     def _resumed(self) -> tuple[Mission, Callable[[float], None]]:
         journal = read_journal(self.folder / "run.journal")
         devices = {a.name: a.device for a in self.directory.actions.values() if a.device}
-        return resumed_mission(self.directory, self.task, Engine(self.task, devices), journal, [], 0.0)
+        return resumed_mission(
+            self.directory, self.task, Engine(self.task, devices), journal, [], 0.0
+        )
 
     def _outcome(self, mission: Mission) -> dict[str, Any]:
         """What a kill must not change, and how many operations there are to be killed at."""
@@ -186,12 +211,15 @@ class Experiment:
         }
 
     def _book(self) -> dict[str, Any]:
-        """What the journal and the nodes say of the calls: executed how often, unknown, and every firing one of the net."""
+        """What the journal and the nodes say of the calls: executed how often, unknown, and every
+        firing one of the net."""
         executed = Counter(self._log.read_text(encoding="utf-8").split())
         found = recorded(str(self.folder))
         given = [i for step in found.steps() for i in step.instructions]
         firings = [one for one in given if isinstance(one, Fired)]
-        markings = list(found.task.flat.net.replay([f.transition for f in firings], firings[0].before))
+        markings = list(
+            found.task.flat.net.replay([f.transition for f in firings], firings[0].before)
+        )
         assert [tuple(m) for m in markings[1:]] == [f.after for f in firings], (
             "a firing that the ordinary net does not allow"
         )
@@ -223,7 +251,9 @@ def main() -> None:
     """All experiments, one after the other."""
     folder, services, seed, runs, kills = sys.argv[1:]
     for number, experiment in enumerate(json.loads(kills)):
-        outcome = Experiment(Path(folder) / str(number), Path(services), int(seed), int(runs)).run(experiment)
+        outcome = Experiment(Path(folder) / str(number), Path(services), int(seed), int(runs)).run(
+            experiment
+        )
         print(json.dumps(outcome), flush=True)
 
 

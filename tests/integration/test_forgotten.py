@@ -1,4 +1,5 @@
-"""Real processes: a node that other clients' calls made forget a run does not run it again for a resumed coordinator."""
+"""Real processes: a node that other clients' calls made forget a run does not run it again for a
+resumed coordinator."""
 
 from __future__ import annotations
 
@@ -11,22 +12,31 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.record.journal import MAGIC, PREFIX, read_journal
-from coordinator.record.runfolder import JOURNAL
-from coordinator.task import Executed, Status
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.directory import load
-from services.comm.messages import Call, Hello
-from services.comm.notice import Ended, Notice
-from services.comm.results import Keeping
+from petrobot.coordinator.record.journal import MAGIC, PREFIX, read_journal
+from petrobot.coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import load
+from petrobot.services.comm.messages import Call, Hello
+from petrobot.services.comm.notice import Ended, Notice
+from petrobot.services.comm.results import Keeping
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
-from tests.integration.test_resume_processes import NEVER_BEGUN, PATIENCE, QUIET, ends_of, nodes, petrobot, until
+from tests.integration.test_resume_processes import (
+    NEVER_BEGUN,
+    PATIENCE,
+    QUIET,
+    ends_of,
+    nodes,
+    petrobot,
+    until,
+)
 
 pytestmark = pytest.mark.processes
 RUNS = 4
 BATCH = 1_500
-"""Calls that are under way at once: more than the results that a node keeps, so that it drops those of the mission run."""
+"""Calls that are under way at once: more than the results that a node keeps, so that it drops those
+of the mission run."""
 
 
 async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) -> None:
@@ -56,7 +66,8 @@ async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) ->
 
 
 def _without_accepts(path: Path) -> None:
-    """Cut the journal before the first word of a node: so it is when the kill comes between an order and its ACCEPT."""
+    """Cut the journal before the first word of a node: so it is when the kill comes between an
+    order and its ACCEPT."""
     offset, raw = len(MAGIC), path.read_bytes()
     for record in [None, *read_journal(path).records]:
         if record is not None and record.data.get("stimulus", {}).get("kind") == "RunStarted":
@@ -73,7 +84,10 @@ def _without_accepts(path: Path) -> None:
         pytest.param(lambda n: f"flood/{n}", 3_000, id="results"),
         pytest.param(lambda n: f"flood/{n}", 202_500, id="counted ids", marks=pytest.mark.proof),
         pytest.param(
-            lambda n: f"{n} flood", Keeping().id_groups + 2_500, id="ids without order", marks=pytest.mark.proof
+            lambda n: f"{n} flood",
+            Keeping().id_groups + 2_500,
+            id="ids without order",
+            marks=pytest.mark.proof,
         ),
     ],
 )
@@ -95,12 +109,15 @@ def test_what_a_flood_made_its_node_forget_is_not_run_again(
         active = set(moves(tmp_path, "begin"))
         until(
             lambda: (
-                moves(tmp_path, "end").keys() >= {call for call in active if "tidy" not in call and "carry" not in call}
+                moves(tmp_path, "end").keys()
+                >= {call for call in active if "tidy" not in call and "carry" not in call}
             )
         )
         for node in load(services).nodes.values():
             asyncio.run(_flood(node.name, node.port, ids, calls))
-        resumed = petrobot(tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET)
+        resumed = petrobot(
+            tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET
+        )
         assert resumed.wait(PATIENCE) == 0, (tmp_path / "resume.txt").read_text()
     finally:
         up.terminate()

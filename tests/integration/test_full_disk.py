@@ -1,4 +1,5 @@
-"""A disk that is full in the middle of a run: one clear error, nothing done that is not kept, and a resume that ends the run."""
+"""A disk that is full in the middle of a run: one clear error, nothing done that is not kept, and a
+resume that ends the run."""
 
 from __future__ import annotations
 
@@ -10,15 +11,23 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.record.journal import read_journal
-from coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.record.journal import read_journal
+from petrobot.coordinator.record.runfolder import JOURNAL
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
-from tests.integration.test_resume_processes import NEVER_BEGUN, PATIENCE, QUIET, ends_of, nodes, petrobot
+from tests.integration.test_resume_processes import (
+    NEVER_BEGUN,
+    PATIENCE,
+    QUIET,
+    ends_of,
+    nodes,
+    petrobot,
+)
 
 pytestmark = pytest.mark.processes
 RUNS = 8
 ROOM = 6
-"""Kilobytes that any file of the coordinator may have: its journal's header takes four of them (ulimit -f, setrlimit(2))."""
+"""Kilobytes that any file of the coordinator may have: its journal's header takes four of them
+(ulimit -f, setrlimit(2))."""
 
 
 def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> None:
@@ -34,18 +43,24 @@ def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> 
         "--journal",
         str(runs),
     ]
-    command = shlex.join([sys.executable, "-m", "coordinator", *given, *QUIET])
+    command = shlex.join([sys.executable, "-m", "petrobot.coordinator", *given, *QUIET])
     up = nodes(tmp_path)
     try:
         full = ["bash", "-c", f"ulimit -f {ROOM}; exec {command}"]
-        done = subprocess.run(full, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False)
+        done = subprocess.run(
+            full, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
         assert done.returncode == 1, done.stdout + done.stderr
         assert f"{JOURNAL}: File too large; nothing was sent on the strength of it" in done.stderr
         assert "Traceback" not in done.stderr
         [run] = runs.iterdir()
-        kept = [r.data["stimulus"] for r in read_journal(run / JOURNAL).records if r.kind == "stimulus"]
+        kept = [
+            r.data["stimulus"] for r in read_journal(run / JOURNAL).records if r.kind == "stimulus"
+        ]
         assert kept, "it was full in the middle of the run"
-        resumed = petrobot(tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET)
+        resumed = petrobot(
+            tmp_path, "resume", str(run), "--json", str(tmp_path / "out.json"), *QUIET
+        )
         assert resumed.wait(PATIENCE) == 0, (tmp_path / "resume.txt").read_text()
     finally:
         up.terminate()
@@ -56,5 +71,6 @@ def test_a_full_disk_ends_the_run_in_clear_and_loses_nothing(tmp_path: Path) -> 
     ends, made = ends_of(tmp_path), {call.rpartition("/")[2] for call in begun}
     assert len(ends) == RUNS, "no token lost or doubled"
     for call, end in ends.items():
-        # the bell may ring between a run's start and its first step: then it is told that it never began
+        # the bell may ring between a run's start and its first step: then it is told that it never
+        # began
         assert call in made or (end.status, end.executed) in NEVER_BEGUN, end

@@ -1,4 +1,5 @@
-"""What a driver or an action does wrong, as the person at the coordinator finds it: exit code, journal and log."""
+"""What a driver or an action does wrong, as the person at the coordinator finds it: exit code,
+journal and log."""
 
 from __future__ import annotations
 
@@ -83,7 +84,7 @@ def petrobot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         [
             sys.executable,
             "-c",
-            "import sys; from coordinator.cli import main; sys.exit(main(sys.argv[1:]))",
+            "import sys; from petrobot.coordinator.cli import main; sys.exit(main(sys.argv[1:]))",
             *arguments,
         ],
         cwd=folder,
@@ -97,20 +98,45 @@ def petrobot(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("services", "cause", "words"),
     [
-        (SERVICES.format(port="{port}", send="[{ odd = 3 }]", seconds=0.0), "command_refused", "no odd numbers: 3"),
-        (SERVICES.format(port="{port}", send="[{ need = true }]", seconds=0.1), "command_refused", "what is not there"),
+        (
+            SERVICES.format(port="{port}", send="[{ odd = 3 }]", seconds=0.0),
+            "command_refused",
+            "no odd numbers: 3",
+        ),
+        (
+            SERVICES.format(port="{port}", send="[{ need = true }]", seconds=0.1),
+            "command_refused",
+            "what is not there",
+        ),
         (
             SERVICES.format(port="{port}", send="[{ break = true }]", seconds=9.0),
             "device_died",
             "nothing is right in step",
         ),
-        (GIVE.format(port="{port}", kind="long cause"), "bad_result", "found 1,234: put long words into the text"),
-        (GIVE.format(port="{port}", kind="many containers"), "bad_result", "more than 20,000 lists and dicts"),
+        (
+            GIVE.format(port="{port}", kind="long cause"),
+            "bad_result",
+            "found 1,234: put long words into the text",
+        ),
+        (
+            GIVE.format(port="{port}", kind="many containers"),
+            "bad_result",
+            "more than 20,000 lists and dicts",
+        ),
         (GIVE.format(port="{port}", kind="65 MiB"), "bad_result", "above its limit"),
         (GIVE.format(port="{port}", kind="KeyboardInterrupt"), "exception", "KeyboardInterrupt"),
         (GIVE.format(port="{port}", kind="an event with a long name"), "exception", "found 256"),
     ],
-    ids=["refused", "KeyError", "step raises", "long cause", "containers", "65 MiB", "KeyboardInterrupt", "event"],
+    ids=[
+        "refused",
+        "KeyError",
+        "step raises",
+        "long cause",
+        "containers",
+        "65 MiB",
+        "KeyboardInterrupt",
+        "event",
+    ],
 )
 def test_the_words_reach_the_person(tmp_path: Path, services: str, cause: str, words: str) -> None:
     (tmp_path / "services.toml").write_text(services.replace("{port}", str(free_ports(1)[0])))
@@ -119,4 +145,8 @@ def test_the_words_reach_the_person(tmp_path: Path, services: str, cause: str, w
     assert ran.returncode == 1, (ran.stdout, ran.stderr)
     log = petrobot(tmp_path, "log", "last")
     said = " ".join(log.stdout.split())
-    assert log.returncode == 0 and cause in said and words in said, (log.stdout, ran.stdout, ran.stderr)
+    assert log.returncode == 0 and cause in said and words in said, (
+        log.stdout,
+        ran.stdout,
+        ran.stderr,
+    )

@@ -1,4 +1,5 @@
-"""The whole cell in lock step: the same result in one and in several processes, and wherever things are placed."""
+"""The whole cell in lock step: the same result in one and in several processes, and wherever things
+are placed."""
 
 from __future__ import annotations
 
@@ -24,11 +25,22 @@ port = 7305
 def run(services: Path, *arguments: str, seed: int = 5, regime: str = "B") -> dict[str, Any]:
     """Two throws; the result without its wall-clock time."""
     path = services.parent / "out.json"
-    given = ["--services", str(services), "--mode", "lockstep", "--runs", "2", "--seed", str(seed), "--regime", regime]
+    given = [
+        "--services",
+        str(services),
+        "--mode",
+        "lockstep",
+        "--runs",
+        "2",
+        "--seed",
+        str(seed),
+        "--regime",
+        regime,
+    ]
     command = [
         sys.executable,
         "-m",
-        "coordinator",
+        "petrobot.coordinator",
         "run",
         "catch_ball",
         *given,
@@ -61,7 +73,8 @@ def test_one_process_a_node_gives_the_same(usual: dict[str, Any], tmp_path: Path
 
 @pytest.mark.processes
 def test_a_third_node_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> None:
-    """Global memory and sampling tick on a node of their own: three nodes, laboratory and coordinator, five processes."""
+    """Global memory and sampling tick on a node of their own: three nodes, laboratory and
+    coordinator, five processes."""
     edits = {
         '[timers.image_tick]\nnode = "vision"': '[timers.image_tick]\nnode = "desk"',
         'memory.compare_and_set, memory.list\nnode = "vision"': 'memory.compare_and_set, memory.list\nnode = "desk"',
@@ -69,8 +82,11 @@ def test_a_third_node_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> 
     assert run(services_file(tmp_path, edits=edits, more=DESK), "--processes", "0") == usual
 
 
-def test_moving_the_camera_and_its_actions_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> None:
-    """One line of services.toml puts the camera, and so seven actions, on the arm's computer: the same catches."""
+def test_moving_the_camera_and_its_actions_changes_nothing(
+    usual: dict[str, Any], tmp_path: Path
+) -> None:
+    """One line of services.toml puts the camera, and so seven actions, on the arm's computer: the
+    same catches."""
     edits = {'[devices.camera]\nnode = "vision"': '[devices.camera]\nnode = "motion"'}
     assert run(services_file(tmp_path, edits=edits)) == usual
 

@@ -1,7 +1,8 @@
-"""kill -9 of the coordinator of a 4-run catching task in lock step, resumed each time: the outcome is that of an undisturbed run.
+"""kill -9 of the coordinator of a 4-run catching task in lock step, resumed each time: the outcome
+is that of an undisturbed run.
 
-The nodes and the laboratory outlive it in a process of their own. Every action is rejoined (`on_resume`): in lock step the ball
-waits with everything else for the new coordinator.
+The nodes and the laboratory outlive it in a process of their own. Every action is rejoined
+(`on_resume`): in lock step the ball waits with everything else for the new coordinator.
 """
 
 from __future__ import annotations
@@ -35,8 +36,12 @@ def experiments(folder: Path, kills: Sequence[Sequence[int]]) -> list[dict[str, 
 
 def judge(outcome: dict[str, Any], undisturbed: dict[str, Any]) -> None:
     """Same end, no call executed twice or left out, nothing unknown that is not said."""
-    assert outcome["lives"] == len(outcome["kills"]) + 1, f"not killed as often as wanted: {outcome}"
-    assert outcome["same"] == undisturbed["same"], f"another outcome with kills at {outcome['kills']}"
+    assert outcome["lives"] == len(outcome["kills"]) + 1, (
+        f"not killed as often as wanted: {outcome}"
+    )
+    assert outcome["same"] == undisturbed["same"], (
+        f"another outcome with kills at {outcome['kills']}"
+    )
     assert outcome["twice"] == [] and outcome["unknown"] == []
     assert outcome["calls"] == outcome["recorded"] == undisturbed["calls"]
 
@@ -45,18 +50,25 @@ def test_twenty_kills_change_nothing(tmp_path: Path) -> None:
     """All in one mission run, at seeded places, a few operations apart."""
     kills = np.random.default_rng(2).integers(1, 12, 20).tolist()
     undisturbed, killed = experiments(tmp_path / "cell", [[], kills])
-    assert undisturbed["same"]["status"] == "success" and undisturbed["same"]["caught"] == [True] * RUNS
+    assert (
+        undisturbed["same"]["status"] == "success"
+        and undisturbed["same"]["caught"] == [True] * RUNS
+    )
     judge(killed, undisturbed)
 
 
 @pytest.mark.proof
 def test_a_kill_at_every_record_changes_nothing(tmp_path: Path) -> None:
-    """After every append, flush and sync of the journal in turn: hundreds of mission runs, thousands of calls."""
+    """After every append, flush and sync of the journal in turn: hundreds of mission runs,
+    thousands of calls."""
     [undisturbed] = experiments(tmp_path / "undisturbed", [[]])
     kills = [[operation] for operation in range(1, undisturbed["operations"])]
     outcomes = experiments(tmp_path / "killed", kills)
     for outcome in outcomes:
         judge(outcome, undisturbed)
     calls = sum(outcome["calls"] for outcome in outcomes)
-    print(f"{len(outcomes)} mission runs, each killed once; {calls} calls, none executed twice, none unknown")
+    print(
+        f"{len(outcomes)} mission runs, each killed once; {calls} calls, none executed "
+        "twice, none unknown"
+    )
     assert calls >= 2_000

@@ -1,4 +1,5 @@
-"""No process outlives its parent: each parent is killed (kill -9) while its children hang as badly as can be, and all are gone."""
+"""No process outlives its parent: each parent is killed (kill -9) while its children hang as badly
+as can be, and all are gone."""
 
 from __future__ import annotations
 
@@ -13,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.directory import load
-from services.comm.messages import Call, Hello
-from services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import load
+from petrobot.services.comm.messages import Call, Hello
+from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
 from tests.integration.test_resume_processes import nodes
 from tests.ports import free_ports
 from tests.waiting import beat
@@ -84,7 +85,12 @@ def alive(processes: set[int]) -> list[str]:
     for process in processes:
         try:
             state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-            line = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+            line = (
+                Path(f"/proc/{process}/cmdline")
+                .read_bytes()
+                .replace(b"\0", b" ")
+                .decode(errors="replace")
+            )
         except OSError:
             continue
         if state not in "ZX":
@@ -95,13 +101,19 @@ def alive(processes: set[int]) -> list[str]:
 async def call(folder: Path, names: tuple[str, ...]) -> None:
     """Call these actions and services of the node, and wait until each says that it hangs."""
     directory = load(folder / "services.toml")
-    hello = Hello(OLDEST_VERSION, NEWEST_VERSION, "coordinator", "tester", "tester", 1, directory.hash)
+    hello = Hello(
+        OLDEST_VERSION, NEWEST_VERSION, "coordinator", "tester", "tester", 1, directory.hash
+    )
     caller = Caller("motion", hello)
     client = Client(*directory.address("motion"), caller)
     client.start()
     assert await client.connected(PATIENCE)
     for name in names:
-        arguments = dict(directory.actions[name].args) if name in directory.actions else {"mark": str(folder / name)}
+        arguments = (
+            dict(directory.actions[name].args)
+            if name in directory.actions
+            else {"mark": str(folder / name)}
+        )
         caller.call(client.now(), Call(f"tester/{name}", name, arguments, PATIENCE))
         client.flush()
         await asyncio.to_thread(until, (folder / name).exists, f"{name} was not called")
@@ -111,8 +123,11 @@ async def call(folder: Path, names: tuple[str, ...]) -> None:
 
 @contextmanager
 def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
-    """`petrobot up` over a node whose servo process, workers and general worker all hang; both process ids."""
-    (folder / "services.toml").write_text(SERVICES.format(port=free_ports(1)[0], folder=folder), encoding="utf-8")
+    """`petrobot up` over a node whose servo process, workers and general worker all hang; both
+    process ids."""
+    (folder / "services.toml").write_text(
+        SERVICES.format(port=free_ports(1)[0], folder=folder), encoding="utf-8"
+    )
     launcher = nodes(folder)
     family = below(launcher.pid)
     try:
@@ -129,7 +144,8 @@ def hanging_cell(folder: Path) -> Iterator[tuple[int, int]]:
 
 
 def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
-    """Servo process, the worker at its link, a worker with its device, one without: all hang with the interpreter held."""
+    """Servo process, the worker at its link, a worker with its device, one without: all hang with
+    the interpreter held."""
     with hanging_cell(tmp_path) as (launcher, node):
         os.kill(launcher, signal.SIGSTOP)  # so that it starts no other, and reaps nothing
         children = below(node)
@@ -139,7 +155,8 @@ def test_a_node_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
 
 
 def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
-    """Its node hangs, too, in a service of its own loop, with the interpreter held: SIGTERM does nothing to it."""
+    """Its node hangs, too, in a service of its own loop, with the interpreter held: SIGTERM does
+    nothing to it."""
     with hanging_cell(tmp_path) as (launcher, node):
         asyncio.run(call(tmp_path, ("quick",)))
         family = below(launcher)
@@ -149,7 +166,9 @@ def test_a_launcher_that_is_killed_leaves_no_process(tmp_path: Path) -> None:
 
 
 def test_a_lock_step_node_ends_with_its_launcher(tmp_path: Path) -> None:
-    (tmp_path / "services.toml").write_text(SERVICES.format(port=free_ports(1)[0], folder=tmp_path), encoding="utf-8")
+    (tmp_path / "services.toml").write_text(
+        SERVICES.format(port=free_ports(1)[0], folder=tmp_path), encoding="utf-8"
+    )
     launcher = nodes(tmp_path, "--lockstep")
     family = below(launcher.pid)
     assert len(family) == 1

@@ -1,4 +1,5 @@
-"""The cell on the wall clock over real processes: nodes are killed in mid-task, and the task goes on through its error branches."""
+"""The cell on the wall clock over real processes: nodes are killed in mid-task, and the task goes
+on through its error branches."""
 
 from __future__ import annotations
 
@@ -11,16 +12,16 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli.loading import load_task
-from coordinator.engine import Fired, Instruction, RunRecorded, StartRun, State, Stimulus
-from coordinator.launch import Setting, local_programs, mission_id, realtime_mission
-from coordinator.mission.mission import Mission
-from coordinator.mission.realtime import RealtimeMission
-from coordinator.supervisor import Supervisor
-from coordinator.task import Executed, Status
-from services.comm.directory import load
-from services.comm.messages import Command
-from services.comm.notice import Progress
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.engine import Fired, Instruction, RunRecorded, StartRun, State, Stimulus
+from petrobot.coordinator.launch import Setting, local_programs, mission_id, realtime_mission
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm.directory import load
+from petrobot.services.comm.messages import Command
+from petrobot.services.comm.notice import Progress
 from tests.integration.cell_files import services_file
 
 pytestmark = pytest.mark.processes
@@ -71,7 +72,8 @@ async def arm_state(shell: RealtimeMission) -> dict[str, Any]:
 async def run_and_kill(
     folder: Path, place: str, node: str
 ) -> tuple[Mission, list[RunRecorded], Supervisor, dict[str, Any]]:
-    """Two runs over launched nodes; a node is killed (kill -9) when the place is first entered. The arm's state comes last."""
+    """Two runs over launched nodes; a node is killed (kill -9) when the place is first entered. The
+    arm's state comes last."""
     directory, task = load(services_file(folder)), load_task("catch_ball")
     mission = realtime_mission(directory, Setting(task, runs=2, seed=3), mission_id(task))
     async with Supervisor(local_programs(directory), folder / "logs") as supervisor:
@@ -92,8 +94,9 @@ async def run_and_kill(
 async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
     tmp_path: Path, place: str, node: str
 ) -> None:
-    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started again, final is reached.
-    Whatever befalls the sender, no set point older than three periods is executed."""
+    """kill -9: its run ends in ERROR with executed = unknown and a reason, the node is started
+    again, final is reached. Whatever befalls the sender, no set point older than three periods is
+    executed."""
     mission, runs, supervisor, arm = await run_and_kill(tmp_path, place, node)
     finished = mission.executor.finished
     assert finished is not None
@@ -107,7 +110,9 @@ async def test_a_node_killed_in_mid_catch_is_an_error_and_the_task_goes_on(
     stream = mission.executor.directory.streams["catch_point"]
     assert arm["stale_executed"] == 0
     assert arm["oldest_executed"] <= PERIODS * stream.period
-    assert node == "motion" or arm["setpoint_count"] > 0, "a motion node that was killed counts anew"
+    assert node == "motion" or arm["setpoint_count"] > 0, (
+        "a motion node that was killed counts anew"
+    )
 
 
 async def test_every_firing_of_a_live_run_is_one_of_the_ordinary_net(tmp_path: Path) -> None:

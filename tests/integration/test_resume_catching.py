@@ -1,4 +1,5 @@
-"""kill -9 of the coordinator while the arm is about to catch, in real time over the whole cell, and resumed."""
+"""kill -9 of the coordinator while the arm is about to catch, in real time over the whole cell, and
+resumed."""
 
 from __future__ import annotations
 
@@ -17,18 +18,33 @@ RUNS = 3
 
 @pytest.mark.parametrize("place", ["track_ball", "catch_ball", "return_home"])
 def test_killed_in_mid_catch_the_task_goes_on_to_its_end(place: str, tmp_path: Path) -> None:
-    """The arm's action is not rejoined (the ball has long gone): ERROR with a cause, or its stored result; then the rest is caught.
+    """The arm's action is not rejoined (the ball has long gone): ERROR with a cause, or its stored
+    result; then the rest is caught.
 
-    The time without a coordinator is on the mission's clock, so the referee knows every cycle, also those of before the kill.
+    The time without a coordinator is on the mission's clock, so the referee knows every cycle, also
+    those of before the kill.
     """
     services = services_file(tmp_path)
     up = nodes(tmp_path)
     runs = tmp_path / "runs"
     try:
-        given = ["catch_ball", "--services", str(services), "--runs", str(RUNS), "--journal", str(runs), "--seed", "3"]
+        given = [
+            "catch_ball",
+            "--services",
+            str(services),
+            "--runs",
+            str(RUNS),
+            "--journal",
+            str(runs),
+            "--seed",
+            "3",
+        ]
         process = petrobot(tmp_path, "run", *given, *QUIET)
         entered = f"{place}#2".encode()
-        until(lambda: any(entered in path.read_bytes() for path in runs.glob("*/run.journal")), process)
+        until(
+            lambda: any(entered in path.read_bytes() for path in runs.glob("*/run.journal")),
+            process,
+        )
         process.send_signal(signal.SIGKILL)
         process.wait()
         [run] = runs.iterdir()

@@ -1,4 +1,5 @@
-"""kill -9 of the coordinator over real processes: `petrobot resume` goes on where it was, and no action is executed twice."""
+"""kill -9 of the coordinator over real processes: `petrobot resume` goes on where it was, and no
+action is executed twice."""
 
 from __future__ import annotations
 
@@ -14,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli.replaying import recorded
-from coordinator.engine import RunRecorded
-from coordinator.task import Executed, Status
+from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.engine import RunRecorded
+from petrobot.coordinator.task import Executed, Status
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 
 pytestmark = pytest.mark.processes
@@ -30,14 +31,21 @@ QUIET = ("--quiet", "--no-page")
 def petrobot(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
     """A command of ours that runs; what it prints goes to a file."""
     with (folder / f"{arguments[0]}.txt").open("ab") as out:
-        return subprocess.Popen([sys.executable, "-m", "coordinator", *arguments], cwd=ROOT, stdout=out, stderr=out)
+        return subprocess.Popen(
+            [sys.executable, "-m", "petrobot.coordinator", *arguments],
+            cwd=ROOT,
+            stdout=out,
+            stderr=out,
+        )
 
 
 def until(ready: Callable[[], Any], process: subprocess.Popen[bytes] | None = None) -> None:
     """Wait for a condition."""
     deadline, pause = time.monotonic() + PATIENCE, threading.Event()
     while not ready():
-        assert process is None or process.poll() is None, f"it ended: {process and process.returncode}"
+        assert process is None or process.poll() is None, (
+            f"it ended: {process and process.returncode}"
+        )
         assert time.monotonic() < deadline, "it takes too long"
         pause.wait(0.002)
 
@@ -50,10 +58,15 @@ def nodes(folder: Path, *options: str) -> subprocess.Popen[bytes]:
     return up
 
 
-def killed_and_resumed(folder: Path, count: int, kills: list[int], first: list[str]) -> dict[str, Any]:
-    """`count` runs whose coordinator is killed when so many moves have begun, and resumed each time. The result."""
+def killed_and_resumed(
+    folder: Path, count: int, kills: list[int], first: list[str]
+) -> dict[str, Any]:
+    """`count` runs whose coordinator is killed when so many moves have begun, and resumed each
+    time. The result."""
     runs = folder / "runs"
-    process = petrobot(folder, "run", str(TASK), "--runs", str(count), "--journal", str(runs), *first)
+    process = petrobot(
+        folder, "run", str(TASK), "--runs", str(count), "--journal", str(runs), *first
+    )
     for begun in kills:
         until(lambda begun=begun: len(moves(folder, "begin")) >= begun, process)  # type: ignore[misc]
         process.send_signal(signal.SIGKILL)
@@ -69,7 +82,8 @@ def killed_and_resumed(folder: Path, count: int, kills: list[int], first: list[s
 
 
 NEVER_BEGUN = {(Status.ERROR, Executed.NO), (Status.ERROR, Executed.UNKNOWN), (None, Executed.NO)}
-"""Status and whether it was executed, of runs that may have made no move; the last one is preempted before its first step."""
+"""Status and whether it was executed, of runs that may have made no move; the last one is preempted
+before its first step."""
 
 
 def ends_of(folder: Path) -> dict[str, RunRecorded]:
@@ -80,7 +94,8 @@ def ends_of(folder: Path) -> dict[str, RunRecorded]:
 
 
 def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) -> None:
-    """Runs that went on are rejoined, results that came meanwhile are fetched: every move is made once and none is lost."""
+    """Runs that went on are rejoined, results that came meanwhile are fetched: every move is made
+    once and none is lost."""
     shuttle_services(tmp_path, fetch=0.4, carry=0.5, orphan=60.0)
     up = nodes(tmp_path)
     try:
@@ -91,12 +106,15 @@ def test_a_run_in_real_time_killed_twice_goes_on_where_it_was(tmp_path: Path) ->
         assert up.wait(PATIENCE) == 0
     assert (result["status"], result["mode"], result["runs"]) == ("success", "realtime", RUNS)
     begun, ended = moves(tmp_path, "begin"), moves(tmp_path, "end")
-    assert set(begun.values()) == {1} and set(ended) <= set(begun) and not moves(tmp_path, "overlap")
+    assert (
+        set(begun.values()) == {1} and set(ended) <= set(begun) and not moves(tmp_path, "overlap")
+    )
     ends = ends_of(tmp_path)
     assert len(ends) == RUNS, "no token lost or doubled"
     made = {call.rpartition("/")[2] for call in begun}
     for run, end in ends.items():
-        # what the kill kept from its node (a call not sent yet, a device still leased) is said, never passed over
+        # what the kill kept from its node (a call not sent yet, a device still leased) is said,
+        # never passed over
         assert run in made or (end.status, end.executed) in NEVER_BEGUN, end
     journal = (tmp_path / "resume.txt").read_text()
     assert "Traceback" not in journal
@@ -106,7 +124,16 @@ def test_a_run_in_lock_step_whose_nodes_wait_goes_on_where_it_was(tmp_path: Path
     """One process a node: they wait for the resumed coordinator, and simulated time with them."""
     shuttle_services(tmp_path, fetch=0.4, carry=0.5)
     up = nodes(tmp_path, "--lockstep")
-    first = ["--services", str(tmp_path / "services.toml"), "--mode", "lockstep", "--processes", "0", "--join", *QUIET]
+    first = [
+        "--services",
+        str(tmp_path / "services.toml"),
+        "--mode",
+        "lockstep",
+        "--processes",
+        "0",
+        "--join",
+        *QUIET,
+    ]
     try:
         result = killed_and_resumed(tmp_path, MANY, [3, 40], first)
         assert up.wait(PATIENCE) == 0, "members end with their cell"
@@ -115,4 +142,6 @@ def test_a_run_in_lock_step_whose_nodes_wait_goes_on_where_it_was(tmp_path: Path
         up.wait(PATIENCE)
     assert (result["status"], result["mode"], result["runs"]) == ("success", "lockstep", MANY)
     begun = moves(tmp_path, "begin")
-    assert set(begun.values()) == {1} and len([call for call in begun if "tidy" not in call]) == MANY
+    assert (
+        set(begun.values()) == {1} and len([call for call in begun if "tidy" not in call]) == MANY
+    )

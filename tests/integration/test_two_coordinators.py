@@ -1,4 +1,5 @@
-"""Two coordinators want one device: its lease settles who has it, the second is refused in clear and nothing moves for it."""
+"""Two coordinators want one device: its lease settles who has it, the second is refused in clear
+and nothing moves for it."""
 
 from __future__ import annotations
 
@@ -7,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli.loading import load_task
-from coordinator.engine import RunRecorded
-from coordinator.launch import Setting, local_programs, mission_id, realtime_mission
-from coordinator.mission.mission import Mission
-from coordinator.mission.realtime import RealtimeMission
-from coordinator.supervisor import Supervisor
-from coordinator.task import Executed, Status
-from services.comm.directory import Directory, load
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.engine import RunRecorded
+from petrobot.coordinator.launch import Setting, local_programs, mission_id, realtime_mission
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm.directory import Directory, load
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
 from tests.waiting import beat
 
@@ -28,7 +29,9 @@ def mission_on(directory: Directory, runs: int) -> Mission:
     return realtime_mission(directory, Setting(task, runs=runs), mission_id(task))
 
 
-async def led(directory: Directory, mission: Mission, meanwhile: asyncio.Event | None = None) -> None:
+async def led(
+    directory: Directory, mission: Mission, meanwhile: asyncio.Event | None = None
+) -> None:
     """Connect, set `meanwhile`, run to the end, leave in good order."""
     shell = RealtimeMission(mission, directory)
     try:
@@ -48,14 +51,16 @@ async def until_moving(folder: Path) -> None:
 
 
 def judged(mission: Mission) -> tuple[list[RunRecorded], list[RunRecorded]]:
-    """Runs of a mission run, and apart from them those without a status: on a busy host the bell may preempt a run before its
-    node's answer to the call is there, and such a run counts as what it is, not begun (docs/semantics.md, records)."""
+    """Runs of a mission run, and apart from them those without a status: on a busy host the bell
+    may preempt a run before its node's answer to the call is there, and such a run counts as what
+    it is, not begun (docs/semantics.md, records)."""
     runs = mission.tally.runs
     return [r for r in runs if r.status is not None], [r for r in runs if r.status is None]
 
 
 async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:
-    """No device is shared, no run of the first one suffers, and whoever comes after it has the hands at once."""
+    """No device is shared, no run of the first one suffers, and whoever comes after it has the
+    hands at once."""
     directory = load(shuttle_services(tmp_path, fetch=0.8, carry=0.8))
     first, second, third = (mission_on(directory, runs) for runs in (10, 2, 2))
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
@@ -66,7 +71,9 @@ async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_pa
         await leading
         await led(directory, third)
     refused, not_begun = judged(second)
-    assert {(r.status, r.cause, r.executed) for r in refused} == {(Status.ERROR, "device_leased", Executed.NO)}
+    assert {(r.status, r.cause, r.executed) for r in refused} == {
+        (Status.ERROR, "device_leased", Executed.NO)
+    }
     assert all(first.executor.mission in r.text for r in refused), "the text says who has it"
     assert {r.executed for r in not_begun} <= {Executed.NO}, not_begun
     for mission in (first, third):
@@ -78,7 +85,8 @@ async def test_the_second_coordinator_is_refused_until_the_first_has_gone(tmp_pa
 
 
 async def test_a_good_bye_whose_link_is_broken_is_said_over_another(tmp_path: Path) -> None:
-    """The cable is cut as the first one is done: it comes back to say so, and whoever comes next has the hands at once."""
+    """The cable is cut as the first one is done: it comes back to say so, and whoever comes next
+    has the hands at once."""
     directory = load(shuttle_services(tmp_path))
     first, second = mission_on(directory, 2), mission_on(directory, 2)
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
@@ -93,4 +101,6 @@ async def test_a_good_bye_whose_link_is_broken_is_said_over_another(tmp_path: Pa
                 await beat(0.001)
         await shell.close()
         await led(directory, second)
-    assert second.tally.runs and all(r.status is Status.SUCCESS for r in second.tally.runs), second.tally.runs
+    assert second.tally.runs and all(r.status is Status.SUCCESS for r in second.tally.runs), (
+        second.tally.runs
+    )

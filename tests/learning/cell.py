@@ -6,16 +6,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Stimulus
-from coordinator.experience.learner import LearningSelector
-from coordinator.launch import Setting, lockstep_cell
-from coordinator.mission.mission import Mission
-from coordinator.mission.partners import FirstAlternative, Store
-from coordinator.task import Task
-from coordinator.taskfile import load
-from services.action import Status
-from services.comm.directory import Directory, parse
-from services.scripted import Line, Scripted
+from petrobot.coordinator.engine import Stimulus
+from petrobot.coordinator.experience.learner import LearningSelector
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.partners import FirstAlternative, Store
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import load
+from petrobot.services.action import Status
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.scripted import Line, Scripted
 
 TASK_FILE = Path(__file__).parent / "sorting.toml"
 HEAD = """
@@ -76,7 +76,8 @@ def run(
     store: Store | None = None,
     first: Sequence[Stimulus] = (),
 ) -> Mission:
-    """Run to the end, at most an hour of simulated time; `first` is what the operator says before the beginning."""
+    """Run to the end, at most an hour of simulated time; `first` is what the operator says before
+    the beginning."""
     setting = Setting(task, parameters or {}, runs, seed, selector or FirstAlternative())
     cell, party = lockstep_cell(directory(task), setting, scripts())
     if store is not None:

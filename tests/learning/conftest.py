@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from coordinator.learning.estimate import Observation, Tally
-from coordinator.task import Executed, Status
+from petrobot.coordinator.learning.estimate import Observation, Tally
+from petrobot.coordinator.task import Executed, Status
 
 SECONDS = st.floats(0.001, 100.0)
 COUNTED = st.builds(
@@ -20,7 +20,9 @@ COUNTED = st.builds(
     st.none() | SECONDS,
 )
 CENSORED = st.builds(Observation, st.none(), SECONDS, preempted_by=st.sampled_from(["", "caught"]))
-MISSING = st.builds(Observation, st.just(Status.ERROR), st.just(0.0), st.just("unreachable"), st.just(Executed.NO))
+MISSING = st.builds(
+    Observation, st.just(Status.ERROR), st.just(0.0), st.just("unreachable"), st.just(Executed.NO)
+)
 OBSERVATIONS = st.lists(COUNTED | CENSORED | MISSING, max_size=25)
 
 

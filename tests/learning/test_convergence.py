@@ -1,4 +1,5 @@
-"""Convergence on Bernoulli worlds: the fast variant's floor, the textbook gain beside it, negative controls that stick.
+"""Convergence on Bernoulli worlds: the fast variant's floor, the textbook gain beside it, negative
+controls that stick.
 
 The full study, with figures for every selector, is tests/bench/learning.py; these are its floors.
 """
@@ -10,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coordinator.learning.automata import NikolicFu
-from coordinator.learning.batch import Trial
-from coordinator.learning.rule import Rule
-from coordinator.learning.selectors import RULES
-from coordinator.learning.tracking import Tracking
+from petrobot.coordinator.learning.automata import NikolicFu
+from petrobot.coordinator.learning.batch import Trial
+from petrobot.coordinator.learning.rule import Rule
+from petrobot.coordinator.learning.selectors import RULES
+from petrobot.coordinator.learning.tracking import Tracking
 from tests.learning.worlds import Played, World, gapped, play
 
 SEEDS = 1000
@@ -34,7 +35,8 @@ def converged(rule: Rule, world: World, trials: int = 500, seeds: int = SEEDS) -
 @pytest.mark.parametrize("gap", [0.4, 0.3, 0.2])
 @pytest.mark.parametrize("best", [0.95, 0.9, 0.8, 0.6])
 def test_the_fast_variant_finds_the_optimum_in_500_trials(gap: float, best: float) -> None:
-    """p >= 0.95 in at least 99 % of 1,000 seeds at gaps from 0.2 on with 4 actions, whatever the best reliability."""
+    """p >= 0.95 in at least 99 % of 1,000 seeds at gaps from 0.2 on with 4 actions, whatever the
+    best reliability."""
     assert converged(RULES["nikolic_fu_fast"](), free(gap, best)) >= 0.99
 
 
@@ -46,7 +48,9 @@ def test_costs_with_scatter_are_found_too() -> None:
 
 def test_the_textbook_gain_needs_longer_and_gets_there() -> None:
     """Its order of actions is right ever more often; p follows slowly."""
-    shares = [converged(RULES["nikolic_fu"](), free(0.4), trials, 300) for trials in (100, 500, 2500)]
+    shares = [
+        converged(RULES["nikolic_fu"](), free(0.4), trials, 300) for trials in (100, 500, 2500)
+    ]
     assert shares == sorted(shares)
     assert shares[0] < 0.2
     assert shares[-1] > 0.95
@@ -58,7 +62,8 @@ def test_the_textbook_gain_needs_longer_and_gets_there() -> None:
     ids=["k^-0.6", "c = 2"],
 )
 def test_gains_outside_the_conditions_stick(rule: NikolicFu) -> None:
-    """Negative controls: many seeds end at a wrong action, and three times the trials change next to nothing."""
+    """Negative controls: many seeds end at a wrong action, and three times the trials change next
+    to nothing."""
     played = play(rule, free(0.2, 0.6), 3000, 300, np.random.default_rng(1), (1000, 3000))
     stuck = played.p_best < 0.01
     assert stuck[0].mean() > 0.1
@@ -66,7 +71,8 @@ def test_gains_outside_the_conditions_stick(rule: NikolicFu) -> None:
 
 
 def test_the_conditions_tell_these_gains_apart() -> None:
-    """(i) the gains sum to infinity, (ii) so do the products of 1 - gamma: partial sums to 1e6 grow or stop."""
+    """(i) the gains sum to infinity, (ii) so do the products of 1 - gamma: partial sums to 1e6 grow
+    or stop."""
     k = np.arange(1.0, 1e6)
 
     def sums(rule: NikolicFu) -> tuple[float, float]:
@@ -74,7 +80,11 @@ def test_the_conditions_tell_these_gains_apart() -> None:
         products = np.cumprod(1 - gain)
         return float(gain[len(k) // 10 :].sum()), float(products[len(k) // 10 :].sum())
 
-    textbook, fast_gain, double = NikolicFu(), NikolicFu(k0=1.0, exponent=0.6), NikolicFu(c=2.0, k0=2.0)
+    textbook, fast_gain, double = (
+        NikolicFu(),
+        NikolicFu(k0=1.0, exponent=0.6),
+        NikolicFu(c=2.0, k0=2.0),
+    )
     assert sums(textbook)[0] > 1
     assert sums(textbook)[1] > 1
     assert sums(fast_gain)[1] < 1e-12
@@ -83,7 +93,8 @@ def test_the_conditions_tell_these_gains_apart() -> None:
 
 @pytest.mark.parametrize("name", ["nikolic_fu_fast", "thompson", "ucb1", "discretised_pursuit"])
 def test_equal_actions_cost_no_regret(name: str) -> None:
-    """Where all are equal, whoever wins is right: the paper's claim that slow learning is then harmless."""
+    """Where all are equal, whoever wins is right: the paper's claim that slow learning is then
+    harmless."""
     played = play(RULES[name](), free(0.0), 300, 50, np.random.default_rng(2))
     assert np.all(played.regret == 0.0)
     assert np.all(played.optimal == 1.0)
@@ -96,7 +107,8 @@ def changing(rule: Rule) -> Played:
 
 
 def test_tracking_follows_a_world_that_changes() -> None:
-    """Most of the last hundred choices are the new best one; the converging scheme is still at the old one."""
+    """Most of the last hundred choices are the new best one; the converging scheme is still at the
+    old one."""
     following, converging = changing(Tracking()), changing(RULES["nikolic_fu_fast"]())
     assert following.optimal.mean() > 0.85
     assert converging.optimal.mean() < 0.5
@@ -110,9 +122,11 @@ def test_tracking_seldom_sees_a_change_where_there_is_none() -> None:
 
 
 def test_tracking_follows_a_small_move_late_in_its_life() -> None:
-    """R moves by 0.13, which few tests notice, after 4,000 trials: the floor of the gain follows within 600.
+    """R moves by 0.13, which few tests notice, after 4,000 trials: the floor of the gain follows
+    within 600.
 
-    Without the floor the gain is 1 / 4000^0.7 = 0.003 by then, and p of the new best action is 0.76 instead of 0.96.
+    Without the floor the gain is 1 / 4000^0.7 = 0.003 by then, and p of the new best action is 0.76
+    instead of 0.96.
     """
     world = World("drifting", (0.85, 0.72), (0.0, 0.0), 4000, (0.72, 0.85))
     played = play(Tracking(), world, 4600, 100, np.random.default_rng(5))
@@ -120,11 +134,20 @@ def test_tracking_follows_a_small_move_late_in_its_life() -> None:
 
 
 def test_the_gain_of_tracking_never_falls_below_its_floor() -> None:
-    """One trial after ten thousand: p moves towards the best action by exactly the floor, and every action stays possible."""
+    """One trial after ten thousand: p moves towards the best action by exactly the floor, and every
+    action stays possible."""
     rule, p = Tracking(), np.array([[0.9, 0.1]])
     batch = rule.begin(1, 2)
-    batch.p[:], batch.k[:], batch.tries[:], batch.runs[:], batch.successes[:] = p, 10_000, 5_000, 100, [[10, 90]]
+    batch.p[:], batch.k[:], batch.tries[:], batch.runs[:], batch.successes[:] = (
+        p,
+        10_000,
+        5_000,
+        100,
+        [[10, 90]],
+    )
     rule.learn(batch, Trial(np.array([1]), np.array([1.0]), np.array([np.nan]), np.array([True])))
     assert batch.p == pytest.approx(p + rule.gain_floor * (np.array([[0.0, 1.0]]) - p))
     batch.p[:] = [[1.0, 0.0]]
-    assert rule.probabilities(batch, np.ones((1, 2), bool)).min() == pytest.approx(rule.probability_floor)
+    assert rule.probabilities(batch, np.ones((1, 2), bool)).min() == pytest.approx(
+        rule.probability_floor
+    )

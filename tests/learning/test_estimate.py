@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from coordinator.learning.estimate import Observation, Tally, merge
-from coordinator.learning.intervals import clopper_pearson, wilson
-from coordinator.learning.moments import Moments
-from coordinator.learning.sample import SIZE, Sample, quantile
-from coordinator.learning.selectors import cost_of
-from coordinator.task import Executed, Status
+from petrobot.coordinator.learning.estimate import Observation, Tally, merge
+from petrobot.coordinator.learning.intervals import clopper_pearson, wilson
+from petrobot.coordinator.learning.moments import Moments
+from petrobot.coordinator.learning.sample import SIZE, Sample, quantile
+from petrobot.coordinator.learning.selectors import cost_of
+from petrobot.coordinator.task import Executed, Status
 from tests.learning.conftest import COUNTED, OBSERVATIONS, tally_of
 
 NUMBERS = st.lists(st.floats(-1e3, 1e3), max_size=30)
@@ -35,7 +35,9 @@ def of(numbers: list[float]) -> Moments:
 
 def close(one: Moments, other: Moments) -> bool:
     """Equal up to rounding."""
-    return one.n == other.n and np.allclose([one.mean, one.variance], [other.mean, other.variance], atol=1e-6)
+    return one.n == other.n and np.allclose(
+        [one.mean, one.variance], [other.mean, other.variance], atol=1e-6
+    )
 
 
 @given(NUMBERS, NUMBERS)
@@ -72,7 +74,16 @@ def test_moments_survive_large_offsets() -> None:
         (Observation(Status.SUCCESS, 0.4, preempted_by="caught"), 1, 1.0, 1.0, 0),
         (Observation(None, 0.0, executed=Executed.NO, preempted_by="caught"), 0, math.nan, 1.0, 0),
     ],
-    ids=["success", "failure", "error", "unknown", "never executed", "censored", "preempted success", "never began"],
+    ids=[
+        "success",
+        "failure",
+        "error",
+        "unknown",
+        "never executed",
+        "censored",
+        "preempted success",
+        "never began",
+    ],
 )
 def test_what_an_end_changes(
     seen: Observation, runs: int, reliability: float, availability: float, censored: int
@@ -88,8 +99,11 @@ def test_what_an_end_changes(
 
 
 @given(OBSERVATIONS, OBSERVATIONS, OBSERVATIONS)
-def test_tallies_merge_like_sets_of_runs(a: list[Observation], b: list[Observation], c: list[Observation]) -> None:
-    """Commutative, associative, and what one counter would have counted (up to rounding of the sums)."""
+def test_tallies_merge_like_sets_of_runs(
+    a: list[Observation], b: list[Observation], c: list[Observation]
+) -> None:
+    """Commutative, associative, and what one counter would have counted (up to rounding of the
+    sums)."""
     x, y, z = tally_of(a, "a"), tally_of(b, "b"), tally_of(c, "c")
     assert merge(x, y).counts == merge(y, x).counts
     assert merge(x, y).sample == merge(y, x).sample
@@ -98,7 +112,11 @@ def test_tallies_merge_like_sets_of_runs(a: list[Observation], b: list[Observati
     for one in (left, right):
         assert one.counts == whole.counts
         assert one.not_executed == whole.not_executed
-        assert (one.changes, one.unknown, one.censored) == (whole.changes, whole.unknown, whole.censored)
+        assert (one.changes, one.unknown, one.censored) == (
+            whole.changes,
+            whole.unknown,
+            whole.censored,
+        )
         assert set(one.durations) == set(whole.durations)
         assert all(close(one.durations[e], whole.durations[e]) for e in whole.durations)
         assert close(one.cpu, whole.cpu)
@@ -117,15 +135,22 @@ def test_a_tally_is_plain_data_and_back(seen: list[Observation]) -> None:
 
 
 @given(OBSERVATIONS, COUNTED, st.sampled_from(Status))
-def test_a_deferred_verdict_changes_r_once(seen: list[Observation], deferred: Observation, status: Status) -> None:
+def test_a_deferred_verdict_changes_r_once(
+    seen: list[Observation], deferred: Observation, status: Status
+) -> None:
     """The corrected tally counts as if the status had been so from the beginning."""
     assert deferred.status is not None
     corrected = tally_of([*seen, deferred]).correcting(deferred, status, "seen later")
     expected = tally_of(
-        [*seen, Observation(status, deferred.seconds, "seen later", preempted_by=deferred.preempted_by)]
+        [
+            *seen,
+            Observation(status, deferred.seconds, "seen later", preempted_by=deferred.preempted_by),
+        ]
     )
     assert corrected.counts == expected.counts
-    assert {e: m.n for e, m in corrected.durations.items()} == {e: m.n for e, m in expected.durations.items()}
+    assert {e: m.n for e, m in corrected.durations.items()} == {
+        e: m.n for e, m in expected.durations.items()
+    }
     assert corrected.corrected == (status is not deferred.status)
     assert corrected.runs == expected.runs
 
@@ -139,7 +164,8 @@ def test_a_verdict_on_nothing_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("measure", "mean"), [("wall", 2.0), ("cpu", 0.2), ("count", 1.0), ("value:images", 5.0), ("value:energy", 0.0)]
+    ("measure", "mean"),
+    [("wall", 2.0), ("cpu", 0.2), ("count", 1.0), ("value:images", 5.0), ("value:energy", 0.0)],
 )
 def test_cost_by_measure(measure: str, mean: float) -> None:
     """Each declared measure over the counted runs; an unknown value has no numbers."""
@@ -154,19 +180,28 @@ def test_cost_by_measure(measure: str, mean: float) -> None:
 
 
 @given(OBSERVATIONS, st.lists(st.none() | st.integers(0, 9), min_size=25, max_size=25))
-def test_a_count_is_what_runs_report_and_else_one(seen: list[Observation], counts: list[int | None]) -> None:
-    """Summed in a tally as the learners take it run by run; what was preempted and counts none has no cost."""
-    told = [replace(one, values={} if n is None else {"count": float(n)}) for one, n in zip(seen, counts, strict=False)]
+def test_a_count_is_what_runs_report_and_else_one(
+    seen: list[Observation], counts: list[int | None]
+) -> None:
+    """Summed in a tally as the learners take it run by run; what was preempted and counts none has
+    no cost."""
+    told = [
+        replace(one, values={} if n is None else {"count": float(n)})
+        for one, n in zip(seen, counts, strict=False)
+    ]
     counted = [one for one in told if one.status is not None and one.executed is not Executed.NO]
     found = tally_of(told).cost("count")
     assert found.n == len(counted)
     assert found.total == pytest.approx(sum(cost_of(one, "count") for one in counted))
-    assert [cost_of(one, "count") for one in counted] == [one.values.get("count", 1.0) for one in counted]
+    assert [cost_of(one, "count") for one in counted] == [
+        one.values.get("count", 1.0) for one in counted
+    ]
 
 
 @given(st.integers(0, 60), st.integers(0, 60), st.sampled_from([0.8, 0.9, 0.95]))
 def test_intervals_are_the_known_ones(successes: int, others: int, level: float) -> None:
-    """Wilson and Clopper-Pearson as scipy has them; the exact interval is never the shorter at its ends' coverage."""
+    """Wilson and Clopper-Pearson as scipy has them; the exact interval is never the shorter at its
+    ends' coverage."""
     n = successes + others
     if n == 0:
         assert wilson(0, 0) == clopper_pearson(0, 0) == (0.0, 1.0)
@@ -195,7 +230,8 @@ def test_quantiles_interpolate(numbers: list[float], q: float) -> None:
 
 
 def test_the_sample_stays_bounded_and_uniform() -> None:
-    """Of 5,000 durations 0 to 1, `SIZE` are kept, and their law is uniform (Kolmogorov-Smirnov at 1e-3)."""
+    """Of 5,000 durations 0 to 1, `SIZE` are kept, and their law is uniform (Kolmogorov-Smirnov at
+    1e-3)."""
     sample = Sample()
     for i in range(5000):
         sample = sample.adding(f"x/{i}", i / 5000, None, "success")
@@ -239,7 +275,10 @@ def plain_of(*seen: Observation) -> dict[str, Any]:
         ({"durations": {"success": [2, float("nan"), 0.0, 1.0, 1.0]}}, "no moments"),
         ({"durations": {"success": [2, 9.0, 0.0, 1.0, 1.0]}}, "no moments"),
         ({"durations": {"success": [2, -1.0, 0.0, -1.0, -1.0]}}, "seconds below 0"),
-        ({"durations": {"success": [2, 1.0, 0.0, 1.0, 1.0], "lost": [1, 1.0, 0.0, 1.0, 1.0]}}, "none of success"),
+        (
+            {"durations": {"success": [2, 1.0, 0.0, 1.0, 1.0], "lost": [1, 1.0, 0.0, 1.0, 1.0]}},
+            "none of success",
+        ),
         ({"cpu": [3, 1.0, 0.0, 1.0, 1.0]}, "3 numbers called cpu: a whole number from 0 to 2"),
         ({"values": {"images": [3, 1.0, 0.0, 1.0, 1.0]}}, "called images"),
         ({"waited": [3, 1.0, 0.0, 1.0, 1.0]}, "3 waits"),
@@ -250,7 +289,9 @@ def plain_of(*seen: Observation) -> dict[str, Any]:
         ({"sample": [[i, 1.0, -1.0, "success"] for i in range(3)]}, "3 runs in the sample"),
     ],
 )
-def test_numbers_that_no_runs_could_have_left_are_refused(change: dict[str, Any], said: str) -> None:
+def test_numbers_that_no_runs_could_have_left_are_refused(
+    change: dict[str, Any], said: str
+) -> None:
     """One bad number, merged, would spoil the figures of everything that it is added to."""
     run = Observation(Status.SUCCESS, 1.0)
     assert Tally.of_plain(plain_of(run, run)).runs == 2
@@ -263,5 +304,8 @@ def test_whatever_runs_leave_is_taken_back(
     seen: list[Observation], deferred: Observation, status: Status, others: list[Observation]
 ) -> None:
     """Corrected and merged, too: the check refuses nothing that is true."""
-    tally = merge(tally_of([*seen, deferred]).correcting(deferred, status, "seen later"), tally_of(others, "other"))
+    tally = merge(
+        tally_of([*seen, deferred]).correcting(deferred, status, "seen later"),
+        tally_of(others, "other"),
+    )
     assert Tally.of_plain(json.loads(json.dumps(tally.to_plain()))) == tally

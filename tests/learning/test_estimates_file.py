@@ -1,4 +1,5 @@
-"""The estimates file: what survives, what merges, what stays forgotten, and how a bad file is refused."""
+"""The estimates file: what survives, what merges, what stays forgotten, and how a bad file is
+refused."""
 
 from __future__ import annotations
 
@@ -14,13 +15,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
-from coordinator.learning.estimate import Key, Observation
-from coordinator.learning.learning import Estimates
-from coordinator.learning.objective import Question
-from coordinator.learning.passage import Flow, PassageKey
-from coordinator.learning.selectors import make
-from coordinator.task import Status
+from petrobot.coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.learning.estimate import Key, Observation
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.passage import Flow, PassageKey
+from petrobot.coordinator.learning.selectors import make
+from petrobot.coordinator.task import Status
 from tests.learning.conftest import OBSERVATIONS, tally_of
 
 KEY = Key("pick", "pick_fast", "regime=A")
@@ -29,7 +30,9 @@ OTHER = Key("place", "place_soft")
 
 def gained(good: int, key: Key = KEY, salt: str = "") -> Estimates:
     """So many successes of one action, and as many firings."""
-    tally = tally_of([Observation(Status.SUCCESS, 0.1 * (i + 1), cpu_seconds=0.01) for i in range(good)], salt)
+    tally = tally_of(
+        [Observation(Status.SUCCESS, 0.1 * (i + 1), cpu_seconds=0.01) for i in range(good)], salt
+    )
     flow = Flow()
     for _ in range(good):
         flow = flow.adding(0.02)
@@ -51,7 +54,8 @@ def known(file: EstimatesFile) -> tuple[Any, Any]:
 
 
 def test_what_was_added_is_there_again(tmp_path: Path) -> None:
-    """Sums of several sessions, selectors' states, the generation; a file that is not there holds nothing."""
+    """Sums of several sessions, selectors' states, the generation; a file that is not there holds
+    nothing."""
     path = tmp_path / "deep" / "learned.db"
     assert EstimatesFile(path).read() == Kept()
     selector = make("ucb1", ("pick_fast", "pick_slow"))
@@ -67,7 +71,9 @@ def test_what_was_added_is_there_again(tmp_path: Path) -> None:
     assert kept.states("thompson") == {}
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(seen=OBSERVATIONS.filter(len))
 def test_tallies_come_back_exactly(seen: list[Observation], tmp_path: Path) -> None:
     """Whatever was observed."""
@@ -137,9 +143,15 @@ def state_of(name: str, learned: dict[str, int], action: str = "pick_slow") -> d
 
 
 def test_what_was_learned_in_different_contexts_is_joined(tmp_path: Path) -> None:
-    """One machine learned in A and B, the other in B and C: of each context whoever knows more, whoever takes in whom."""
-    states = [state_of("nikolic_fu", {"A": 9, "B": 4}), state_of("nikolic_fu", {"B": 7, "C": 2}, "pick_fast")]
-    expected = {context: states[i]["learners"][context] for context, i in (("A", 0), ("B", 1), ("C", 1))}
+    """One machine learned in A and B, the other in B and C: of each context whoever knows more,
+    whoever takes in whom."""
+    states = [
+        state_of("nikolic_fu", {"A": 9, "B": 4}),
+        state_of("nikolic_fu", {"B": 7, "C": 2}, "pick_fast"),
+    ]
+    expected = {
+        context: states[i]["learners"][context] for context, i in (("A", 0), ("B", 1), ("C", 1))
+    }
     for order in ((0, 1), (1, 0)):
         one, other = (EstimatesFile(tmp_path / f"{order[0]}{i}.db") for i in order)
         one.add(Estimates(), {"pick": states[order[0]]})
@@ -149,7 +161,8 @@ def test_what_was_learned_in_different_contexts_is_joined(tmp_path: Path) -> Non
 
 
 def test_states_over_other_actions_are_not_mixed(tmp_path: Path) -> None:
-    """Numbers by position mean other actions then: the state with more trials is kept whole, frozen as it was here."""
+    """Numbers by position mean other actions then: the state with more trials is kept whole, frozen
+    as it was here."""
     mine, theirs = make("ucb1", ("pick_fast",)), state_of("ucb1", {"A": 3})
     mine.update("B", "pick_fast", Observation(Status.SUCCESS, 1.0))
     one, other = EstimatesFile(tmp_path / "one.db"), EstimatesFile(tmp_path / "other.db")
@@ -160,7 +173,8 @@ def test_states_over_other_actions_are_not_mixed(tmp_path: Path) -> None:
 
 
 def test_a_copy_that_goes_on_is_somebody_else(tmp_path: Path) -> None:
-    """Copied to another machine by hand: what both learn afterwards counts, what they share counts once."""
+    """Copied to another machine by hand: what both learn afterwards counts, what they share counts
+    once."""
     one = file_of(tmp_path / "one.db", 10)
     copy = EstimatesFile(Path(shutil.copy(one.path, tmp_path / "copy.db")))
     one.add(gained(5, salt="one"), {})
@@ -177,7 +191,8 @@ def test_a_copy_that_goes_on_is_somebody_else(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_only_begun_holds_nothing(tmp_path: Path) -> None:
-    """A kill between making the file and its first transaction leaves an empty one: it is used as if it were not there."""
+    """A kill between making the file and its first transaction leaves an empty one: it is used as
+    if it were not there."""
     path = tmp_path / "begun.db"
     path.touch()
     file = EstimatesFile(path)
@@ -224,7 +239,8 @@ def test_a_choice_that_was_reset_does_not_come_back(tmp_path: Path, selectors_on
 
 
 def test_what_is_learned_after_another_files_reset_counts(tmp_path: Path) -> None:
-    """A file that hears of a reset of its own runs goes on under a new origin, so that the next merge does not drop them."""
+    """A file that hears of a reset of its own runs goes on under a new origin, so that the next
+    merge does not drop them."""
     one, other = file_of(tmp_path / "one.db", 5), file_of(tmp_path / "other.db", 4)
     one.merge(other.path)
     one.reset("pick")
@@ -262,7 +278,8 @@ def test_selectors_alone_can_be_reset(tmp_path: Path) -> None:
 
 
 def test_two_sessions_at_once_lose_nothing(tmp_path: Path) -> None:
-    """Both read the file, both add what they gained: the sums are added within the file, not written over."""
+    """Both read the file, both add what they gained: the sums are added within the file, not
+    written over."""
     file = file_of(tmp_path / "one.db", 1)
     sessions = [EstimatesFile(tmp_path / "one.db") for _ in range(2)]
     for session in sessions:
@@ -309,19 +326,37 @@ def asked_of(path: Path, statement: str) -> Path:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda p: p.write_bytes(b"no database at all, but long enough to be looked at" * 9), "not a database"),
+        (
+            lambda p: p.write_bytes(b"no database at all, but long enough to be looked at" * 9),
+            "not a database",
+        ),
         (lambda p: written(p, "CREATE TABLE songs(name)"), "no estimates file"),
         (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 99"), "schema 99.*upgrade"),
         (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 0"), "schema 0.*new file"),
         (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = '{}'"), "do not fit"),
         (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = 'x'"), "do not fit"),
         (lambda p: file_of(p, 2) and written(p, "DROP TABLE tally"), "no such table"),
-        (lambda p: asked_of(p, "UPDATE question SET cost = 'pictures'"), "'pictures' is no cost measure"),
+        (
+            lambda p: asked_of(p, "UPDATE question SET cost = 'pictures'"),
+            "'pictures' is no cost measure",
+        ),
         (lambda p: asked_of(p, "UPDATE question SET target = 7"), "7.0 is no target"),
         (lambda p: asked_of(p, "UPDATE question SET rho = -3"), "-3.0 is no weight"),
         (lambda p: p.mkdir(), "unable to open"),
     ],
-    ids=["text", "foreign", "newer", "older", "empty body", "torn body", "no table", "cost", "target", "rho", "folder"],
+    ids=[
+        "text",
+        "foreign",
+        "newer",
+        "older",
+        "empty body",
+        "torn body",
+        "no table",
+        "cost",
+        "target",
+        "rho",
+        "folder",
+    ],
 )
 def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str) -> None:
     """File, what is wrong, what to do; and it is left as it was."""
@@ -337,7 +372,13 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
 @pytest.mark.parametrize(
     ("table", "old", "new", "version", "said"),
     [
-        ("tally", '[["success","",2]]', '[["success","",-5]]', 999, "pick, pick_fast (regime=A): -5 runs"),
+        (
+            "tally",
+            '[["success","",2]]',
+            '[["success","",-5]]',
+            999,
+            "pick, pick_fast (regime=A): -5 runs",
+        ),
         ("tally", '"unknown":0', '"unknown":7', 2, "pick, pick_fast (regime=A): 7 runs of which"),
         ("tally", '"unknown"', '"unheard"', 2, "'unknown' is missing"),
         ("tally", "{", "{", 999, "version 999 of what was changed 2 times"),
@@ -349,9 +390,13 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
 def test_a_corrupted_file_poisons_no_other(
     tmp_path: Path, table: str, old: str, new: str, version: int, said: str
 ) -> None:
-    """It is refused by name, whatever its version, and the file that should have taken it is as it was."""
+    """It is refused by name, whatever its version, and the file that should have taken it is as it
+    was."""
     one, other = file_of(tmp_path / "one.db", 3), file_of(tmp_path / "other.db", 2)
-    written(other.path, f"UPDATE {table} SET body = replace(body, '{old}', '{new}'), version = {version}")
+    written(
+        other.path,
+        f"UPDATE {table} SET body = replace(body, '{old}', '{new}'), version = {version}",
+    )
     before = known(one)
     for use in (other.read, lambda: one.merge(other.path)):
         with pytest.raises(EstimatesError) as fault:
@@ -361,11 +406,12 @@ def test_a_corrupted_file_poisons_no_other(
     assert known(one) == before
 
 
-# --- what was asked, and files of schema 1 ------------------------------------------------------------------------------
+# --- what was asked, and files of schema 1 ----------------------------------------------------
 
 
 def test_what_actions_are_judged_by_is_kept(tmp_path: Path) -> None:
-    """Per origin: a file's own says the last word, of others the one that was asked most often; all that differ are known."""
+    """Per origin: a file's own says the last word, of others the one that was asked most often; all
+    that differ are known."""
     one, other, third = (EstimatesFile(tmp_path / f"{i}.db") for i in range(3))
     images, wall = Question("value:images", 0.8, 0.1), Question("wall", 0.9)
     assert one.read().question("pick") == Question()
@@ -404,16 +450,27 @@ PRAGMA user_version = 1;
 def old_file(path: Path, good: int, origin: str) -> EstimatesFile:
     """A file of schema 1 with so many successes, and a selector that was learned by images."""
     written(path, SCHEMA_1)
-    tally, state = gained(good, salt=origin).tally(KEY), state_of("ucb1", {"A": 3}) | {"cost": "value:images"}
+    tally, state = (
+        gained(good, salt=origin).tally(KEY),
+        state_of("ucb1", {"A": 3}) | {"cost": "value:images"},
+    )
     flow = gained(good).flows[PassageKey("sorting", "begin", "regime=A")]
     with closing(sqlite3.connect(path)) as db, db:
         rows = [("origin", origin), ("generation", "1")]
         db.executemany("INSERT INTO about VALUES (?, ?)", rows)
         where = ("pick", "pick_fast", "regime=A", tally.changes, json.dumps(tally.to_plain()))
         db.execute("INSERT INTO tally VALUES (?, ?, ?, ?, ?, ?)", (origin, *where))
-        where = ("sorting", "begin", "regime=A", flow.fired, json.dumps([flow.fired, flow.waits.to_plain()]))
+        where = (
+            "sorting",
+            "begin",
+            "regime=A",
+            flow.fired,
+            json.dumps([flow.fired, flow.waits.to_plain()]),
+        )
         db.execute("INSERT INTO flow VALUES (?, ?, ?, ?, ?, ?)", (origin, *where))
-        db.execute("INSERT INTO selector VALUES (?, ?, ?, ?)", ("pick", "ucb1", 3.0, json.dumps(state)))
+        db.execute(
+            "INSERT INTO selector VALUES (?, ?, ?, ?)", ("pick", "ucb1", 3.0, json.dumps(state))
+        )
     return EstimatesFile(path)
 
 
@@ -424,10 +481,15 @@ def schema_of(path: Path) -> int:
 
 
 def test_a_file_of_schema_1_goes_on(tmp_path: Path) -> None:
-    """It is read as it is, and becomes one of schema 2 when something is added; nothing is lost or counted twice."""
+    """It is read as it is, and becomes one of schema 2 when something is added; nothing is lost or
+    counted twice."""
     old = old_file(tmp_path / "old.db", 4, "ab12")
     kept = old.read()
-    assert (kept.generation, kept.estimates.tally(KEY).runs, kept.question("pick").measure) == (1, 4, "value:images")
+    assert (kept.generation, kept.estimates.tally(KEY).runs, kept.question("pick").measure) == (
+        1,
+        4,
+        "value:images",
+    )
     assert schema_of(old.path) == 1
     old.add(gained(3, salt="more"), {}, asked={"pick": Question("cpu", 0.7)})
     kept = old.read()
@@ -450,7 +512,7 @@ def test_old_and_new_files_merge(tmp_path: Path) -> None:
     assert known(old) == known(new)
 
 
-# --- campaigns: origins that are closed ---------------------------------------------------------------------------------
+# --- campaigns: origins that are closed -------------------------------------------------------
 
 RUNS = "campaign/0123"
 """The origin of one campaign, wherever it was run."""
@@ -460,12 +522,15 @@ def campaign_file(path: Path, good: int = 12) -> EstimatesFile:
     """What a campaign writes beside its table."""
     file = EstimatesFile(path, RUNS)
     selectors = {"pick": state_of("nikolic_fu", {"regime=A": good})}
-    file.put_closed(RUNS, gained(good, salt=RUNS), selectors, {"pick": Question("value:images", 0.8)})
+    file.put_closed(
+        RUNS, gained(good, salt=RUNS), selectors, {"pick": Question("value:images", 0.8)}
+    )
     return file
 
 
 def test_what_is_added_to_a_campaigns_file_is_not_the_campaigns(tmp_path: Path) -> None:
-    """The same campaign on two machines, both go on, and meet: its runs count once, each one's own too."""
+    """The same campaign on two machines, both go on, and meet: its runs count once, each one's own
+    too."""
     one, other = (campaign_file(tmp_path / f"m{i}.db") for i in (1, 2))
     one.add(gained(6, salt="one"), {})
     one.add(gained(1, salt="one again"), {})
@@ -498,7 +563,8 @@ def test_a_campaign_that_is_written_again_wipes_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("goes_on", [False, True])
 def test_a_campaign_that_was_reset_stays_forgotten(tmp_path: Path, goes_on: bool) -> None:
-    """When it is written again, and when another machine's file of it comes in; also if a run was added before."""
+    """When it is written again, and when another machine's file of it comes in; also if a run was
+    added before."""
     file, other = (campaign_file(tmp_path / f"m{i}.db") for i in (1, 2))
     if goes_on:
         file.add(gained(6, salt="run"), {})
@@ -516,7 +582,8 @@ def test_a_campaign_that_was_reset_stays_forgotten(tmp_path: Path, goes_on: bool
 
 
 def test_a_campaigns_file_of_schema_1_is_closed_when_it_goes_on(tmp_path: Path) -> None:
-    """So a run that is added after the update merges; what the campaign writes again does not take away what is there."""
+    """So a run that is added after the update merges; what the campaign writes again does not take
+    away what is there."""
     one, other = (old_file(tmp_path / f"m{i}.db", 12, RUNS) for i in (1, 2))
     one.add(gained(6, salt="one"), {})
     assert one.read().origin != RUNS
@@ -536,11 +603,18 @@ def test_merging_from_nowhere_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "one.db").exists()
 
 
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(steps=st.lists(st.tuples(st.integers(0, 2), st.sampled_from("amMc"), st.integers(1, 3)), max_size=10))
+@settings(
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    steps=st.lists(
+        st.tuples(st.integers(0, 2), st.sampled_from("amMc"), st.integers(1, 3)), max_size=10
+    )
+)
 def test_files_that_met_agree(steps: list[tuple[int, str, int]], tmp_path: Path) -> None:
-    """Whatever was added where and merged whither, one file begun under schema 1, one by a campaign, campaigns given again
-    anywhere: after all have met, all know every run exactly once."""
+    """Whatever was added where and merged whither, one file begun under schema 1, one by a
+    campaign, campaigns given again anywhere: after all have met, all know every run exactly
+    once."""
     folder = tmp_path / "crdt"
     for old in folder.glob("*") if folder.exists() else ():
         old.unlink()
@@ -553,7 +627,10 @@ def test_files_that_met_agree(steps: list[tuple[int, str, int]], tmp_path: Path)
         campaigns.add(number)
 
     campaigns: set[int] = set()
-    begun = [EstimatesFile(folder / "1.db", "campaign/1"), EstimatesFile(folder / "2.db", "origin2")]
+    begun = [
+        EstimatesFile(folder / "1.db", "campaign/1"),
+        EstimatesFile(folder / "2.db", "origin2"),
+    ]
     files = [old_file(folder / "0.db", 1, "origin0"), *begun]
     campaign(1, files[1])
     files[2].add(gained(1, salt="begin"), {})

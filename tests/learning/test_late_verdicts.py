@@ -1,4 +1,5 @@
-"""Verdicts and the estimates file: R is corrected once, wherever the mission run was interrupted and wherever the file went."""
+"""Verdicts and the estimates file: R is corrected once, wherever the mission run was interrupted
+and wherever the file went."""
 
 from __future__ import annotations
 
@@ -10,11 +11,15 @@ from typing import Any
 
 import pytest
 
-from coordinator.experience.estimates_file import EstimatesFile
-from coordinator.experience.learning_session import LearningSession, LearningSetting, session_of
-from coordinator.launch import Setting, lockstep_cell
-from coordinator.learning.records import Correction, End, Record, of_plain, to_plain
-from coordinator.task import Task
+from petrobot.coordinator.experience.estimates_file import EstimatesFile
+from petrobot.coordinator.experience.learning_session import (
+    LearningSession,
+    LearningSetting,
+    session_of,
+)
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.learning.records import Correction, End, Record, of_plain, to_plain
+from petrobot.coordinator.task import Task
 from tests.mission.judged_parts import LEARNED, PARTS, directory, learned, sorting
 
 SELECTOR = "round_robin"
@@ -29,7 +34,9 @@ def task() -> Task:
 def whole(task: Task, path: Path) -> LearningSession:
     """A mission run that learned, and was not saved."""
     session = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
-    cell, party = lockstep_cell(directory(), Setting(task, runs=PARTS, seed=1, selector=session.selector))
+    cell, party = lockstep_cell(
+        directory(), Setting(task, runs=PARTS, seed=1, selector=session.selector)
+    )
     assert cell.run(lambda: party.over, 100_000)
     return session
 
@@ -53,14 +60,19 @@ def taken_up(task: Task, session: LearningSession, records: Sequence[Record]) ->
 def kept(path: Path) -> Mapping[str, tuple[dict[Any, int], int]]:
     """By action: what the file says of its runs, and how many were corrected."""
     tallies = EstimatesFile(path).read().estimates.tallies
-    return {key.action: (dict(t.counts), t.corrected) for key, t in tallies.items() if key.primitive_task == "pick"}
+    return {
+        key.action: (dict(t.counts), t.corrected)
+        for key, t in tallies.items()
+        if key.primitive_task == "pick"
+    }
 
 
 TRUE = {action: (counts, corrected) for action, (counts, corrected, _) in LEARNED.items()}
 
 
 def test_wherever_it_was_interrupted_each_verdict_counts_once(task: Task, tmp_path: Path) -> None:
-    """At any record: with the run and its verdict on one side, or the run counted and saved before its verdict came."""
+    """At any record: with the run and its verdict on one side, or the run counted and saved before
+    its verdict came."""
     one = whole(task, tmp_path / "none.db")
     records = one.selector.records
     assert sum(isinstance(r, Correction) for r in records) == 5
@@ -77,7 +89,8 @@ def test_wherever_it_was_interrupted_each_verdict_counts_once(task: Task, tmp_pa
 
 
 def split(task: Task, path: Path, between: Callable[[], None]) -> None:
-    """All runs are counted and saved, something happens to the file, then the score's verdict on the third pick comes."""
+    """All runs are counted and saved, something happens to the file, then the score's verdict on
+    the third pick comes."""
     records = whole(task, path.with_name("none.db")).selector.records
     last = max(n for n, r in enumerate(records) if isinstance(r, Correction))
     first = LearningSession(task, LearningSetting(path, SELECTOR), seed=1)
@@ -87,10 +100,13 @@ def split(task: Task, path: Path, between: Callable[[], None]) -> None:
 
 
 def test_merged_before_and_after_it_counts_once(task: Task, tmp_path: Path) -> None:
-    """Another machine has heard of the run before its verdict came, and hears of that later, as often as one likes."""
+    """Another machine has heard of the run before its verdict came, and hears of that later, as
+    often as one likes."""
     path, other = tmp_path / "here.db", tmp_path / "there.db"
     split(task, path, lambda: EstimatesFile(other).merge(path))
-    assert kept(other)["pick_left"] == ({("failure", "crooked"): 1, ("success", ""): 2}, 1), "provisional until then"
+    assert kept(other)["pick_left"] == ({("failure", "crooked"): 1, ("success", ""): 2}, 1), (
+        "provisional until then"
+    )
     for _ in range(2):
         EstimatesFile(other).merge(path)
         EstimatesFile(path).merge(other)
@@ -98,7 +114,8 @@ def test_merged_before_and_after_it_counts_once(task: Task, tmp_path: Path) -> N
 
 
 def test_what_was_forgotten_or_copied_meanwhile_is_left_alone(task: Task, tmp_path: Path) -> None:
-    """The runs are not this file's own any more: no run of somebody else's is corrected in their place."""
+    """The runs are not this file's own any more: no run of somebody else's is corrected in their
+    place."""
     path = tmp_path / "reset.db"
     split(task, path, EstimatesFile(path).reset)
     assert kept(path) == {}

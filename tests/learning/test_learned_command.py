@@ -1,4 +1,5 @@
-"""`run --learn` and `learned` as a user meets them: twice in a row, frozen, merged; and nothing touched without --learn."""
+"""`run --learn` and `learned` as a user meets them: twice in a row, frozen, merged; and nothing
+touched without --learn."""
 
 from __future__ import annotations
 
@@ -8,17 +9,21 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli import main
-from coordinator.engine import Engine
-from coordinator.experience.estimates_file import EstimatesFile
-from coordinator.experience.learning_session import LearningSession, LearningSetting, session_of
-from coordinator.launch import resumed_mission, with_runs
-from coordinator.learning.estimate import Key, Observation, Tally
-from coordinator.learning.learning import Estimates
-from coordinator.learning.objective import Question
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import JournalStore
-from coordinator.task import Status
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.experience.estimates_file import EstimatesFile
+from petrobot.coordinator.experience.learning_session import (
+    LearningSession,
+    LearningSetting,
+    session_of,
+)
+from petrobot.coordinator.launch import resumed_mission, with_runs
+from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.task import Status
 from tests.learning.cell import TASK_FILE, directory, run, sorting
 from tests.learning.conftest import tally_of
 
@@ -74,7 +79,17 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def petrobot(*more: str, runs: int = 6) -> tuple[int, dict[str, Any]]:
     """Run the sorting task in lock step; the result without its wall-clock time."""
-    given = ["--mode", "lockstep", "--runs", str(runs), "--mock", "mock.toml", "--json", "out.json", "--quiet"]
+    given = [
+        "--mode",
+        "lockstep",
+        "--runs",
+        str(runs),
+        "--mock",
+        "mock.toml",
+        "--json",
+        "out.json",
+        "--quiet",
+    ]
     code = main(["run", str(TASK_FILE), *given, *more])
     result: dict[str, Any] = json.loads(Path("out.json").read_text(encoding="utf-8"))
     del result["wall_s"]
@@ -98,32 +113,45 @@ def test_learning_goes_on_where_it_stood(cell: Path, capsys: pytest.CaptureFixtu
     assert again == first
     assert main(["learned", "show", "learned.db", "--target", "0.9", "--json", "shown.json"]) == 0
     shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
-    assert {row["action"] for row in shown["pick"]["actions"]} == {"pick_fast", "pick_slow", "pick_blind"}
+    assert {row["action"] for row in shown["pick"]["actions"]} == {
+        "pick_fast",
+        "pick_slow",
+        "pick_blind",
+    }
     assert shown["pick"]["best"] in (None, "pick_slow")
     assert "nikolic_fu_fast regime=A" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_costs_are_shown_as_they_were_learned_by(cell: Path) -> None:
-    """The measure that the task declares for each primitive task, and in its unit; `--cost` asks otherwise."""
+    """The measure that the task declares for each primitive task, and in its unit; `--cost` asks
+    otherwise."""
     petrobot("--learn", "learned.db", runs=12)
 
     def shown(*more: str) -> dict[str, Any]:
         assert main(["learned", "show", "learned.db", "--json", "shown.json", *more]) == 0
-        found: dict[str, Any] = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+        found: dict[str, Any] = json.loads(Path("shown.json").read_text(encoding="utf-8"))[
+            "primitive_tasks"
+        ]
         return found
 
     declared = shown()
-    assert {task: about["cost"] for task, about in declared.items()} == {"pick": "wall", "place": "value:tries"}
+    assert {task: about["cost"] for task, about in declared.items()} == {
+        "pick": "wall",
+        "place": "value:tries",
+    }
     place = EstimatesFile(cell / "learned.db").read().estimates.of("place")
     for row in declared["place"]["actions"]:
         (tally,) = place[row["action"]].values()
         assert row["C"] == pytest.approx(tally.cost("value:tries").mean)
     counted = shown("--cost", "count")
-    assert all(row["C"] == 1.0 for about in counted.values() for row in about["actions"] if row["runs"])
+    assert all(
+        row["C"] == 1.0 for about in counted.values() for row in about["actions"] if row["runs"]
+    )
 
 
 def test_it_learns_the_only_way_that_works(cell: Path) -> None:
-    """Of three ways to pick, one succeeds: after 150 runs it has nearly all probability, and frozen it is always chosen."""
+    """Of three ways to pick, one succeeds: after 150 runs it has nearly all probability, and frozen
+    it is always chosen."""
     _, result = petrobot("--learn", "learned.db", runs=150)
     assert result["learned"]["probabilities"]["pick"]["pick_slow"] > 0.9
     before = (cell / "learned.db").read_bytes()
@@ -154,12 +182,26 @@ def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
         (["--learn", "mock.toml"], "not a database"),
         (["--learn", "learned.db", "--context", "speed"], "no parameter or variable 'speed'"),
         (["--learn", "learned.db", "--selector", "greedy"], "invalid choice"),
-        (["--learn", "learned.db", "--target", "7"], "--target: 7 is not a number of more than 0 and at most 1"),
+        (
+            ["--learn", "learned.db", "--target", "7"],
+            "--target: 7 is not a number of more than 0 and at most 1",
+        ),
     ],
 )
-def test_bad_input_is_refused(cell: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_refused(
+    cell: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exit code 2 and one line, before anything runs or is written."""
-    given = ["run", str(TASK_FILE), "--mode", "lockstep", "--mock", "mock.toml", "--quiet", *arguments]
+    given = [
+        "run",
+        str(TASK_FILE),
+        "--mode",
+        "lockstep",
+        "--mock",
+        "mock.toml",
+        "--quiet",
+        *arguments,
+    ]
     assert main(given) == 2
     assert said in capsys.readouterr().err
     assert not (cell / "learned.db").exists()
@@ -169,7 +211,9 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
     """Merge adds, freeze holds the selectors, reset forgets; unknown names are refused."""
     petrobot("--learn", "one.db", runs=8)
     petrobot("--learn", "two.db", "--seed", "9", runs=8)
-    frozen_at = json.dumps(EstimatesFile(cell / "one.db").read().states("nikolic_fu_fast")["pick"]["learners"])
+    frozen_at = json.dumps(
+        EstimatesFile(cell / "one.db").read().states("nikolic_fu_fast")["pick"]["learners"]
+    )
     assert main(["learned", "freeze", "one.db", "pick"]) == 0
     petrobot("--learn", "one.db", runs=4)
     states = EstimatesFile(cell / "one.db").read().states("nikolic_fu_fast")
@@ -178,9 +222,15 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert not states["place"]["frozen"]
     assert main(["learned", "thaw", "one.db"]) == 0
     assert main(["learned", "merge", "one.db", "two.db"]) == 0
-    runs = sum(t.runs for t in EstimatesFile(cell / "one.db").read().estimates.of("pick")["pick_slow"].values())
+    runs = sum(
+        t.runs
+        for t in EstimatesFile(cell / "one.db").read().estimates.of("pick")["pick_slow"].values()
+    )
     assert main(["learned", "merge", "one.db", "two.db", "two.db"]) == 0
-    again = sum(t.runs for t in EstimatesFile(cell / "one.db").read().estimates.of("pick")["pick_slow"].values())
+    again = sum(
+        t.runs
+        for t in EstimatesFile(cell / "one.db").read().estimates.of("pick")["pick_slow"].values()
+    )
     assert again == runs
     assert main(["learned", "reset", "one.db", "pick"]) == 0
     assert not EstimatesFile(cell / "one.db").read().estimates.of("pick")
@@ -192,13 +242,19 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["reset", "one.db", "fly"], "no primitive task 'fly'"),
         (["show", "one.db", "--cost", "pictures"], "no cost measure"),
         (["show", "one.db", "--cost", "value:"], "no cost measure"),
-        (["show", "two.db", "--cost", "value:nosuch"], "the results have: value:tries, value:weight"),
+        (
+            ["show", "two.db", "--cost", "value:nosuch"],
+            "the results have: value:tries, value:weight",
+        ),
         (["show", "two.db", "pick", "--cost", "value:tries"], "the results have: value:weight"),
         (["show", "one.db", "--target", "7"], "7 is not a number of more than 0 and at most 1"),
         (["show", "one.db", "--rho", "-3"], "-3 is not a number of at least 0"),
         (["show", "one.db", "--budget", "nan"], "nan is not a number of more than 0"),
         (["show", "one.db", "--context", "nowhere"], "knows the contexts 'regime=A'"),
-        (["task", "one.db", str(TASK_FILE), "--context", "nowhere"], "knows the contexts 'regime=A'"),
+        (
+            ["task", "one.db", str(TASK_FILE), "--context", "nowhere"],
+            "knows the contexts 'regime=A'",
+        ),
     ):
         assert main(["learned", *arguments]) == 2
         assert said in capsys.readouterr().err
@@ -215,8 +271,13 @@ def told(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[di
 
 def shares(seconds: float, **by_context: tuple[int, int]) -> dict[str, Tally]:
     """Tallies of (successes, failures) by context."""
-    ends = {c: [Status.SUCCESS] * good + [Status.FAILURE] * bad for c, (good, bad) in by_context.items()}
-    return {c: tally_of([Observation(status, seconds) for status in statuses]) for c, statuses in ends.items()}
+    ends = {
+        c: [Status.SUCCESS] * good + [Status.FAILURE] * bad for c, (good, bad) in by_context.items()
+    }
+    return {
+        c: tally_of([Observation(status, seconds) for status in statuses])
+        for c, statuses in ends.items()
+    }
 
 
 def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tally]) -> Path:
@@ -226,7 +287,9 @@ def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tall
     return path
 
 
-def test_shown_is_the_worst_case_and_each_context(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shown_is_the_worst_case_and_each_context(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Pooled over unequal shares of easy and hard, the better action would look the worse one."""
     good = shares(1.0, easy=(98, 2), hard=(560, 440))
     bad = shares(1.0, easy=(900, 100), hard=(40, 60))
@@ -243,24 +306,42 @@ def test_shown_is_the_worst_case_and_each_context(tmp_path: Path, capsys: pytest
     assert all(row["J"] == pytest.approx(2 - row["R"]) for row in parts.values())
     assert "good * 1100 0.56" in text and "hard 1000 0.56" in text and "easy 100 0.98" in text
     alone, text = told(tmp_path / "x.db", capsys, "--context", "easy")
-    assert {row["action"]: row["R"] for row in alone["pick"]["actions"]} == {"good": 0.98, "bad": 0.9}
+    assert {row["action"]: row["R"] for row in alone["pick"]["actions"]} == {
+        "good": 0.98,
+        "bad": 0.9,
+    }
     assert "hard" not in text
 
 
-def test_shown_by_the_target_that_the_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """So without being asked again; `--target` asks otherwise, and one context by itself has none."""
+def test_shown_by_the_target_that_the_file_holds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """So without being asked again; `--target` asks otherwise, and one context by itself has
+    none."""
     path = tmp_path / "x.db"
     act = shares(1.0, calm=(990, 10), windy=(900, 100), storm=(500, 500))
     act["windy"] = shares(2.0, windy=(900, 100))["windy"]
-    file_of(path, Question("wall", 0.85, 0.25), act=act, weak=shares(1.0, calm=(5, 5), windy=(5, 5), storm=(5, 5)))
+    file_of(
+        path,
+        Question("wall", 0.85, 0.25),
+        act=act,
+        weak=shares(1.0, calm=(5, 5), windy=(5, 5), storm=(5, 5)),
+    )
     shown, text = told(path, capsys)
     row, weak = shown["pick"]["actions"]
     assert (shown["pick"]["target"], shown["pick"]["rho"]) == (0.85, 0.25)
-    assert (row["scenario"], row["scenarios"], row["C"], row["worst"]) == ("windy", ["calm", "windy"], 2.0, "storm")
+    assert (row["scenario"], row["scenarios"], row["C"], row["worst"]) == (
+        "windy",
+        ["calm", "windy"],
+        2.0,
+        "storm",
+    )
     assert row["J"] == pytest.approx(1 - 0.5 + 0.25 * 2.0)
     assert weak["J"] is None
     assert "act meets R 0.85 in: calm, windy, where it costs 2 at most" in text
-    assert "target R 0.85" in text and "weak does not surely reach R 0.85 in any context: no J" in text
+    assert (
+        "target R 0.85" in text and "weak does not surely reach R 0.85 in any context: no J" in text
+    )
     shown, text = told(path, capsys, "--target", "0.995", "--rho", "0")
     assert shown["pick"]["target_unmet"]
     assert [row["J"] for row in shown["pick"]["actions"]] == [0.5, 0.5]
@@ -268,8 +349,11 @@ def test_shown_by_the_target_that_the_file_holds(tmp_path: Path, capsys: pytest.
     assert told(path, capsys, "--context", "storm")[0]["pick"]["target"] is None
 
 
-def test_what_a_table_cannot_say_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Contexts that not all actions share, costs that no result has, other questions of other machines."""
+def test_what_a_table_cannot_say_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Contexts that not all actions share, costs that no result has, other questions of other
+    machines."""
     some, none = shares(1.0, A=(5, 5), B=(9, 1)), shares(1.0, C=(5, 5))
     _, text = told(file_of(tmp_path / "x.db", one=some, other=shares(1.0, A=(5, 5))), capsys)
     assert "judged over the contexts in which all actions were run: A" in text
@@ -285,17 +369,40 @@ def test_what_a_table_cannot_say_is_said(tmp_path: Path, capsys: pytest.CaptureF
     assert "no run reported" not in text
 
 
-def test_a_run_says_that_a_cost_was_never_reported(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The number that the task file names as cost is in no result: one line for each action, and what to correct."""
+def test_a_run_says_that_a_cost_was_never_reported(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The number that the task file names as cost is in no result: one line for each action, and
+    what to correct."""
     spoilt = cell / "sorting.toml"
-    spoilt.write_text(TASK_FILE.read_text(encoding="utf-8").replace("value:tries", "value:trees"), encoding="utf-8")
+    spoilt.write_text(
+        TASK_FILE.read_text(encoding="utf-8").replace("value:tries", "value:trees"),
+        encoding="utf-8",
+    )
     petrobot("--learn", "learned.db", runs=2)
     assert "reported" not in capsys.readouterr().err
-    assert main(["run", str(spoilt), "--mode", "lockstep", "--mock", "mock.toml", "--quiet", "--learn", "x.db"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(spoilt),
+                "--mode",
+                "lockstep",
+                "--mock",
+                "mock.toml",
+                "--quiet",
+                "--learn",
+                "x.db",
+            ]
+        )
+        == 0
+    )
     assert "place: no run of place_soft reported value:trees" in capsys.readouterr().err
 
 
-def test_what_the_actions_come_to_in_the_task(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_the_actions_come_to_in_the_task(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """R and C of primitive tasks and of the task through its net, for one run of it."""
     petrobot("--learn", "learned.db", "--selector", "round_robin", runs=30)
     assert main(["learned", "task", "learned.db", str(TASK_FILE), "--json", "task.json"]) == 0
@@ -314,7 +421,8 @@ def test_what_the_actions_come_to_in_the_task(cell: Path, capsys: pytest.Capture
 
 
 def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
-    """The session of a recorded run begins as that run began, and adds only what was not saved before."""
+    """The session of a recorded run begins as that run began, and adds only what was not saved
+    before."""
     task, path = sorting(), tmp_path / "learned.db"
     one = LearningSession(task, LearningSetting(path), seed=5)
     header = {"seed": 5, "learning": json.loads(json.dumps(one.beginning()))}
@@ -339,13 +447,19 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
     assert directory(task).actions
     assert session_of(task, {"seed": 5}) is None
     with pytest.raises(ValueError, match="declared"):
-        session_of(task, {"seed": 5, "learning": {k: v for k, v in header["learning"].items() if k != "declared"}})
+        session_of(
+            task,
+            {
+                "seed": 5,
+                "learning": {k: v for k, v in header["learning"].items() if k != "declared"},
+            },
+        )
     assert Key("pick", "pick_slow", "regime=A") in kept.estimates.tallies
 
 
 def test_a_resumed_mission_brings_its_selector_to_where_it_was(tmp_path: Path) -> None:
-    """A journal that stops half way: what the resumed selector knows is what the live one knew there, and its next choice is
-    the same."""
+    """A journal that stops half way: what the resumed selector knows is what the live one knew
+    there, and its next choice is the same."""
     task, path = sorting(), tmp_path / "learned.db"
     session = LearningSession(task, LearningSetting(path), seed=5)
     header = {
@@ -366,7 +480,13 @@ def test_a_resumed_mission_brings_its_selector_to_where_it_was(tmp_path: Path) -
     resumed = session_of(task, json.loads(json.dumps(journal.header)))
     assert resumed is not None
     mission, _ = resumed_mission(
-        directory(task), known, Engine(known, {}), journal, [resumed.selector], 100.0, resumed.selector
+        directory(task),
+        known,
+        Engine(known, {}),
+        journal,
+        [resumed.selector],
+        100.0,
+        resumed.selector,
     )
     n = len(resumed.selector.records)
     assert 0 < n < len(session.selector.records)

@@ -1,4 +1,5 @@
-"""The selector that learns, on the executor: what it records, by which contexts, and that replay derives the same state."""
+"""The selector that learns, on the executor: what it records, by which contexts, and that replay
+derives the same state."""
 
 from __future__ import annotations
 
@@ -12,19 +13,31 @@ from typing import Any, cast
 
 import pytest
 
-from coordinator.engine import Engine, Override, State
-from coordinator.engine.instructions import Corrected, RunRecorded, StartRun
-from coordinator.experience.learner import ContextError, Contexts, LearningSelector, usual_contexts
-from coordinator.launch import Setting, lockstep_cell, with_runs
-from coordinator.learning.estimate import Key
-from coordinator.learning.learning import Learning
-from coordinator.learning.records import Choice, Correction, End, Passage, of_plain, to_plain
-from coordinator.learning.selectors import RULES
-from coordinator.mission.realtime import RealtimeMission
-from coordinator.operator.operation import Operation
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import JournalStore, replay
-from coordinator.task import Executed, Status, Task
+from petrobot.coordinator.engine import Engine, Override, State
+from petrobot.coordinator.engine.instructions import Corrected, RunRecorded, StartRun
+from petrobot.coordinator.experience.learner import (
+    ContextError,
+    Contexts,
+    LearningSelector,
+    usual_contexts,
+)
+from petrobot.coordinator.launch import Setting, lockstep_cell, with_runs
+from petrobot.coordinator.learning.estimate import Key
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.records import (
+    Choice,
+    Correction,
+    End,
+    Passage,
+    of_plain,
+    to_plain,
+)
+from petrobot.coordinator.learning.selectors import RULES
+from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.operator.operation import Operation
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import JournalStore, replay
+from petrobot.coordinator.task import Executed, Status, Task
 from tests.learning.cell import directory, run, scripts, sorting
 
 
@@ -53,11 +66,14 @@ def test_every_end_and_choice_is_recorded(task: Task) -> None:
         assert tally.censored == recorded[key.primitive_task, key.action, None]
     choices = [r for r in selector.records if isinstance(r, Choice)]
     assert len(choices) == len([r for r in selector.records if isinstance(r, End)])
-    assert [of_plain(json.loads(json.dumps(to_plain(r)))) for r in selector.records] == selector.records
+    assert [
+        of_plain(json.loads(json.dumps(to_plain(r)))) for r in selector.records
+    ] == selector.records
 
 
 def test_costs_durations_waits_and_values(task: Task) -> None:
-    """Seconds as the node says, what the token waited beyond, numbers of the result, and the wait for the pulse."""
+    """Seconds as the node says, what the token waited beyond, numbers of the result, and the wait
+    for the pulse."""
     selector = learner(task, "round_robin", seed=1)
     run(task, selector, runs=12)
     known = selector.learning.estimates
@@ -75,7 +91,8 @@ def test_costs_durations_waits_and_values(task: Task) -> None:
 
 
 def test_a_preempted_run_is_censored_by_its_transition(task: Task) -> None:
-    """`jam` comes every 1.24 s and takes placing runs, which count none: exposure grows, R does not change."""
+    """`jam` comes every 1.24 s and takes placing runs, which count none: exposure grows, R does not
+    change."""
     selector = learner(task, "round_robin", seed=2)
     run(task, selector, runs=40)
     tallies = selector.learning.estimates.of("place")
@@ -102,15 +119,18 @@ def test_the_same_seed_chooses_the_same(task: Task, name: str) -> None:
 
 
 def test_replay_derives_the_same_state(task: Task, tmp_path: Path) -> None:
-    """The recorded steps, shown to a fresh selector, leave exactly what the live one had: so a resume goes on as if nothing
-    had happened, and the reasons of the choices stand in the journal."""
+    """The recorded steps, shown to a fresh selector, leave exactly what the live one had: so a
+    resume goes on as if nothing had happened, and the reasons of the choices stand in the
+    journal."""
     path = tmp_path / "run.journal"
     store = JournalStore(JournalWriter(path, {"mission": "m", "mode": "lockstep"}), 0.0)
     live = learner(task, seed=4)
     run(task, live, runs=15, seed=4, store=store)
     store.sync()
     known, _ = with_runs(task, 15)
-    devices: Mapping[str, str] = {a.name: a.device for a in directory(task).actions.values() if a.device}
+    devices: Mapping[str, str] = {
+        a.name: a.device for a in directory(task).actions.values() if a.device
+    }
     again = learner(task, seed=4)
     reasons = []
     for step in replay(read_journal(path), Engine(known, devices)):
@@ -122,11 +142,14 @@ def test_replay_derives_the_same_state(task: Task, tmp_path: Path) -> None:
     assert again.records == live.records
     assert again.learning.state() == live.learning.state()
     assert again.learning.gained.tallies == live.learning.gained.tallies
-    assert sum("nikolic_fu_fast: " in reason for reason in reasons) == sum(isinstance(r, Choice) for r in live.records)
+    assert sum("nikolic_fu_fast: " in reason for reason in reasons) == sum(
+        isinstance(r, Choice) for r in live.records
+    )
 
 
 def test_records_of_a_worker_applied_in_order_are_the_same(task: Task) -> None:
-    """A campaign's worker does not learn by itself; its records, applied later, make the same estimates."""
+    """A campaign's worker does not learn by itself; its records, applied later, make the same
+    estimates."""
     worker, master = learner(task, "round_robin", seed=1, live=False), Learning(task, "round_robin")
     run(task, worker, runs=10)
     assert not worker.learning.gained.tallies
@@ -150,7 +173,9 @@ def test_contexts_follow_parameters_variables_and_conditions(task: Task) -> None
     assert Contexts().of({"regime": "B"}) == ""
 
 
-@pytest.mark.parametrize(("part", "said"), [("speed", "no parameter or variable 'speed'"), ("regime ==", "column")])
+@pytest.mark.parametrize(
+    ("part", "said"), [("speed", "no parameter or variable 'speed'"), ("regime ==", "column")]
+)
 def test_a_context_that_cannot_be_told_is_refused(task: Task, part: str, said: str) -> None:
     """At the beginning, with the names that there are."""
     with pytest.raises(ContextError, match=said):
@@ -158,10 +183,14 @@ def test_a_context_that_cannot_be_told_is_refused(task: Task, part: str, said: s
 
 
 def test_the_users_and_the_operators_choice_come_first(task: Task) -> None:
-    """Both are counted as what they are, and say so. The operator's is answered by the executor, which journals it."""
+    """Both are counted as what they are, and say so. The operator's is answered by the executor,
+    which journals it."""
     selector = learner(task, seed=1, chosen={"pick": "pick_slow"})
     run(task, selector, runs=4, first=[Override("place", "place_hard")])
-    assert {r.action for r in selector.records if isinstance(r, Choice)} == {"pick_slow", "place_hard"}
+    assert {r.action for r in selector.records if isinstance(r, Choice)} == {
+        "pick_slow",
+        "place_hard",
+    }
     assert selector.choose("pick", "pick#9", ("pick_fast", "pick_slow"))[1] == "chosen by the user"
     assert selector.learning.selectors["pick"].learner("regime=A").runs[0, 1] == 4
 
@@ -171,12 +200,27 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
     selector = learner(task, seed=1)
     selector.settled(0.0, State((0,), {"regime": "A"}))
     selector.instruction(0.0, StartRun("pick#1", "pick", "pick", "pick_slow", {}, 5.0))
-    ended = RunRecorded("pick#1", "pick", "pick", "pick_slow", Status.SUCCESS, "", "", Executed.YES, 0.4, deferred=True)
+    ended = RunRecorded(
+        "pick#1",
+        "pick",
+        "pick",
+        "pick_slow",
+        Status.SUCCESS,
+        "",
+        "",
+        Executed.YES,
+        0.4,
+        deferred=True,
+    )
     selector.instruction(0.4, ended)
     key = Key("pick", "pick_slow", "regime=A")
     assert selector.learning.estimates.tally(key).reliability == 1.0
     verdict = Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked")
-    for correction in (verdict, verdict, Corrected("pick#2", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE)):
+    for correction in (
+        verdict,
+        verdict,
+        Corrected("pick#2", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE),
+    ):
         selector.instruction(1.0, correction)
     tally = selector.learning.estimates.tally(key)
     assert (tally.reliability, tally.corrected, tally.runs) == (0.0, 1, 1)
@@ -187,10 +231,14 @@ def test_a_deferred_verdict_knows_how_many_trials_came_since(task: Task) -> None
     """Those of its own primitive task and context; a run that was cancelled is none."""
     selector = learner(task, "tracking", seed=1)
 
-    def ended(run: str, action: str, status: Status | None, place: str = "pick", regime: str = "A") -> None:
+    def ended(
+        run: str, action: str, status: Status | None, place: str = "pick", regime: str = "A"
+    ) -> None:
         selector.settled(0.0, State((0,), {"regime": regime}))
         selector.instruction(0.0, StartRun(run, place, place, action, {}, 5.0))
-        record = RunRecorded(run, place, place, action, status, "", "", Executed.YES, 0.4, deferred=run == "pick#1")
+        record = RunRecorded(
+            run, place, place, action, status, "", "", Executed.YES, 0.4, deferred=run == "pick#1"
+        )
         selector.instruction(0.4, record)
 
     ended("pick#1", "pick_slow", Status.SUCCESS)
@@ -199,16 +247,21 @@ def test_a_deferred_verdict_knows_how_many_trials_came_since(task: Task) -> None
     ended("pick#4", "pick_fast", None)
     ended("pick#5", "pick_fast", Status.SUCCESS, regime="B")
     ended("place#1", "place_soft", Status.SUCCESS, "place")
-    selector.instruction(1.0, Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked"))
+    selector.instruction(
+        1.0, Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked")
+    )
     record = selector.records[-1]
     assert isinstance(record, Correction)
     assert record.age == 2
     assert of_plain(json.loads(json.dumps(to_plain(record)))) == record
-    assert of_plain({k: v for k, v in to_plain(record).items() if k != "age"}) == replace(record, age=0)
+    assert of_plain({k: v for k, v in to_plain(record).items() if k != "age"}) == replace(
+        record, age=0
+    )
 
 
 def test_alternatives_are_judged_in_a_context_or_over_scenarios(task: Task) -> None:
-    """In one context everything known counts; over scenarios the declared target (0.9) rules out what never reaches it."""
+    """In one context everything known counts; over scenarios the declared target (0.9) rules out
+    what never reaches it."""
     selector = learner(task, "round_robin", seed=1)
     for regime in ("A", "B"):
         run(task, selector, runs=120, parameters={"regime": regime})
@@ -233,11 +286,17 @@ def test_firings_are_counted(task: Task) -> None:
 
 
 @pytest.mark.parametrize("declared", [None, {"pick_slow": 0.25}])
-def test_measured_cpu_time_never_steers_in_lock_step(task: Task, declared: dict[str, float] | None) -> None:
-    """Where CPU time is the cost, lock step takes what services.toml declares; real time takes what was measured."""
+def test_measured_cpu_time_never_steers_in_lock_step(
+    task: Task, declared: dict[str, float] | None
+) -> None:
+    """Where CPU time is the cost, lock step takes what services.toml declares; real time takes what
+    was measured."""
     costly = replace(
         task,
-        primitive_tasks={**task.primitive_tasks, "pick": replace(task.primitive_tasks["pick"], cost="cpu")},
+        primitive_tasks={
+            **task.primitive_tasks,
+            "pick": replace(task.primitive_tasks["pick"], cost="cpu"),
+        },
     )
     selector = LearningSelector(Learning(costly, "round_robin"), seed=1, declared=declared)
     run(costly, selector, runs=9)
@@ -251,7 +310,8 @@ def test_measured_cpu_time_never_steers_in_lock_step(task: Task, declared: dict[
 
 
 def test_people_are_shown_what_was_learned(task: Task) -> None:
-    """Probability of each alternative, and R, C and J of those that ran; asking for it teaches nothing."""
+    """Probability of each alternative, and R, C and J of those that ran; asking for it teaches
+    nothing."""
     selector = learner(task, seed=1)
     assert selector.figures("pick")["pick_slow"] == {"probability": 0.0}
     assert not selector.learning.state()["pick"]["learners"]
@@ -265,11 +325,14 @@ def test_people_are_shown_what_was_learned(task: Task) -> None:
 
 
 async def test_the_operators_page_follows_the_learning(task: Task) -> None:
-    """The snapshot has every alternative's probability at the beginning, and R, C and J once it ran."""
+    """The snapshot has every alternative's probability at the beginning, and R, C and J once it
+    ran."""
     selector = learner(task, seed=1)
     setting = Setting(task, {}, 12, 1, selector)
     cell, party = lockstep_cell(directory(task), setting, scripts())
-    operation = Operation(cast(RealtimeMission, SimpleNamespace(mission=party.mission, now=lambda: 0.0)), selector)
+    operation = Operation(
+        cast(RealtimeMission, SimpleNamespace(mission=party.mission, now=lambda: 0.0)), selector
+    )
     before = operation.snapshot()["selectors"]["pick"]["alternatives"]
     assert [a["action"] for a in before] == ["pick_fast", "pick_slow", "pick_blind"]
     assert all("probability" in a and "reliability" not in a for a in before)

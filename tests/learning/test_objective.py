@@ -1,4 +1,5 @@
-"""J, rho, scenarios above the target, break-even, the Pareto front, and the target-reliability question both ways."""
+"""J, rho, scenarios above the target, break-even, the Pareto front, and the target-reliability
+question both ways."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.learning.estimate import Observation, Tally
-from coordinator.learning.objective import (
+from petrobot.coordinator.learning.estimate import Observation, Tally
+from petrobot.coordinator.learning.objective import (
     Comparison,
     Question,
     admitted,
@@ -20,7 +21,7 @@ from coordinator.learning.objective import (
     pareto,
     reliability_for,
 )
-from coordinator.task import Executed, Status
+from petrobot.coordinator.task import Executed, Status
 
 
 def runs(good: int, bad: int, seconds: float = 1.0, missing: int = 0) -> Tally:
@@ -80,14 +81,17 @@ HARD = {"calm": runs(99, 1, 1.0), "windy": runs(90, 10, 2.0), "storm": runs(50, 
 def test_cost_is_that_of_the_hardest_scenario_above_the_target(
     target: float | None, scenario: str, cost: float
 ) -> None:
-    """The paper's definition: the lowest reliability among those with values lower-bounded by the target."""
+    """The paper's definition: the lowest reliability among those with values lower-bounded by the
+    target."""
     figures = compare({"act": HARD}, Question(target=target)).of("act")
     assert (figures.scenario, figures.cost) == (scenario, cost)
 
 
 def test_no_scenario_above_the_target_makes_inadmissible() -> None:
     """An empty set: J is infinite, and another action is best whatever its J."""
-    found = compare({"weak": {"": runs(50, 50, 0.1)}, "strong": {"": runs(99, 1, 9.0)}}, Question(target=0.9))
+    found = compare(
+        {"weak": {"": runs(50, 50, 0.1)}, "strong": {"": runs(99, 1, 9.0)}}, Question(target=0.9)
+    )
     assert not found.of("weak").admissible
     assert found.of("weak").j == inf
     assert found.best == "strong"
@@ -104,21 +108,33 @@ def test_membership_has_hysteresis() -> None:
 
 def test_the_largest_cost_over_the_set_is_offered_too() -> None:
     """The hardest scenario need not be the dearest."""
-    figures = compare({"act": {"hard": runs(90, 10, 1.0), "easy": runs(99, 1, 3.0)}}, Question()).of("act")
+    figures = compare(
+        {"act": {"hard": runs(90, 10, 1.0), "easy": runs(99, 1, 3.0)}}, Question()
+    ).of("act")
     assert (figures.scenario, figures.cost, figures.largest_cost) == ("hard", 1.0, 3.0)
     assert figures.scenarios == ("easy", "hard")
 
 
 @given(
-    st.integers(1, 30), st.integers(0, 30), st.integers(1, 30), st.integers(0, 30), st.floats(0.1, 9), st.floats(0.1, 9)
+    st.integers(1, 30),
+    st.integers(0, 30),
+    st.integers(1, 30),
+    st.integers(0, 30),
+    st.floats(0.1, 9),
+    st.floats(0.1, 9),
 )
-def test_break_even_is_where_j_is_equal(g1: int, b1: int, g2: int, b2: int, c1: float, c2: float) -> None:
+def test_break_even_is_where_j_is_equal(
+    g1: int, b1: int, g2: int, b2: int, c1: float, c2: float
+) -> None:
     """At the break-even rho both J agree; below it the more reliable action is better."""
     found = judged(one=runs(g1, b1, c1), other=runs(g2, b2, c2))
     one, other = found.figures
     rho = break_even(one, other)
     if rho is None:
-        assert one.cost == other.cost or (one.reliability - other.reliability) * (one.cost - other.cost) <= 0
+        assert (
+            one.cost == other.cost
+            or (one.reliability - other.reliability) * (one.cost - other.cost) <= 0
+        )
         return
     at = [objective(f.reliability, f.cost, rho) for f in (one, other)]
     assert at[0] == pytest.approx(at[1], abs=1e-6)
@@ -126,7 +142,11 @@ def test_break_even_is_where_j_is_equal(g1: int, b1: int, g2: int, b2: int, c1: 
     assert (below[0] < below[1]) == (one.reliability > other.reliability)
 
 
-@given(st.lists(st.tuples(st.integers(0, 10), st.integers(1, 10), st.floats(0.1, 9)), min_size=1, max_size=6))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 10), st.integers(1, 10), st.floats(0.1, 9)), min_size=1, max_size=6
+    )
+)
 def test_the_pareto_front_is_not_dominated_and_complete(rows: list[tuple[int, int, float]]) -> None:
     """Nobody beats a member in both; everybody else is matched or beaten by a member."""
     found = compare({f"a{i}": {"": runs(g, b, c)} for i, (g, b, c) in enumerate(rows)}, Question())
@@ -143,10 +163,20 @@ def test_the_target_question_both_ways() -> None:
     """What a reliability costs, and what a cost buys."""
     found = judged(one=runs(70, 30, 1.0), four=runs(90, 10, 4.0), nine=runs(97, 3, 9.0))
     reach = {r: cost_to_reach(found.figures, r) for r in (0.5, 0.8, 0.95, 0.99)}
-    assert [None if f is None else f.action for f in reach.values()] == ["one", "four", "nine", None]
+    assert [None if f is None else f.action for f in reach.values()] == [
+        "one",
+        "four",
+        "nine",
+        None,
+    ]
     assert cost_to_reach(found.figures, 0.85, surely=True) == found.of("nine")
     bought = {c: reliability_for(found.figures, c) for c in (0.5, 1.0, 5.0, 50.0)}
-    assert [None if f is None else f.action for f in bought.values()] == [None, "one", "four", "nine"]
+    assert [None if f is None else f.action for f in bought.values()] == [
+        None,
+        "one",
+        "four",
+        "nine",
+    ]
 
 
 def test_more_images_averaged_cost_more_and_are_more_reliable() -> None:
@@ -156,7 +186,9 @@ def test_more_images_averaged_cost_more_and_are_more_reliable() -> None:
         tally = Tally()
         for i in range(100):
             status = Status.SUCCESS if i < good else Status.FAILURE
-            tally = tally.adding(Observation(status, 0.02 * images, values={"images": float(images)}))
+            tally = tally.adding(
+                Observation(status, 0.02 * images, values={"images": float(images)})
+            )
         tallies[f"average_{images}"] = {"": tally}
     found = compare(tallies, Question("value:images"))
     assert [f.cost for f in found.figures] == [1.0, 4.0, 16.0]
@@ -171,8 +203,12 @@ def shares(good: float, runs_: int, seconds: float = 1.0) -> Tally:
     return runs(round(good * runs_), runs_ - round(good * runs_), seconds)
 
 
-@pytest.mark.parametrize(("easy", "hard"), [((50, 500), (500, 50)), ((500, 50), (50, 500)), ((200, 200), (200, 200))])
-def test_unequal_shares_of_easy_and_hard_do_not_reverse_the_order(easy: tuple[int, int], hard: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("easy", "hard"), [((50, 500), (500, 50)), ((500, 50), (50, 500)), ((200, 200), (200, 200))]
+)
+def test_unequal_shares_of_easy_and_hard_do_not_reverse_the_order(
+    easy: tuple[int, int], hard: tuple[int, int]
+) -> None:
     """Simpson: better in each scenario is better in all, whoever was run where how often."""
     found = compare(
         {
@@ -189,7 +225,8 @@ def test_unequal_shares_of_easy_and_hard_do_not_reverse_the_order(easy: tuple[in
 
 
 def test_actions_are_compared_where_all_of_them_were_run() -> None:
-    """One that was never run in the storm is not better for it; the runs there are known nevertheless."""
+    """One that was never run in the storm is not better for it; the runs there are known
+    nevertheless."""
     new = {"calm": shares(0.9, 50)}
     found = compare({"act": HARD, "new": new, "unknown": {}}, Question())
     assert found.scenarios == ("calm",)
@@ -207,7 +244,9 @@ def test_while_nobody_meets_the_target_nobody_is_ruled_out() -> None:
     found = compare(actions, Question(target=0.9))
     assert found.unmet
     assert found.best == "weak"
-    assert [f.j for f in found.figures] == pytest.approx([f.j for f in compare(actions, Question()).figures])
+    assert [f.j for f in found.figures] == pytest.approx(
+        [f.j for f in compare(actions, Question()).figures]
+    )
     assert not any(f.admissible or f.scenarios for f in found.figures)
     assert not compare({"new": {}}, Question(target=0.9)).unmet
 
@@ -221,7 +260,8 @@ def test_a_cost_that_nobody_reported_is_named() -> None:
 
 
 def test_a_node_that_is_away_is_away_in_all_scenarios() -> None:
-    """A is over all of them, though the starts that never began were in one without a single run."""
+    """A is over all of them, though the starts that never began were in one without a single
+    run."""
     found = compare({"act": {"calm": runs(9, 1), "storm": runs(0, 0, missing=10)}}, Question())
     assert found.of("act").availability == 0.5
     assert found.scenarios == ("calm",)

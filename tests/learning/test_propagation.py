@@ -1,4 +1,5 @@
-"""From actions to the task: competing risks against closed forms, series products, preemption as a cause, and the sorting task."""
+"""From actions to the task: competing risks against closed forms, series products, preemption as a
+cause, and the sorting task."""
 
 from __future__ import annotations
 
@@ -10,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.analysis.completion import completion
-from coordinator.analysis.forecast import forecast
-from coordinator.analysis.gspn import Chain
-from coordinator.analysis.stochastic import Measured, stochastic_view
-from coordinator.experience.learner import LearningSelector
-from coordinator.experience.propagation import measured_from, propagate
-from coordinator.launch import with_runs
-from coordinator.learning.competing import incidences
-from coordinator.learning.estimate import Key, Observation, Tally
-from coordinator.learning.learning import Estimates, Learning
-from coordinator.task import Estimate, Executed, Status, Task
-from coordinator.taskfile import loads
+from petrobot.coordinator.analysis.completion import completion
+from petrobot.coordinator.analysis.forecast import forecast
+from petrobot.coordinator.analysis.gspn import Chain
+from petrobot.coordinator.analysis.stochastic import Measured, stochastic_view
+from petrobot.coordinator.experience.learner import LearningSelector
+from petrobot.coordinator.experience.propagation import measured_from, propagate
+from petrobot.coordinator.launch import with_runs
+from petrobot.coordinator.learning.competing import incidences
+from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.learning import Estimates, Learning
+from petrobot.coordinator.task import Estimate, Executed, Status, Task
+from petrobot.coordinator.taskfile import loads
 from tests.learning.cell import run, sorting
 
 SERIES = """
@@ -73,7 +74,9 @@ def tally(good: int, bad: int, error: int, seconds: float) -> Tally:
     out = Tally()
     for status, n in ((Status.SUCCESS, good), (Status.FAILURE, bad), (Status.ERROR, error)):
         for _ in range(n):
-            out = out.adding(Observation(status, seconds, "" if status is Status.SUCCESS else "why"))
+            out = out.adding(
+                Observation(status, seconds, "" if status is Status.SUCCESS else "why")
+            )
     return out
 
 
@@ -83,8 +86,11 @@ COUNTS = st.tuples(st.integers(1, 20), st.integers(0, 5), st.integers(0, 5), st.
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.tuples(COUNTS, COUNTS, st.floats(0, 1)), min_size=1, max_size=3))
-def test_a_series_comes_to_the_conjunctive_product(rows: list[tuple[Counts, Counts, float]]) -> None:
-    """R = R_1 R_2 ... with each R_i mixed as its alternatives are chosen; costs add as far as runs come."""
+def test_a_series_comes_to_the_conjunctive_product(
+    rows: list[tuple[Counts, Counts, float]],
+) -> None:
+    """R = R_1 R_2 ... with each R_i mixed as its alternatives are chosen; costs add as far as runs
+    come."""
     task, estimates = series(len(rows)), Estimates()
     choice, expected_r, reach, expected_c = {}, 1.0, 1.0, 0.0
     for name, (one, other, share) in zip("abc", rows, strict=False):
@@ -103,7 +109,8 @@ def test_a_series_comes_to_the_conjunctive_product(rows: list[tuple[Counts, Coun
 
 
 def test_loops_and_recoveries_are_not_products() -> None:
-    """An action that is repeated until it succeeds: R_conj is the first try's, but the task always completes."""
+    """An action that is repeated until it succeeds: R_conj is the first try's, but the task always
+    completes."""
     text = (
         SERIES
         + """
@@ -142,7 +149,7 @@ def test_what_never_executed_takes_the_error_branch() -> None:
     assert propagate(task, Estimates({Key("a", "do_a"): known})).conjunctive == pytest.approx(0.9)
 
 
-# --- competing risks ---------------------------------------------------------------------------------------------------
+# --- competing risks --------------------------------------------------------------------------
 
 
 def test_incidences_without_cut_offs_are_relative_frequencies() -> None:
@@ -166,14 +173,16 @@ def test_incidences_of_a_textbook_example() -> None:
 
 @pytest.mark.parametrize("cut", [0.0, 0.5, 2.0])
 def test_incidences_see_through_cut_offs(cut: float) -> None:
-    """Two exponential causes (rates 2 and 1) with exponential cut-offs: shares 2/3 and 1/3, mean 1/3, all unbiased; counting
-    the ends alone would get the mean wrong."""
+    """Two exponential causes (rates 2 and 1) with exponential cut-offs: shares 2/3 and 1/3, mean
+    1/3, all unbiased; counting the ends alone would get the mean wrong."""
     rng = np.random.default_rng(5)
     n = 20_000
     a, b = rng.exponential(1 / 2, n), rng.exponential(1.0, n)
     c = rng.exponential(1 / cut, n) if cut else np.full(n, np.inf)
     times = np.minimum(np.minimum(a, b), c)
-    causes = [None if t == z else ("a" if t == x else "b") for t, x, z in zip(times, a, c, strict=True)]
+    causes = [
+        None if t == z else ("a" if t == x else "b") for t, x, z in zip(times, a, c, strict=True)
+    ]
     found = incidences(times.tolist(), causes)
     assert found["a"].share == pytest.approx(2 / 3, abs=0.02)
     assert found["a"].mean == pytest.approx(1 / 3, abs=0.03)
@@ -183,11 +192,12 @@ def test_incidences_see_through_cut_offs(cut: float) -> None:
         assert naive < 0.3
 
 
-# --- preemption ----------------------------------------------------------------------------------------------------------
+# --- preemption -------------------------------------------------------------------------------
 
 
 def caught_or_missed(n: int, caught: int) -> Tally:
-    """Of n runs, `caught` are preempted near 0.5 s and count as success, the others end as failures at 1.2 s."""
+    """Of n runs, `caught` are preempted near 0.5 s and count as success, the others end as failures
+    at 1.2 s."""
     rng = np.random.default_rng(1)
     out = Tally()
     for i in range(n):
@@ -200,8 +210,8 @@ def caught_or_missed(n: int, caught: int) -> Tally:
 
 
 def test_a_preempting_event_is_a_cause_not_a_race() -> None:
-    """The event comes at half a second in 93 of 100 runs or never. As a cause its share is met exactly; an independent
-    exponential with the same mean wait makes it 87 %."""
+    """The event comes at half a second in 93 of 100 runs or never. As a cause its share is met
+    exactly; an independent exponential with the same mean wait makes it 87 %."""
     task, _ = with_runs(sorting(), 1)
     estimates = Estimates(
         {
@@ -215,35 +225,52 @@ def test_a_preempting_event_is_a_cause_not_a_race() -> None:
     assert found.firings["jammed"] == pytest.approx(0.93, abs=1e-9)
     mean = 0.02 + 0.4 + 0.93 * measured.preempted["place", "place_soft"]["jammed"].mean + 0.07 * 1.2
     assert found.mission_time == pytest.approx(mean, rel=1e-6)
-    race = replace(measured, preempted={}, waits={"jam": measured.preempted["place", "place_soft"]["jammed"].mean})
+    race = replace(
+        measured,
+        preempted={},
+        waits={"jam": measured.preempted["place", "place_soft"]["jammed"].mean},
+    )
     assert forecast(stochastic_view(task, race)).firings["jammed"] < 0.88
 
 
 def test_causes_leave_nothing_behind() -> None:
-    """Every marking at the end is clean: a law of preemption whose transition was not the one that took the run is flushed."""
+    """Every marking at the end is clean: a law of preemption whose transition was not the one that
+    took the run is flushed."""
     task, _ = with_runs(sorting(), 2)
-    runs = {("pick", "pick_slow"): {Status.SUCCESS: Estimate(1.0, 0.4)}, ("place", "place_soft"): {}}
+    runs = {
+        ("pick", "pick_slow"): {Status.SUCCESS: Estimate(1.0, 0.4)},
+        ("place", "place_soft"): {},
+    }
     choice = {"pick": {"pick_slow": 1.0}, "place": {"place_soft": 1.0}}
-    measured = Measured(runs, choice, {}, {}, {("place", "place_soft"): {"jammed": Estimate(1.0, 0.5, 0.7)}})
+    measured = Measured(
+        runs, choice, {}, {}, {("place", "place_soft"): {"jammed": Estimate(1.0, 0.5, 0.7)}}
+    )
     view = stochastic_view(task, measured)
     found = forecast(view)
     assert found.completion_probability == pytest.approx(1.0)
     assert found.firings["jammed"] == pytest.approx(2.0)
     places, own = view.gspn.net.places, len(task.net.places)
     dirty = found.chain.space.where(
-        lambda m: any(n and not p.endswith(".server") for p, n in zip(places[own:], m[own:], strict=True))
+        lambda m: any(
+            n and not p.endswith(".server") for p, n in zip(places[own:], m[own:], strict=True)
+        )
     )
     assert found.done.goal.any()
     assert not np.any(dirty & found.done.goal)
 
 
 def test_an_abort_is_a_mere_cut_off() -> None:
-    """Runs that the operator broke off are censored: their shares go by competing risks over the sample."""
+    """Runs that the operator broke off are censored: their shares go by competing risks over the
+    sample."""
     rng, out = np.random.default_rng(2), Tally()
     for _ in range(400):
         end, cut = rng.exponential(1.0), rng.exponential(2.0)
         status = Status.SUCCESS if rng.random() < 0.7 else Status.ERROR
-        seen = Observation(None, cut, preempted_by="") if cut < end else Observation(status, end, "why")
+        seen = (
+            Observation(None, cut, preempted_by="")
+            if cut < end
+            else Observation(status, end, "why")
+        )
         out = out.adding(seen, "x")
     law = measured_from(series(1), Estimates({Key("a", "do_a"): out})).runs["a", "do_a"]
     assert law[Status.SUCCESS].share == pytest.approx(0.7, abs=0.06)
@@ -251,11 +278,12 @@ def test_an_abort_is_a_mere_cut_off() -> None:
     assert sum(e.share for e in law.values()) == pytest.approx(1.0)
 
 
-# --- the whole loop ------------------------------------------------------------------------------------------------------
+# --- the whole loop ---------------------------------------------------------------------------
 
 
 def test_the_forecast_of_a_learned_task_meets_its_runs() -> None:
-    """Runs of the sorting task, estimates, the stochastic view, and what the runs themselves had: firings and time agree."""
+    """Runs of the sorting task, estimates, the stochastic view, and what the runs themselves had:
+    firings and time agree."""
     task, n = sorting(), 150
     selector = LearningSelector(Learning(task, "round_robin"), seed=1)
     mission = run(task, selector, runs=n, seed=1)
@@ -264,7 +292,9 @@ def test_the_forecast_of_a_learned_task_meets_its_runs() -> None:
     fired = {k.transition: f.fired / n for k, f in selector.learning.estimates.flows.items()}
     for transition, share in fired.items():
         assert found.forecast.firings[transition] == pytest.approx(share, abs=0.02), transition
-    assert found.forecast.mission_time == pytest.approx((mission.ended - mission.begun) / n, rel=0.03)
+    assert found.forecast.mission_time == pytest.approx(
+        (mission.ended - mission.begun) / n, rel=0.03
+    )
     assert found.goal == pytest.approx(fired["placed"], abs=0.02)
 
 
@@ -273,7 +303,11 @@ def test_uniformly_censored_exponential_has_the_classic_rate() -> None:
     rng, out = np.random.default_rng(3), Tally()
     for _ in range(3000):
         t = rng.exponential(2.0)
-        seen = Observation(Status.SUCCESS, t) if t < 1 else Observation(None, 1.0, preempted_by="jammed")
+        seen = (
+            Observation(Status.SUCCESS, t)
+            if t < 1
+            else Observation(None, 1.0, preempted_by="jammed")
+        )
         out = out.adding(seen)
     assert out.exposure / out.runs == pytest.approx(2.0, rel=0.06)
     assert out.runs / (out.runs + out.censored) == pytest.approx(1 - exp(-0.5), abs=0.03)

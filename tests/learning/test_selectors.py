@@ -1,4 +1,5 @@
-"""Selectors: the same rules alone and side by side, contexts, targets, dead nodes, and what people may do to them."""
+"""Selectors: the same rules alone and side by side, contexts, targets, dead nodes, and what people
+may do to them."""
 
 from __future__ import annotations
 
@@ -10,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.cli.learning import SELECTORS
-from coordinator.learning.batch import SUMS, Batch, Trial, drawn, restricted
-from coordinator.learning.estimate import Observation, Tally
-from coordinator.learning.objective import Question
-from coordinator.learning.selectors import RULES, RuleSelector, make
-from coordinator.learning.target import eligible
-from coordinator.task import Executed, Status
+from petrobot.coordinator.cli.learning import SELECTORS
+from petrobot.coordinator.learning.batch import SUMS, Batch, Trial, drawn, restricted
+from petrobot.coordinator.learning.estimate import Observation, Tally
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.selectors import RULES, RuleSelector, make
+from petrobot.coordinator.learning.target import eligible
+from petrobot.coordinator.task import Executed, Status
 from tests.waiting import Limit
 
 ACTIONS = ("a", "b", "c", "d")
@@ -67,12 +68,18 @@ def test_the_command_line_names_every_selector() -> None:
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**31), st.integers(2, 5), st.booleans())
-def test_rows_of_a_batch_are_the_shipped_selector(name: str, seed: int, n: int, costly: bool) -> None:
-    """What the convergence study simulates is, trial by trial and bit by bit, what a mission run uses."""
+def test_rows_of_a_batch_are_the_shipped_selector(
+    name: str, seed: int, n: int, costly: bool
+) -> None:
+    """What the convergence study simulates is, trial by trial and bit by bit, what a mission run
+    uses."""
     rng = np.random.default_rng(seed)
     rows, trials, actions = 3, 60, ACTIONS[:n] if n < 5 else (*ACTIONS, "e")
     u, v = rng.random((trials, rows, n)), rng.random((trials, rows))
-    r, seconds = rng.random(n), rng.random((trials, rows)) + 0.1 if costly else np.zeros((trials, rows))
+    r, seconds = (
+        rng.random(n),
+        rng.random((trials, rows)) + 0.1 if costly else np.zeros((trials, rows)),
+    )
     rule, offered = RULES[name](), np.ones((rows, n), dtype=bool)
     batch = rule.begin(rows, n)
     alone = [RuleSelector(RULES[name](), actions, Question("wall")) for _ in range(rows)]
@@ -87,7 +94,11 @@ def test_rows_of_a_batch_are_the_shipped_selector(name: str, seed: int, n: int, 
             assert action == actions[chosen[i]]
             assert why.startswith(name)
             selector.chosen("", action)
-            selector.update("", action, Observation(Status.SUCCESS if good[i] else Status.ERROR, float(seconds[t, i])))
+            selector.update(
+                "",
+                action,
+                Observation(Status.SUCCESS if good[i] else Status.ERROR, float(seconds[t, i])),
+            )
     for i, selector in enumerate(alone):
         mine = selector.learner("")
         for field in ("p", *SUMS):
@@ -96,8 +107,15 @@ def test_rows_of_a_batch_are_the_shipped_selector(name: str, seed: int, n: int, 
 
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=10, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from(ACTIONS), st.sampled_from("SFEMC"), st.floats(0.01, 9)), max_size=40))
-def test_probabilities_are_probabilities_whatever_happens(name: str, ends: list[tuple[str, str, float]]) -> None:
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(ACTIONS), st.sampled_from("SFEMC"), st.floats(0.01, 9)),
+        max_size=40,
+    )
+)
+def test_probabilities_are_probabilities_whatever_happens(
+    name: str, ends: list[tuple[str, str, float]]
+) -> None:
     """p and the choice probabilities stay in [0, 1] and sum to 1; censored runs teach nothing."""
     selector = make(name, ACTIONS)
     for action, end, seconds in ends:
@@ -148,7 +166,8 @@ def test_state_survives_plain_data(name: str) -> None:
 
 @pytest.mark.parametrize("name", [n for n in NAMES if n not in ("fixed", "round_robin")])
 def test_contexts_are_learned_apart(name: str) -> None:
-    """What was learned in one context says nothing about another; frozen, each chooses its own best."""
+    """What was learned in one context says nothing about another; frozen, each chooses its own
+    best."""
     selector = taught(make(name, ACTIONS), "regime=A", 60)
     for _ in range(240):
         for action in ACTIONS:
@@ -183,11 +202,14 @@ def test_a_choice_says_why_with_numbers() -> None:
     selector = taught(make("nikolic_fu", ACTIONS), "regime=B", 5)
     action, why = selector.choose("regime=B", ACTIONS, Uniform([np.array([0.0, 0, 0, 0])]))
     assert action == "a"
-    assert why == ("nikolic_fu: drawn with 0.060; J 2.000, R 0.000 of 5 runs, C 1; lowest J 1.000 b (regime=B)")
+    assert why == (
+        "nikolic_fu: drawn with 0.060; J 2.000, R 0.000 of 5 runs, C 1; lowest J 1.000 b (regime=B)"
+    )
 
 
 def test_an_action_of_a_dead_node_is_left() -> None:
-    """It never executes, so its R stays 1, yet its J grows with each start that comes to nothing."""
+    """It never executes, so its R stays 1, yet its J grows with each start that comes to
+    nothing."""
     selector = make("nikolic_fu_fast", ("dead", "alive"))
     rng = np.random.default_rng(3)
     for _ in range(5):
@@ -221,7 +243,8 @@ def test_a_deferred_verdict_changes_the_sums() -> None:
 
 
 def test_a_late_verdict_changes_no_more_than_is_left_of_its_run() -> None:
-    """After 300 trials of b the sums hold 0.37 of the only run of a: corrected it is all of them, and R is 1, not 2.7."""
+    """After 300 trials of b the sums hold 0.37 of the only run of a: corrected it is all of them,
+    and R is 1, not 2.7."""
     selector = make("tracking", ("a", "b"))
     selector.update("", "a", failure())
     for _ in range(300):
@@ -251,13 +274,16 @@ def test_a_verdict_fades_with_its_run(age: int) -> None:
     corrected = learned(failure())
     corrected.correct("", "a", Status.FAILURE, Status.SUCCESS, age)
     for name in ("runs", "successes"):
-        assert getattr(corrected.learner(""), name) == pytest.approx(getattr(learned(success()).learner(""), name))
+        assert getattr(corrected.learner(""), name) == pytest.approx(
+            getattr(learned(success()).learner(""), name)
+        )
     own, expected = corrected.learner("").own, learned(success()).learner("").own
     assert own["seen_success"] == pytest.approx(expected["seen_success"])
 
 
 def test_a_verdict_on_a_run_before_a_restart_changes_nothing() -> None:
-    """The run that raised the alarm was forgotten with the others; the first one after it is corrected."""
+    """The run that raised the alarm was forgotten with the others; the first one after it is
+    corrected."""
     selector = make("tracking", ("a", "b"))
     trials, limit = 0, Limit("the alarm", steps=1000)
     while not selector.learner("").own["restarts"][0, 0] and limit.left():
@@ -274,7 +300,10 @@ def test_a_verdict_on_a_run_before_a_restart_changes_nothing() -> None:
 
 
 STEPS = st.lists(
-    st.tuples(st.sampled_from("usmcr"), st.sampled_from(ACTIONS), st.integers(0, 60), st.integers(1, 60)), max_size=25
+    st.tuples(
+        st.sampled_from("usmcr"), st.sampled_from(ACTIONS), st.integers(0, 60), st.integers(1, 60)
+    ),
+    max_size=25,
 )
 
 
@@ -283,7 +312,8 @@ STEPS = st.lists(
 def test_shares_stay_shares_whatever_is_corrected(
     name: str, steps: list[tuple[str, str, int, int]], target: float | None
 ) -> None:
-    """Trials, runs that never began, verdicts of any age, restarts by what is kept: R, A and J stay what they are."""
+    """Trials, runs that never began, verdicts of any age, restarts by what is kept: R, A and J stay
+    what they are."""
     selector = make(name, ACTIONS, Question("wall", target))
     for what, action, age, times in steps:
         for _ in range(times):
@@ -315,7 +345,8 @@ def test_a_state_with_more_successes_than_runs_is_mended() -> None:
 
 
 def test_only_actions_that_meet_the_target_are_sought() -> None:
-    """Cheap but unreliable wins without a target, and is left with one; while nobody meets it, J alone decides."""
+    """Cheap but unreliable wins without a target, and is left with one; while nobody meets it, J
+    alone decides."""
     trials = [("cheap", [success(0.1)] * 6 + [failure(0.1)] * 4), ("sure", [success(5.0)] * 10)]
 
     def learned(target: float | None) -> str:
@@ -331,17 +362,20 @@ def test_only_actions_that_meet_the_target_are_sought() -> None:
 
 
 @pytest.mark.parametrize(
-    ("met", "before", "now"), [(100, False, True), (95, False, False), (95, True, True), (89, True, False)]
+    ("met", "before", "now"),
+    [(100, False, True), (95, False, False), (95, True, True), (89, True, False)],
 )
 def test_an_action_comes_in_surely_and_goes_out_late(met: int, before: bool, now: bool) -> None:
-    """Target 0.9 and 100 runs: in when Wilson's lower bound reaches it (0.96 for 100, 0.89 for 95), out when R itself is below."""
+    """Target 0.9 and 100 runs: in when Wilson's lower bound reaches it (0.96 for 100, 0.89 for 95),
+    out when R itself is below."""
     batch = Batch.fresh(1, 1, None)
     batch.runs[:], batch.successes[:] = 100.0, met
     assert eligible(batch, 0.9, np.array([[before]])).tolist() == [[now]]
 
 
 def test_sums_are_taken_over_from_estimates() -> None:
-    """Another machine's runs decide the order from then on; a rule that fades its sums keeps its own."""
+    """Another machine's runs decide the order from then on; a rule that fades its sums keeps its
+    own."""
     tally = Tally()
     for _ in range(50):
         tally = tally.adding(Observation(Status.SUCCESS, 1.0))
@@ -354,7 +388,8 @@ def test_sums_are_taken_over_from_estimates() -> None:
 
 
 def test_new_and_vanished_alternatives() -> None:
-    """Sums go with their actions, a newcomer is unknown with an equal share, and the gain starts again."""
+    """Sums go with their actions, a newcomer is unknown with an equal share, and the gain starts
+    again."""
     old = taught(make("nikolic_fu", ACTIONS), good=25)
     new = make("nikolic_fu", ("d", "b", "new"))
     new.restore(old.state())

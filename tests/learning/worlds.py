@@ -1,4 +1,5 @@
-"""Bernoulli worlds with known J, and rules played in many of them side by side: the convergence study of docs/learning.md."""
+"""Bernoulli worlds with known J, and rules played in many of them side by side: the convergence
+study of docs/learning.md."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coordinator.learning.batch import Array, Batch, Index, Trial
-from coordinator.learning.rule import Rule
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Trial
+from petrobot.coordinator.learning.rule import Rule
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class Played:
     p_best: Array
     """p of the optimum at each checkpoint, shape (checkpoints, rows)."""
     recent: Array
-    """Share of the hundred choices before each checkpoint that were optimal, shape (checkpoints, rows)."""
+    """Share of the hundred choices before each checkpoint that were optimal, shape (checkpoints,
+    rows)."""
     checkpoints: Sequence[int]
 
 

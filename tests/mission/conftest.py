@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from coordinator.cli.loading import load_task
-from coordinator.task import Task
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.task import Task
 
 
 @pytest.fixture

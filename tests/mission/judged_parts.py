@@ -1,4 +1,5 @@
-"""The judged cell: picks that are provisional, and whoever judges them; in lock step and with processes alike."""
+"""The judged cell: picks that are provisional, and whoever judges them; in lock step and with
+processes alike."""
 
 from __future__ import annotations
 
@@ -7,14 +8,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from coordinator.engine import Corrected, Instruction, Report, State, Stimulus
-from coordinator.experience.learner import LearningSelector
-from coordinator.learning.learning import Learning
-from coordinator.mission.mission import Mission
-from coordinator.task import Status, Task
-from coordinator.taskfile import load
-from services.comm.directory import Directory, parse
-from services.comm.notice import Progress
+from petrobot.coordinator.engine import Corrected, Instruction, Report, State, Stimulus
+from petrobot.coordinator.experience.learner import LearningSelector
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.taskfile import load
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.notice import Progress
 
 FOLDER = Path(__file__).parent / "judged"
 sys.path.append(str(FOLDER))
@@ -74,11 +75,20 @@ def learner(task: Task) -> LearningSelector:
 
 
 def learned(selector: LearningSelector) -> dict[str, tuple[dict[Any, int], int, int]]:
-    """By action: how its runs counted, how many of them were corrected, and the selector's successes."""
-    tallies = {key.action: tally for key, tally in selector.learning.estimates.tallies.items() if tally.runs}
+    """By action: how its runs counted, how many of them were corrected, and the selector's
+    successes."""
+    tallies = {
+        key.action: tally
+        for key, tally in selector.learning.estimates.tallies.items()
+        if tally.runs
+    }
     rule = selector.learning.selectors["pick"]
     successes = dict(zip(rule.actions, rule.learner("").successes[0].tolist(), strict=True))
-    return {a: (dict(t.counts), t.corrected, int(successes[a])) for a, t in tallies.items() if a in successes}
+    return {
+        a: (dict(t.counts), t.corrected, int(successes[a]))
+        for a, t in tallies.items()
+        if a in successes
+    }
 
 
 LEARNED = {

@@ -1,4 +1,5 @@
-"""A cell of scripted actions for tests of the coordinator: one node, no devices, every action of a task on it."""
+"""A cell of scripted actions for tests of the coordinator: one node, no devices, every action of a
+task on it."""
 
 from __future__ import annotations
 
@@ -6,9 +7,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.task import Task
-from services.comm.directory import Directory, parse
-from services.scripted import Line, Scripted
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.scripted import Line, Scripted
 
 HEAD = """
 schema = 1
@@ -29,7 +30,8 @@ def directory_for(task: Task, extra: str = "", every: bool = False) -> Directory
 
 
 def services_text(task: Task, every: bool = False) -> str:
-    """A services.toml that places the first alternative of each primitive task on one node; every one if asked for."""
+    """A services.toml that places the first alternative of each primitive task on one node; every
+    one if asked for."""
     return HEAD + "".join(
         f'[actions.{alternative}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
         for p in task.primitive_tasks.values()
@@ -38,6 +40,11 @@ def services_text(task: Task, every: bool = False) -> str:
 
 
 def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:
-    """A scripted action for every alternative of each primitive task; half a second of success if none is given."""
+    """A scripted action for every alternative of each primitive task; half a second of success if
+    none is given."""
     usual = [Line(seconds=(0.5, 0.5))]
-    return {a: Scripted(lines.get(p.name, usual)) for p in task.primitive_tasks.values() for a in p.alternatives}
+    return {
+        a: Scripted(lines.get(p.name, usual))
+        for p in task.primitive_tasks.values()
+        for a in p.alternatives
+    }

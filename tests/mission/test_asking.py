@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.mission.asking import ask_all
-from services.comm.callee import Callee
-from services.comm.directory import parse
-from services.comm.server import Server
-from services.node import GENERAL, Node
-from services.place import InlinePlace
+from petrobot.coordinator.mission.asking import ask_all
+from petrobot.services.comm.callee import Callee
+from petrobot.services.comm.directory import parse
+from petrobot.services.comm.server import Server
+from petrobot.services.node import GENERAL, Node
+from petrobot.services.place import InlinePlace
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
 
@@ -34,7 +34,9 @@ async def test_one_that_does_not_answer_hides_no_other(tmp_path: Path, mute_is_u
     place = InlinePlace(directory.actions, clock=clock)
     node = Node(directory, "well", boot="well 1", clock=clock, places={GENERAL: place})
     well = NodeInLoop(node, directory.address("well"))
-    mute = Server(Callee("mute", "mute 1", {}))  # welcomes, and leaves every order to an owner that it does not have
+    mute = Server(
+        Callee("mute", "mute 1", {})
+    )  # welcomes, and leaves every order to an owner that it does not have
     await well.start()
     if mute_is_up:
         await mute.start(*directory.address("mute"))
@@ -43,5 +45,7 @@ async def test_one_that_does_not_answer_hides_no_other(tmp_path: Path, mute_is_u
     if mute_is_up:
         await mute.close()
     assert not answers["mute"]["up"]
-    assert ("did not say how it is within 1 s" if mute_is_up else "connection refused") in answers["mute"]["why"]
+    assert ("did not say how it is within 1 s" if mute_is_up else "connection refused") in answers[
+        "mute"
+    ]["why"]
     assert answers["well"]["up"] and answers["well"]["status"]

@@ -1,4 +1,5 @@
-"""Runs in the hands of nodes: what is stopped, fenced, fetched, forgotten and recorded, over one life of the coordinator or two."""
+"""Runs in the hands of nodes: what is stopped, fenced, fetched, forgotten and recorded, over one
+life of the coordinator or two."""
 
 from __future__ import annotations
 
@@ -8,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from coordinator.engine import Begin, Hold, Pause, Phase, Resume, RunEnded, StartRun
-from coordinator.mission.dispatch import ESCALATION, Dispatch
-from coordinator.mission.fences import STOP_MARGIN
-from coordinator.record.journal import JournalError, JournalWriter
-from coordinator.record.recording import JournalStore
-from coordinator.task import Executed, Status
-from services.comm import messages as m
-from services.comm.caller import Caller
+from petrobot.coordinator.engine import Begin, Hold, Pause, Phase, Resume, RunEnded, StartRun
+from petrobot.coordinator.mission.dispatch import ESCALATION, Dispatch
+from petrobot.coordinator.mission.fences import STOP_MARGIN
+from petrobot.coordinator.record.journal import JournalError, JournalWriter
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
 from tests.mission.toy_arm import TIDY, WORK, Bench, directory
 
 STOPPED = "preempted by rung"
@@ -28,7 +29,7 @@ def done(call: str, status: str = "success", cause: str = "") -> m.Outcome:
     return m.Outcome(call, status, cause=cause)
 
 
-# --- cancel ------------------------------------------------------------------------------------------------------------
+# --- cancel -----------------------------------------------------------------------------------
 
 
 def test_nothing_starts_on_the_device_before_the_cancelled_run_is_known_to_have_stopped() -> None:
@@ -39,7 +40,9 @@ def test_nothing_starts_on_the_device_before_the_cancelled_run_is_known_to_have_
     assert bench.calls() == []
     bench.say(2.1, done(WORK, "error", "cancelled"))
     assert bench.calls() == [TIDY]
-    assert [(r.run, r.status, r.cancelled) for r in bench.records] == [("work#1", Status.SUCCESS, True)]
+    assert [(r.run, r.status, r.cancelled) for r in bench.records] == [
+        ("work#1", Status.SUCCESS, True)
+    ]
 
 
 def test_completion_crosses_with_the_cancel() -> None:
@@ -48,7 +51,10 @@ def test_completion_crosses_with_the_cancel() -> None:
     bench.ring(1.0)
     bench.say(1.1, done(WORK, "failure", "dropped"))
     (record,) = bench.records
-    assert (record.status, record.cancelled) == (Status.SUCCESS, True) and "failure, dropped" in record.text
+    assert (record.status, record.cancelled) == (
+        Status.SUCCESS,
+        True,
+    ) and "failure, dropped" in record.text
     assert bench.fired == ["go", "rung"] and bench.calls() == [TIDY]
     bench.say(1.2, done(WORK, "failure", "dropped"))
     assert bench.fired == ["go", "rung"] and len(bench.records) == 1 and bench.calls() == []
@@ -58,10 +64,16 @@ def test_a_preemption_that_comes_just_after_the_end_cancels_nothing() -> None:
     bench = Bench().begin()
     bench.say(1.0, done(WORK))
     bench.ring(1.0)
-    assert bench.fired == ["go", "worked"] and bench.sent(m.Cancel) == [] and bench.reports == ["early_event"]
+    assert (
+        bench.fired == ["go", "worked"]
+        and bench.sent(m.Cancel) == []
+        and bench.reports == ["early_event"]
+    )
 
 
-def test_a_performer_that_never_answers_is_stuck_and_what_needs_its_device_errs_unexecuted() -> None:
+def test_a_performer_that_never_answers_is_stuck_and_what_needs_its_device_errs_unexecuted() -> (
+    None
+):
     """StopFailed once its own time and the escalation's are over, not before."""
     bench = Bench().begin()
     bench.ring(1.0)
@@ -89,7 +101,8 @@ def test_a_late_result_of_a_stuck_run_is_recorded_and_frees_its_device() -> None
 
 
 def test_a_node_cut_off_while_it_stops_a_run_has_the_device_until_its_own_lease_is_over() -> None:
-    """The run stays stopping until orphan time and stop time have passed; only then does the next one begin."""
+    """The run stays stopping until orphan time and stop time have passed; only then does the next
+    one begin."""
     bench = Bench().begin()
     bench.ring(1.0)
     bench.caller.link_down(1.5, "silent", final=True)
@@ -105,7 +118,7 @@ def test_a_node_cut_off_while_it_stops_a_run_has_the_device_until_its_own_lease_
     assert (bench.records[0].run, bench.records[0].executed) == ("work#1", Executed.UNKNOWN)
 
 
-# --- lost runs ---------------------------------------------------------------------------------------------------------
+# --- lost runs --------------------------------------------------------------------------------
 
 
 def test_the_device_of_a_lost_run_is_fenced_until_the_node_must_have_stopped_it() -> None:
@@ -134,7 +147,8 @@ def test_the_nodes_late_word_lifts_the_fence_and_moves_nothing_else() -> None:
 
 
 def test_a_node_that_keeps_silent_about_a_run_although_it_is_there_fences_it_for_good() -> None:
-    """No result 5 s after the deadline: the device may move still. What waits for it errs at its own deadline, unexecuted."""
+    """No result 5 s after the deadline: the device may move still. What waits for it errs at its
+    own deadline, unexecuted."""
     bench = Bench().begin()
     bench.go(10.0)
     assert bench.records[0].cause == "no_answer"
@@ -156,7 +170,7 @@ def test_another_boot_of_the_node_ends_a_fence_when_its_devices_must_stand_still
     assert bench.calls() == [TIDY]
 
 
-# --- over two lives ----------------------------------------------------------------------------------------------------
+# --- over two lives ---------------------------------------------------------------------------
 
 
 def test_a_run_that_goes_on_is_rejoined_under_its_id_at_the_boot_it_was_sent_to() -> None:
@@ -178,7 +192,9 @@ def test_a_run_sent_to_another_boot_is_asked_for_by_that_boot_and_never_run_agai
     assert bench.calls() == [], "the former process's arm may still be at its stop routine"
     bench.go(2.1 + STOP_MARGIN)
     (tidy,) = bench.sent(m.Call)
-    assert isinstance(tidy, m.Call) and (tidy.id, tidy.boot) == (TIDY, "n2"), "later runs go to whoever is there"
+    assert isinstance(tidy, m.Call) and (tidy.id, tidy.boot) == (TIDY, "n2"), (
+        "later runs go to whoever is there"
+    )
 
 
 def test_a_run_that_reached_a_later_boot_than_the_one_recorded_is_found_there() -> None:
@@ -189,7 +205,9 @@ def test_a_run_that_reached_a_later_boot_than_the_one_recorded_is_found_there() 
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
-def test_on_resume_error_gives_up_a_run_that_goes_on_and_takes_the_result_of_one_that_has_ended(goes_on: bool) -> None:
+def test_on_resume_error_gives_up_a_run_that_goes_on_and_takes_the_result_of_one_that_has_ended(
+    goes_on: bool,
+) -> None:
     bench = Bench().begin().resumed(2.0, on_resume="error", runs=[WORK])
     assert bench.calls() == [WORK]
     if not goes_on:
@@ -215,7 +233,8 @@ def test_on_resume_ask_rejoins_and_pauses_for_the_operator() -> None:
 
 
 def test_what_the_node_keeps_of_a_run_is_settled() -> None:
-    """Recorded as ended by the node's word: it may forget it. Unknown to the journal: it is stopped."""
+    """Recorded as ended by the node's word: it may forget it. Unknown to the journal: it is
+    stopped."""
     first = Bench().begin()
     first.say(1.0, m.Accept(WORK), done(WORK))
     bench = Bench(epoch=2)
@@ -241,7 +260,8 @@ def test_a_run_given_up_in_an_earlier_life_is_stopped_its_fence_outlives_the_coo
 
 
 def test_a_latched_event_that_came_while_nobody_coordinated_is_delivered_once() -> None:
-    """Its source keeps it until it is acknowledged; one that an earlier life took already is not taken again."""
+    """Its source keeps it until it is acknowledged; one that an earlier life took already is not
+    taken again."""
     first = Bench().begin()
     bench = first.resumed(2.0, runs=[WORK])
     bench.ring(2.1, number=1)
@@ -264,7 +284,7 @@ def test_a_cancelled_run_is_cancelled_again_and_waited_for() -> None:
     assert bench.calls() == [TIDY]
 
 
-# --- operator ----------------------------------------------------------------------------------------------------------
+# --- operator ---------------------------------------------------------------------------------
 
 
 def test_a_held_run_is_not_given_up_however_long_the_pause() -> None:
@@ -282,14 +302,17 @@ def test_a_held_run_is_not_given_up_however_long_the_pause() -> None:
     assert bench.records[0].cause == "no_answer"
 
 
-# --- cost --------------------------------------------------------------------------------------------------------------
+# --- cost -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("durable", "device", "per_start"), [(False, True, 1), (False, False, 0), (True, False, 1)])
+@pytest.mark.parametrize(
+    ("durable", "device", "per_start"), [(False, True, 1), (False, False, 0), (True, False, 1)]
+)
 def test_a_firing_costs_one_sync_if_it_starts_hardware_and_none_otherwise(
     tmp_path: Path, durable: bool, device: bool, per_start: int
 ) -> None:
-    """Result, firing and start of the next run share one sync; nothing else waits for any, unless all shall be durable."""
+    """Result, firing and start of the next run share one sync; nothing else waits for any, unless
+    all shall be durable."""
     writer = JournalWriter(tmp_path / "run.journal", {})
     store = JournalStore(writer, 0.0, durable=durable)
     bench = Bench(store=store, device='device = "arm"' if device else 'node = "motion"')
@@ -299,9 +322,13 @@ def test_a_firing_costs_one_sync_if_it_starts_hardware_and_none_otherwise(
     assert writer.syncs - before == per_start
     bench.say(0.1, m.Accept(WORK), done(WORK))
     assert writer.syncs - before == 2 * per_start
-    assert (m.ResultAck(WORK) in [*bench.sent()]) is False, "acknowledgements travel together, a little later"
+    assert (m.ResultAck(WORK) in [*bench.sent()]) is False, (
+        "acknowledgements travel together, a little later"
+    )
     bench.go(0.1 + 0.5 + 0.05)
-    assert store.safe and m.ResultAck(WORK) in bench.sent(), "within half a second the node may forget it all the same"
+    assert store.safe and m.ResultAck(WORK) in bench.sent(), (
+        "within half a second the node may forget it all the same"
+    )
     assert writer.syncs - before <= 3
 
 
@@ -313,13 +340,16 @@ def test_nothing_leaves_when_the_journal_cannot_be_written(tmp_path: Path) -> No
     full = os.open("/dev/full", os.O_WRONLY)
     os.dup2(full, writer._file)
     os.close(full)
-    with pytest.raises(JournalError, match=r"run\.journal: No space left on device; nothing was sent"):
+    with pytest.raises(
+        JournalError, match=r"run\.journal: No space left on device; nothing was sent"
+    ):
         bench.executor.stimulate(0.0, Begin())
     assert bench.calls() == []
 
 
 def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
-    """The operator's commands are synced by whoever takes them: then there is nothing to wake up for."""
+    """The operator's commands are synced by whoever takes them: then there is nothing to wake up
+    for."""
     store = JournalStore(JournalWriter(tmp_path / "run.journal", {}), 0.0)
     bench = Bench(store=store)
     bench.link(0.0)
@@ -331,17 +361,24 @@ def test_a_sync_from_outside_leaves_nothing_due(tmp_path: Path) -> None:
     assert store.safe and (due is None or due > 0.7)
 
 
-# --- arguments that no message carries -----------------------------------------------------------------------------------
+# --- arguments that no message carries --------------------------------------------------------
 
 
-@pytest.mark.parametrize("arguments", [{"x": {1: 2}}, {"x": [[]] * 60_000, "y": [[]] * 60_000}, {"x": 2**70}])
+@pytest.mark.parametrize(
+    "arguments", [{"x": {1: 2}}, {"x": [[]] * 60_000, "y": [[]] * 60_000}, {"x": 2**70}]
+)
 def test_arguments_that_no_message_carries_end_their_run_alone(arguments: dict[str, Any]) -> None:
     """Two results, each small enough, may be too much for the one call that they are fed to."""
     caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
     dispatch = Dispatch(directory(), {"motion": caller}, "m", 0)
     (end,) = dispatch.carry_out(0.0, StartRun("work#1", "work", "work", "do_work", arguments, 1.0))
     assert isinstance(end, RunEnded)
-    assert (end.run, end.status, end.cause, end.executed) == ("work#1", Status.ERROR, "bad_arguments", Executed.NO)
+    assert (end.run, end.status, end.cause, end.executed) == (
+        "work#1",
+        Status.ERROR,
+        "bad_arguments",
+        Executed.NO,
+    )
     assert "arguments." in end.text and not dispatch.flights
     assert dispatch.carry_out(0.0, StartRun("work#2", "work", "work", "do_work", {}, 1.0)) == []
     assert list(dispatch.flights) == ["work#2"]

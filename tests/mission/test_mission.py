@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from coordinator.engine import Engine
-from coordinator.launch import Setting, lockstep_cell
-from coordinator.mission.executor import Executor
-from coordinator.mission.mission import Mission
-from coordinator.mission.partners import FirstAlternative
-from coordinator.record.timeline import Timeline
-from coordinator.task import Status, Task
-from coordinator.taskfile import loads
-from services.action import Status as ActionStatus
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.directory import parse
-from services.scripted import Line
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.mission.executor import Executor
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.record.timeline import Timeline
+from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.taskfile import loads
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.directory import parse
+from petrobot.services.scripted import Line
 from tests.mission.scripted_cell import directory_for, scripts
 from tests.mission.toy_arm import SERVICES, TASK
 
@@ -81,7 +81,10 @@ def test_every_error_branch_comes_back(catch_ball: Task, primitive: str, cause: 
 
 def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:
     """Four failed recoveries in a row: given up honestly, with runs left."""
-    mission, _ = run(catch_ball, {"move_to_point": [failing("drive_fault")], "recover_arm": [failing("drive_fault")]})
+    mission, _ = run(
+        catch_ball,
+        {"move_to_point": [failing("drive_fault")], "recover_arm": [failing("drive_fault")]},
+    )
     finished = mission.executor.finished
     assert finished is not None
     assert finished.status is Status.ERROR
@@ -90,7 +93,8 @@ def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task
 
 
 def test_a_run_given_up_says_which_actions_erred_where_and_why(catch_ball: Task) -> None:
-    """What led there, the last one last; a run that reached its final marking has nothing of the kind."""
+    """What led there, the last one last; a run that reached its final marking has nothing of the
+    kind."""
     lines = {"move_to_point": [failing("bad_arguments")], "recover_arm": [failing("drive_fault")]}
     mission, _ = run(catch_ball, lines)
     told = mission.result("lockstep", 0.0)["last_errors"]
@@ -99,7 +103,9 @@ def test_a_run_given_up_says_which_actions_erred_where_and_why(catch_ball: Task)
         *[("recover_arm", "drive_fault")] * 4,
     ]
     where = mission.executor.directory.where
-    assert all(e["node"] == where(e["action"]) and e["run"].startswith(e["primitive_task"]) for e in told)
+    assert all(
+        e["node"] == where(e["action"]) and e["run"].startswith(e["primitive_task"]) for e in told
+    )
     good, _ = run(catch_ball, {"move_to_point": [failing("bad_arguments"), GOOD, GOOD, GOOD]})
     assert "last_errors" not in good.result("lockstep", 0.0)
 
@@ -137,10 +143,12 @@ def test_the_user_chooses_the_action(catch_ball: Task) -> None:
 
 
 def test_a_preparation_that_may_have_been_asked_for_before_says_so() -> None:
-    """A node that has forgotten its oldest calls does not prepare the cell a second time for a resumed coordinator."""
+    """A node that has forgotten its oldest calls does not prepare the cell a second time for a
+    resumed coordinator."""
     text = TASK.replace('name = "toy"', 'name = "toy"\nprepare = "lab_prepare"')
     places = parse(
-        SERVICES.replace("ON_RESUME", "rejoin") + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n',
+        SERVICES.replace("ON_RESUME", "rejoin")
+        + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n',
         Path("services.toml"),
     )
     asked = []
@@ -153,5 +161,7 @@ def test_a_preparation_that_may_have_been_asked_for_before_says_so() -> None:
             mission.resume(0.0, {})
         else:
             mission.start(0.0)
-        asked += [(call.id, call.again) for call in caller.messages(0.0) if isinstance(call, m.Call)]
+        asked += [
+            (call.id, call.again) for call in caller.messages(0.0) if isinstance(call, m.Call)
+        ]
     assert asked == [("m/prepare", False), ("m/prepare", True)]

@@ -1,4 +1,5 @@
-"""Kills, floods, age, cut links and reboots in any order: no action runs twice, and none that ran is said not to have run."""
+"""Kills, floods, age, cut links and reboots in any order: no action runs twice, and none that ran
+is said not to have run."""
 
 from __future__ import annotations
 
@@ -8,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.engine import Begin, RunRecorded
-from coordinator.mission.fences import STOP_MARGIN
-from coordinator.record.recording import Step
-from coordinator.task import Executed, Status
-from services.comm import messages as m
-from services.comm.callee import Callee, CancelRun, Keeping, Offer, StartRun
+from petrobot.coordinator.engine import Begin, RunRecorded
+from petrobot.coordinator.mission.fences import STOP_MARGIN
+from petrobot.coordinator.record.recording import Step
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, CancelRun, Keeping, Offer, StartRun
 from tests.mission.toy_arm import TIDY, WORK, Bench
 
 KEEPING = Keeping(results=10.0, result_count=2, id_groups=2)
@@ -22,7 +23,8 @@ TURNS = 300
 
 
 class World:
-    """A coordinator whose steps are all kept, and a node whose actions end when the test says so."""
+    """A coordinator whose steps are all kept, and a node whose actions end when the test says
+    so."""
 
     def __init__(self, keeping: Keeping = KEEPING) -> None:
         self.now = 0.0
@@ -39,11 +41,13 @@ class World:
         first.executor.stimulate(0.0, Begin())
 
     def _callee(self) -> Callee:
-        offers: dict[str, Offer] = {n: Offer(device="arm", orphan_time=1.0) for n in ("do_work", "do_tidy")}
+        offers: dict[str, Offer] = {
+            n: Offer(device="arm", orphan_time=1.0) for n in ("do_work", "do_tidy")
+        }
         offers["flood"] = Offer(inline=lambda now, call: m.Outcome(call.id, "success"))
         return Callee("motion", f"n{self.boots}", offers, keeping=self.keeping)
 
-    # --- what happens ------------------------------------------------------------------------------------------------
+    # --- what happens -------------------------------------------------------------------------
 
     def connect(self) -> None:
         """The coordinator reaches the node."""
@@ -84,7 +88,8 @@ class World:
             self.bench.executor.adopt(self.now)
 
     def flood(self, calls: int) -> None:
-        """Another client calls, under ids that have nothing in common, and acknowledges or does not."""
+        """Another client calls, under ids that have nothing in common, and acknowledges or does
+        not."""
         self.callee.link_up(self.now, "flood", m.Hello(2, 2, "client", "flood", "f1"))
         for _ in range(calls):
             self.floods += 1
@@ -145,7 +150,7 @@ class World:
                 self.active.remove(order.id)
                 self.callee.finish(self.now, order.id, "error", cause="cancelled")
 
-    # --- what must be ------------------------------------------------------------------------------------------------
+    # --- what must be -------------------------------------------------------------------------
 
     def end(self) -> list[RunRecorded]:
         """Let the mission run end, and check it; the records of its runs."""
@@ -210,8 +215,11 @@ def test_nothing_runs_twice_in_full(operations: list[tuple[object, ...]]) -> Non
 
 @pytest.mark.parametrize("accepted", [True, False], ids=["accepted", "accept lost"])
 @pytest.mark.parametrize("how", ["count", "age", "flood"])
-def test_a_run_that_the_node_has_forgotten_ends_unknown_and_its_device_is_fenced(how: str, accepted: bool) -> None:
-    """Its result is gone by number or by age, or even its id is; the coordinator's journal knows that it was ordered."""
+def test_a_run_that_the_node_has_forgotten_ends_unknown_and_its_device_is_fenced(
+    how: str, accepted: bool
+) -> None:
+    """Its result is gone by number or by age, or even its id is; the coordinator's journal knows
+    that it was ordered."""
     world = World(Keeping(results=10.0, result_count=2, id_groups=100_000 if how != "flood" else 2))
     if accepted:
         world.exchange()
@@ -252,8 +260,8 @@ def test_a_run_that_was_stopping_and_is_forgotten_has_stopped_when_its_fence_is_
 
 
 def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have_begun() -> None:
-    """Ordered, cancelled, executed for a moment; then both are killed: the new boot knows nothing of it, and still says so to
-    the process after the next kill."""
+    """Ordered, cancelled, executed for a moment; then both are killed: the new boot knows nothing
+    of it, and still says so to the process after the next kill."""
     world = World()
     world.ring()
     world.kill(True)
@@ -273,5 +281,8 @@ def test_a_call_lost_on_its_way_is_made_again_by_a_node_that_forgot_nothing() ->
     world.flood(2_000)
     world.pass_time(86_400.0)
     records = world.end()
-    assert [(r.run, r.status) for r in records] == [("work#1", Status.SUCCESS), ("tidy#1", Status.SUCCESS)]
+    assert [(r.run, r.status) for r in records] == [
+        ("work#1", Status.SUCCESS),
+        ("tidy#1", Status.SUCCESS),
+    ]
     assert world.started == {WORK: 1, TIDY: 1}

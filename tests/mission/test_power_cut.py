@@ -1,4 +1,5 @@
-"""The power goes at any moment: journal, sync, effect, acknowledgement come in this order, so nothing runs twice or is lost."""
+"""The power goes at any moment: journal, sync, effect, acknowledgement come in this order, so
+nothing runs twice or is lost."""
 
 from __future__ import annotations
 
@@ -9,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.engine import Begin, CancelRun, Engine, RunEnded, StartRun
-from coordinator.engine.stimuli import EventOccurred
-from coordinator.launch import make_mission, with_runs
-from coordinator.mission.mission import Mission
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import JournalStore, Step, replay
-from coordinator.task import Task
-from coordinator.taskfile import loads
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.messages import Event
+from petrobot.coordinator.engine import Begin, CancelRun, Engine, RunEnded, StartRun
+from petrobot.coordinator.engine.stimuli import EventOccurred
+from petrobot.coordinator.launch import make_mission, with_runs
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import JournalStore, Step, replay
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import loads
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.messages import Event
 from tests.mission import test_resume as resuming
 from tests.mission.test_resume import CrashError, Laboratory, outcome
 from tests.mission.toy_arm import TASK, TIDY, WORK, Bench, directory
@@ -69,28 +70,39 @@ def watched(caller: Caller, name: str, look: Callable[..., None]) -> None:
     setattr(caller, name, call)
 
 
-def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_the_disk(tmp_path: Path) -> None:
-    """With the usual store: each call, cancel and acknowledgement, at the moment at which it is handed to the connection."""
+def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_the_disk(
+    tmp_path: Path,
+) -> None:
+    """With the usual store: each call, cancel and acknowledgement, at the moment at which it is
+    handed to the connection."""
     seen: list[str] = []
     with power_cut(tmp_path) as disk:
         store = JournalStore(JournalWriter(tmp_path / JOURNAL, {"mission": "m"}), 0.0)
         bench = Bench(store=store)
         places = directory()
-        engine = Engine(loads(TASK, "toy"), {a.name: a.device for a in places.actions.values() if a.device})
+        engine = Engine(
+            loads(TASK, "toy"), {a.name: a.device for a in places.actions.values() if a.device}
+        )
 
         def steps() -> list[Step]:
             return left(disk, tmp_path, engine)
 
         def called(call: m.Call) -> None:
-            assert run_of(call.id) in ordered(steps(), StartRun), f"{call.id} is called, its order is not on the disk"
+            assert run_of(call.id) in ordered(steps(), StartRun), (
+                f"{call.id} is called, its order is not on the disk"
+            )
             seen.append(f"call {call.id}")
 
         def cancelled(call: str, *rest: object) -> None:
-            assert run_of(call) in ordered(steps(), CancelRun), f"{call} is cancelled, the order is not on the disk"
+            assert run_of(call) in ordered(steps(), CancelRun), (
+                f"{call} is cancelled, the order is not on the disk"
+            )
             seen.append(f"cancel {call}")
 
         def acknowledged(call: str) -> None:
-            assert run_of(call) in ended(steps()), f"{call} is acknowledged, its end is not on the disk"
+            assert run_of(call) in ended(steps()), (
+                f"{call} is acknowledged, its end is not on the disk"
+            )
             seen.append(f"acknowledge {call}")
 
         def event(event: Event) -> None:
@@ -112,12 +124,19 @@ def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_t
         bench.go(3.0)
         store.writer.close()
     assert bench.executor.finished is not None
-    expected = [f"call {WORK}", f"cancel {WORK}", "acknowledge bell", f"acknowledge {WORK}", f"call {TIDY}"]
+    expected = [
+        f"call {WORK}",
+        f"cancel {WORK}",
+        "acknowledge bell",
+        f"acknowledge {WORK}",
+        f"call {TIDY}",
+    ]
     assert sorted(seen) == sorted([*expected, f"acknowledge {TIDY}"])
 
 
 class Cellar(Laboratory):
-    """The scripted laboratory with a coordinator on a disk that loses what was not synced; its nodes have another supply."""
+    """The scripted laboratory with a coordinator on a disk that loses what was not synced; its
+    nodes have another supply."""
 
     acknowledged: set[str]
 
@@ -151,9 +170,13 @@ def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: 
     steps = list(replay(read_journal(journal), Engine(with_runs(task, resuming.RUNS)[0])))
     began = {run_of(call) for call in laboratory.executed}
     assert began <= ordered(steps, StartRun), f"{where}: executed, and the order is not on the disk"
-    assert {run_of(call) for call in laboratory.acknowledged} <= ended(steps), f"{where}: acknowledged and lost"
+    assert {run_of(call) for call in laboratory.acknowledged} <= ended(steps), (
+        f"{where}: acknowledged and lost"
+    )
     assert outcome(laboratory.resume()) == expected, where
-    assert set(laboratory.executed.values()) == {1}, f"{where}: executed twice: {laboratory.executed}"
+    assert set(laboratory.executed.values()) == {1}, (
+        f"{where}: executed twice: {laboratory.executed}"
+    )
 
 
 def places(task: Task, folder: Path) -> tuple[Any, int]:
@@ -184,7 +207,8 @@ def test_a_power_cut_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) 
 
 @pytest.mark.proof
 def test_a_power_cut_at_every_operation_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
-    """Every append, flush and sync of the journal in turn, with nothing, half and all of what was not synced."""
+    """Every append, flush and sync of the journal in turn, with nothing, half and all of what was
+    not synced."""
     expected, operations = places(catch_ball, tmp_path)
     for lives in range(1, operations):
         for torn in TORN:

@@ -1,10 +1,11 @@
-"""When a host counts as too busy: a share of late looks, or one long gap; a look that is late now and then is not told."""
+"""When a host counts as too busy: a share of late looks, or one long gap; a look that is late now
+and then is not told."""
 
 from __future__ import annotations
 
 import pytest
 
-from coordinator.mission.punctuality import LATE, PERIOD, WORST, Punctuality
+from petrobot.coordinator.mission.punctuality import LATE, PERIOD, WORST, Punctuality
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,5 @@
-"""A coordinator that dies at any record of its journal: the resumed run ends as the undisturbed one, nothing runs twice."""
+"""A coordinator that dies at any record of its journal: the resumed run ends as the undisturbed
+one, nothing runs twice."""
 
 from __future__ import annotations
 
@@ -11,16 +12,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.engine import Engine, Instruction, Override, State, Stimulus
-from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission, with_runs
-from coordinator.mission.lockstep_party import CoordinatorParty
-from coordinator.mission.mission import Mission
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import JournalStore, ReplayError, replay
-from coordinator.task import Status, Task
-from services.action import Status as ActionStatus
-from services.comm.cell import Cell
-from services.scripted import Line
+from petrobot.coordinator.engine import Engine, Instruction, Override, State, Stimulus
+from petrobot.coordinator.launch import (
+    Setting,
+    lockstep_party,
+    make_mission,
+    resumed_mission,
+    with_runs,
+)
+from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import JournalStore, ReplayError, replay
+from petrobot.coordinator.task import Status, Task
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.comm.cell import Cell
+from petrobot.services.scripted import Line
 from tests.mission.scripted_cell import directory_for, scripts
 
 LINES = {
@@ -31,7 +38,10 @@ LINES = {
         Line(seconds=(0.3, 0.3)),
         Line(seconds=(0.3, 0.3)),
     ],
-    "catch_ball": [Line(ActionStatus.FAILURE, (0.2, 0.2), cause="missed"), Line(seconds=(0.2, 0.2))],
+    "catch_ball": [
+        Line(ActionStatus.FAILURE, (0.2, 0.2), cause="missed"),
+        Line(seconds=(0.2, 0.2)),
+    ],
 }
 
 
@@ -43,7 +53,8 @@ class CrashError(Exception):
 
 
 class MortalStore(JournalStore):
-    """Dies after so many operations (appends and syncs), as kill -9 would: what was not synced is lost with the process."""
+    """Dies after so many operations (appends and syncs), as kill -9 would: what was not synced is
+    lost with the process."""
 
     def __init__(self, writer: JournalWriter, lives: int) -> None:
         super().__init__(writer, 0.0)
@@ -56,7 +67,9 @@ class MortalStore(JournalStore):
             os.close(self.writer._file)
             raise CrashError
 
-    def append(self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State) -> None:
+    def append(
+        self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
+    ) -> None:
         self._count()
         super().append(now, stimulus, instructions, state)
 
@@ -72,7 +85,8 @@ class MortalStore(JournalStore):
 
 
 class Laboratory:
-    """A scripted cell whose nodes outlive their coordinator, and count how often each run was executed."""
+    """A scripted cell whose nodes outlive their coordinator, and count how often each run was
+    executed."""
 
     def __init__(self, task: Task, folder: Path) -> None:
         self.task, self.folder = task, folder
@@ -90,8 +104,15 @@ class Laboratory:
         return counting
 
     def begin(self, lives: int, *first: Stimulus) -> tuple[Mission, MortalStore]:
-        """Run until the end or the crash; `first` is what the operator says before the beginning."""
-        header = {"mission": "m", "mode": "lockstep", "seed": 1, "runs": RUNS, "parameters": dict(self.task.parameters)}
+        """Run until the end or the crash; `first` is what the operator says before the
+        beginning."""
+        header = {
+            "mission": "m",
+            "mode": "lockstep",
+            "seed": 1,
+            "runs": RUNS,
+            "parameters": dict(self.task.parameters),
+        }
         store = MortalStore(JournalWriter(self.folder / "run.journal", header), lives)
         mission = make_mission(self.directory, Setting(self.task, runs=RUNS), "m", "boot-1", store)
         mission.executor.stimulate(0.0, *first)
@@ -104,7 +125,9 @@ class Laboratory:
         assert runs == RUNS
         assert self.cell is not None
         journal = read_journal(self.folder / "run.journal")
-        mission, go_on = resumed_mission(self.directory, task, Engine(task), journal, [], self.cell.now)
+        mission, go_on = resumed_mission(
+            self.directory, task, Engine(task), journal, [], self.cell.now
+        )
         self.go(mission, go_on)
         return mission
 
@@ -145,7 +168,9 @@ def die_and_resume(task: Task, folder: Path, lives: int, expected: Mapping[str, 
     with pytest.raises(CrashError):
         laboratory.begin(lives)
     assert outcome(laboratory.resume()) == expected, f"crash at operation {lives}"
-    assert set(laboratory.executed.values()) == {1}, f"crash at operation {lives}: {laboratory.executed}"
+    assert set(laboratory.executed.values()) == {1}, (
+        f"crash at operation {lives}: {laboratory.executed}"
+    )
 
 
 def test_dying_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
@@ -153,7 +178,9 @@ def test_dying_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> Non
     expected, operations = undisturbed(catch_ball, tmp_path)
     assert expected["status"] is Status.SUCCESS
     assert operations > 60
-    for lives in sorted(np.random.default_rng(1).choice(np.arange(1, operations), 20, replace=False)):
+    for lives in sorted(
+        np.random.default_rng(1).choice(np.arange(1, operations), 20, replace=False)
+    ):
         die_and_resume(catch_ball, tmp_path, int(lives), expected)
 
 
@@ -165,8 +192,11 @@ def test_dying_at_every_operation_changes_nothing(catch_ball: Task, tmp_path: Pa
         die_and_resume(catch_ball, tmp_path, lives, expected)
 
 
-def test_what_the_operator_has_chosen_outlives_the_coordinator(catch_ball: Task, tmp_path: Path) -> None:
-    """An override is a stimulus like any other: before and after the crash his alternative is run, and replay says so."""
+def test_what_the_operator_has_chosen_outlives_the_coordinator(
+    catch_ball: Task, tmp_path: Path
+) -> None:
+    """An override is a stimulus like any other: before and after the crash his alternative is run,
+    and replay says so."""
     chosen = {"locate_ball": "locate_hough", "track_ball": "predict_kalman"}
     laboratory = Laboratory(catch_ball, tmp_path)
     with pytest.raises(CrashError):
@@ -174,9 +204,15 @@ def test_what_the_operator_has_chosen_outlives_the_coordinator(catch_ball: Task,
     before = Counter(laboratory.executed)
     mission = laboratory.resume()
     assert mission.executor.state.overrides == chosen
-    ran = {run.partition("#")[0]: action for run, action in mission.tally.chosen.items() if f"m/{run}" not in before}
+    ran = {
+        run.partition("#")[0]: action
+        for run, action in mission.tally.chosen.items()
+        if f"m/{run}" not in before
+    }
     assert {task: ran[task] for task in chosen} == chosen, "runs that only the second process chose"
-    steps = list(replay(read_journal(tmp_path / "run.journal"), Engine(with_runs(catch_ball, RUNS)[0])))
+    steps = list(
+        replay(read_journal(tmp_path / "run.journal"), Engine(with_runs(catch_ball, RUNS)[0]))
+    )
     assert steps[-1].state == mission.executor.state
 
 

@@ -1,13 +1,23 @@
-"""A coordinator that dies under its operator's hands: in a pause, at a breakpoint, in the middle of a cancel or of an abort."""
+"""A coordinator that dies under its operator's hands: in a pause, at a breakpoint, in the middle of
+a cancel or of an abort."""
 
 from __future__ import annotations
 
 import pytest
 
-from coordinator.engine import Abort, Hold, Mode, Pause, Resume, RunHeld, SetBreakpoints, Step
-from coordinator.mission.fences import STOP_MARGIN
-from coordinator.task import Executed, Status
-from services.comm import messages as m
+from petrobot.coordinator.engine import (
+    Abort,
+    Hold,
+    Mode,
+    Pause,
+    Resume,
+    RunHeld,
+    SetBreakpoints,
+    Step,
+)
+from petrobot.coordinator.mission.fences import STOP_MARGIN
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm import messages as m
 from tests.mission.toy_arm import TIDY, WORK, Bench
 
 
@@ -19,8 +29,11 @@ def held(bench: Bench, now: float) -> m.Command:
 
 
 @pytest.mark.parametrize("answered", [True, False], ids=["held", "not answered yet"])
-def test_killed_in_a_pause_it_is_still_paused_and_the_arm_is_asked_to_hold_again(answered: bool) -> None:
-    """Whatever the node had answered: it may have been released since, or started again. Then it goes on as if nothing had been."""
+def test_killed_in_a_pause_it_is_still_paused_and_the_arm_is_asked_to_hold_again(
+    answered: bool,
+) -> None:
+    """Whatever the node had answered: it may have been released since, or started again. Then it
+    goes on as if nothing had been."""
     bench = Bench().begin()
     bench.executor.stimulate(1.0, Pause("look"))
     if answered:
@@ -54,7 +67,10 @@ def test_killed_with_breakpoints_set_it_stops_at_them() -> None:
     after.say(2.1, m.Outcome(WORK, "success"))
     assert after.fired == [] and after.executor.state.mode is Mode.PAUSED
     third = after.resumed(3.0)
-    assert third.executor.state.breakpoints == {"worked"} and third.executor.state.suspended is not None
+    assert (
+        third.executor.state.breakpoints == {"worked"}
+        and third.executor.state.suspended is not None
+    )
     third.executor.stimulate(3.1, Step())
     assert third.fired == ["worked"] and third.executor.state.mode is Mode.PAUSED
     third.executor.stimulate(3.2, Resume())
@@ -63,7 +79,8 @@ def test_killed_with_breakpoints_set_it_stops_at_them() -> None:
 
 @pytest.mark.parametrize("boot", ["n1", "n2"])
 def test_killed_in_the_middle_of_a_cancel(boot: str) -> None:
-    """The cancel is given again; nothing has the arm before the run is known to have stopped, also when its node is another."""
+    """The cancel is given again; nothing has the arm before the run is known to have stopped, also
+    when its node is another."""
     bench = Bench().begin()
     bench.ring(1.0)
     after = bench.resumed(1.5, boot=boot, runs=[WORK] if boot == "n1" else [])
@@ -74,7 +91,9 @@ def test_killed_in_the_middle_of_a_cancel(boot: str) -> None:
     else:
         after.say(1.6, m.Outcome(WORK, "error", {}, "rebooted", "", m.Executed.UNKNOWN))
         after.go(1.6 + 0.9 * STOP_MARGIN)
-        assert after.calls() == [], "the devices of the former process may still be at their stop routines"
+        assert after.calls() == [], (
+            "the devices of the former process may still be at their stop routines"
+        )
         after.go(1.6 + STOP_MARGIN)
     assert after.calls() == [TIDY]
     (record,) = after.records
@@ -83,7 +102,8 @@ def test_killed_in_the_middle_of_a_cancel(boot: str) -> None:
 
 
 def test_killed_in_an_abort_as_after_an_emergency_stop_it_ends_and_starts_nothing() -> None:
-    """The stop was journaled as an abort: the resumed run waits for what still stops, and is over."""
+    """The stop was journaled as an abort: the resumed run waits for what still stops, and is
+    over."""
     bench = Bench().begin()
     bench.executor.stimulate(1.0, Abort("emergency stop by ana"))
     after = bench.resumed(2.0, runs=[WORK])

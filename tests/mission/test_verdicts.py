@@ -1,4 +1,5 @@
-"""Deferred verdicts from the action's own words to the estimates: in lock step, with processes, over lost links and resumes."""
+"""Deferred verdicts from the action's own words to the estimates: in lock step, with processes,
+over lost links and resumes."""
 
 from __future__ import annotations
 
@@ -8,21 +9,21 @@ from typing import Any
 
 import pytest
 
-from coordinator.campaign.throws import ThrowLog
-from coordinator.engine import Engine
-from coordinator.engine.instructions import Corrected
-from coordinator.engine.stimuli import RunEnded, Verdict
-from coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission
-from coordinator.mission.lockstep_party import CoordinatorParty
-from coordinator.mission.mission import Mission, MissionError
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import replay
-from coordinator.record.timeline import Timeline
-from coordinator.task import Status
-from services.comm import messages as m
-from services.comm.callee import Callee, Offer
-from services.comm.cell import Cell
-from services.comm.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.coordinator.campaign.throws import ThrowLog
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.engine.instructions import Corrected
+from petrobot.coordinator.engine.stimuli import RunEnded, Verdict
+from petrobot.coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission
+from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
+from petrobot.coordinator.mission.mission import Mission, MissionError
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import replay
+from petrobot.coordinator.record.timeline import Timeline
+from petrobot.coordinator.task import Status
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.callee import Callee, Offer
+from petrobot.services.comm.cell import Cell
+from petrobot.services.comm.verdicts import VerdictSaid, mission_of, verdict_event
 from tests.mission.judged_parts import (
     FAIL,
     LEARNED,
@@ -47,7 +48,9 @@ class Cellar:
         self.task, self.directory = sorting(), directory()
         self.journal = folder / "run.journal"
         self.heard, self.selector = Heard(), learner(self.task)
-        self.nodes = [lockstep_party(self.directory, node) for node in self.directory.nodes.values()]
+        self.nodes = [
+            lockstep_party(self.directory, node) for node in self.directory.nodes.values()
+        ]
         self.cell: Cell | None = None
 
     def begin(self, lives: int = 0, *observers: Any) -> tuple[Mission, MortalStore]:
@@ -60,7 +63,8 @@ class Cellar:
         return mission, store
 
     def resume(self) -> Mission:
-        """A new process: its learner and observers begin anew, and are shown what the journal holds."""
+        """A new process: its learner and observers begin anew, and are shown what the journal
+        holds."""
         self.heard, self.selector = Heard(), learner(self.task)
         assert self.cell is not None
         mission, go_on = resumed_mission(
@@ -85,14 +89,23 @@ class Cellar:
 
 
 def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_path: Path) -> None:
-    """The estimates, the selector and the run's own tally hold what is true; the net went on by what was said first."""
+    """The estimates, the selector and the run's own tally hold what is true; the net went on by
+    what was said first."""
     cellar = Cellar(tmp_path)
     timeline, log = Timeline(), ThrowLog(cellar.task, lambda record, values: record.seconds)
     mission, _ = cellar.begin(0, timeline, log)
     assert told(mission) == TRULY
     assert learned(cellar.selector) == LEARNED
-    assert [c.run for c in cellar.heard.corrected] == ["pick#1", "pick#2", "pick#4", "pick#5", "pick#3"]
-    assert cellar.heard.notes["no_verdict_due"] == 2, "the second on the first pick, and the one on a run that was sure"
+    assert [c.run for c in cellar.heard.corrected] == [
+        "pick#1",
+        "pick#2",
+        "pick#4",
+        "pick#5",
+        "pick#3",
+    ]
+    assert cellar.heard.notes["no_verdict_due"] == 2, (
+        "the second on the first pick, and the one on a run that was sure"
+    )
     assert set(mission.executor.state.deferred) == {"pick#6"} and not mission.executor.state.early
     assert [(c.status, c.cause) for c in mission.tally.cycles] == list(TRULY.values())
     assert [(t.status, t.cause) for t in log.throws] == [(s.value, c) for s, c in TRULY.values()]
@@ -101,7 +114,9 @@ def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_pat
     assert timeline.bars["pick#1"].text == "held by a corner"
 
 
-def test_the_score_is_told_what_nobody_has_judged_and_its_verdicts_are_no_result(tmp_path: Path) -> None:
+def test_the_score_is_told_what_nobody_has_judged_and_its_verdicts_are_no_result(
+    tmp_path: Path,
+) -> None:
     mission, _ = Cellar(tmp_path).begin()
     result = mission.result("lockstep", 0.0)
     assert result["hidden"] == ["m/pick#3", "m/pick#6"] and "verdicts" not in result
@@ -120,7 +135,9 @@ def test_the_journal_alone_gives_the_verdicts_again(tmp_path: Path) -> None:
     mission, _ = cellar.begin()
     steps = list(replay(read_journal(cellar.journal), Engine(cellar.task)))
     assert steps[-1].state == mission.executor.state
-    assert [i for step in steps for i in step.instructions if isinstance(i, Corrected)] == cellar.heard.corrected
+    assert [
+        i for step in steps for i in step.instructions if isinstance(i, Corrected)
+    ] == cellar.heard.corrected
     again = learner(cellar.task)
     for step in steps:
         again.stimulus(step.time, step.stimulus)
@@ -131,7 +148,8 @@ def test_the_journal_alone_gives_the_verdicts_again(tmp_path: Path) -> None:
 
 
 def test_a_coordinator_that_dies_anywhere_counts_each_verdict_once(tmp_path: Path) -> None:
-    """Before a verdict is written down, between that and its acknowledgement, between the score's verdicts and the score."""
+    """Before a verdict is written down, between that and its acknowledgement, between the score's
+    verdicts and the score."""
     whole, store = Cellar(tmp_path / "whole").begin()
     assert store.operations > 90
     verdicts = places_of_verdicts(tmp_path / "whole" / "run.journal", store.operations)
@@ -147,8 +165,15 @@ def test_a_coordinator_that_dies_anywhere_counts_each_verdict_once(tmp_path: Pat
 
 
 def places_of_verdicts(journal: Path, operations: int) -> Sequence[int]:
-    """Operations of a journal spread over the whole run, and all of the last twelve (the score's)."""
-    assert sum(isinstance(s.stimulus, Verdict) for s in replay(read_journal(journal), Engine(sorting()))) == 7
+    """Operations of a journal spread over the whole run, and all of the last twelve (the
+    score's)."""
+    assert (
+        sum(
+            isinstance(s.stimulus, Verdict)
+            for s in replay(read_journal(journal), Engine(sorting()))
+        )
+        == 7
+    )
     return [*range(20, operations - 12, 9), *range(operations - 12, operations)]
 
 
@@ -170,7 +195,7 @@ def test_a_score_whose_verdicts_are_none_says_so(
         Cellar(tmp_path).begin()
 
 
-# --- between two machines: links that break, verdicts that come early, late, twice or for nobody -----------------------
+# --- between two machines: links that break, verdicts that come early, late, twice or for nobody
 
 
 class Judges(Bench):
@@ -178,7 +203,9 @@ class Judges(Bench):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.node = Callee("motion", "n1", {"do_work": Offer(device="arm"), "do_tidy": Offer(device="arm")})
+        self.node = Callee(
+            "motion", "n1", {"do_work": Offer(device="arm"), "do_tidy": Offer(device="arm")}
+        )
 
     def connect(self, now: float) -> None:
         """The link is there (again)."""
@@ -203,13 +230,18 @@ class Judges(Bench):
                 self.caller.receive(now, message)
         self.go(now)
 
-    def end(self, now: float, run: str, status: str, *, deferred: bool = False, cause: str = "") -> None:
+    def end(
+        self, now: float, run: str, status: str, *, deferred: bool = False, cause: str = ""
+    ) -> None:
         """A run has ended."""
         self.node.finish(now, run, status, cause=cause, deferred=deferred)
         self.carry(now)
 
-    def judge(self, now: float, status: str, cause: str = "", run: str = WORK, **other: Any) -> None:
-        """Somebody on the node says what a run came to. `other`: what stands in its data in place of that."""
+    def judge(
+        self, now: float, status: str, cause: str = "", run: str = WORK, **other: Any
+    ) -> None:
+        """Somebody on the node says what a run came to. `other`: what stands in its data in place
+        of that."""
         data = {**VerdictSaid(run, status, cause).to_data(), **other.get("data", {})}
         self.node.raise_event(now, verdict_event("m"), data, source="judge", latched=True)
 
@@ -279,11 +311,15 @@ def test_a_verdict_that_overtakes_the_result_counts() -> None:
     bench.carry(0.5)
     assert bench.corrected == [] and bench.executor.state.early
     bench.end(1.0, WORK, "success", deferred=True)
-    assert bench.corrected == CROOKED and bench.fired == ["go", "worked"], "the net went on by what the run said"
+    assert bench.corrected == CROOKED and bench.fired == ["go", "worked"], (
+        "the net went on by what the run said"
+    )
 
 
 @pytest.mark.parametrize("preempted", [False, True], ids=["sure", "preempted"])
-def test_a_verdict_that_came_early_on_a_run_that_never_says_it_was_provisional(preempted: bool) -> None:
+def test_a_verdict_that_came_early_on_a_run_that_never_says_it_was_provisional(
+    preempted: bool,
+) -> None:
     bench = working()
     bench.judge(0.5, "failure", "crooked")
     bench.carry(0.5)
@@ -292,11 +328,16 @@ def test_a_verdict_that_came_early_on_a_run_that_never_says_it_was_provisional(p
         bench.carry(0.6)
     bench.end(1.0, WORK, "error", cause="broken", deferred=preempted)
     assert bench.records[0].cancelled is preempted
-    assert bench.corrected == [] and bench.reports == ["no_verdict_due"] and not bench.executor.state.early
+    assert (
+        bench.corrected == []
+        and bench.reports == ["no_verdict_due"]
+        and not bench.executor.state.early
+    )
 
 
 def test_a_verdict_after_a_resume() -> None:
-    """One comes while nobody coordinates, one had been written down and not acknowledged: both count once."""
+    """One comes while nobody coordinates, one had been written down and not acknowledged: both
+    count once."""
     bench = judged()
     bench.cut(1.1)
     bench.judge(1.2, "failure", "crooked")
@@ -319,7 +360,9 @@ def test_a_verdict_that_never_comes_leaves_what_was_said() -> None:
     assert bench.corrected == [] and bench.records[0].deferred and bench.records[0].status is OK
     bench.judge(2.5, "failure", "crooked")
     bench.carry(2.5)
-    assert bench.corrected == CROOKED, "the net is at its end, the mission run is still being scored"
+    assert bench.corrected == CROOKED, (
+        "the net is at its end, the mission run is still being scored"
+    )
 
 
 @pytest.mark.parametrize(
@@ -339,11 +382,17 @@ def test_what_is_no_verdict_on_a_run_of_ours_changes_nothing(
     bench.judge(1.2, "failure", run=run, data=more)
     bench.carry(1.3)
     assert bench.corrected == [] and bench.reports == reports
-    assert bench.node.events.waiting("m") == [], "acknowledged: it would not become better by being sent again"
+    assert bench.node.events.waiting("m") == [], (
+        "acknowledged: it would not become better by being sent again"
+    )
 
 
 def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
-    for deferred, executed in ((False, m.Executed.YES), (True, m.Executed.NO), (True, m.Executed.UNKNOWN)):
+    for deferred, executed in (
+        (False, m.Executed.YES),
+        (True, m.Executed.NO),
+        (True, m.Executed.UNKNOWN),
+    ):
         bench = Bench().begin()
         status = "success" if executed is m.Executed.YES else "error"
         bench.say(1.0, m.Outcome(WORK, status, {}, "odd", executed=executed, deferred=deferred))
@@ -351,7 +400,9 @@ def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
         assert not ended.deferred and not bench.executor.state.deferred
 
 
-@pytest.mark.parametrize("run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", "m" * 255 + "/a#1", None, 7])
+@pytest.mark.parametrize(
+    "run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", "m" * 255 + "/a#1", None, 7]
+)
 def test_what_is_no_runs_id_is_refused_where_it_is_said(run: Any) -> None:
     with pytest.raises(ValueError, match="give what its own context gave as ctx"):
         mission_of(run)

@@ -1,4 +1,5 @@
-"""Deferred verdicts on the wall clock: nodes as real processes, both links cut while a run is being inspected."""
+"""Deferred verdicts on the wall clock: nodes as real processes, both links cut while a run is being
+inspected."""
 
 from __future__ import annotations
 
@@ -9,15 +10,25 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.engine import Instruction, State, Stimulus
-from coordinator.engine.stimuli import RunEnded
-from coordinator.launch import Setting, local_programs, realtime_mission
-from coordinator.mission.mission import Mission
-from coordinator.mission.realtime import RealtimeMission
-from coordinator.supervisor import Supervisor
-from services.comm.directory import Directory, load
-from services.comm.notice import Progress
-from tests.mission.judged_parts import FOLDER, LEARNED, PARTS, TRULY, Heard, learned, learner, sorting, told
+from petrobot.coordinator.engine import Instruction, State, Stimulus
+from petrobot.coordinator.engine.stimuli import RunEnded
+from petrobot.coordinator.launch import Setting, local_programs, realtime_mission
+from petrobot.coordinator.mission.mission import Mission
+from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.supervisor import Supervisor
+from petrobot.services.comm.directory import Directory, load
+from petrobot.services.comm.notice import Progress
+from tests.mission.judged_parts import (
+    FOLDER,
+    LEARNED,
+    PARTS,
+    TRULY,
+    Heard,
+    learned,
+    learner,
+    sorting,
+    told,
+)
 from tests.ports import free_ports
 
 pytestmark = pytest.mark.processes
@@ -75,13 +86,18 @@ async def led(mission: Mission, directory: Directory, cut: str) -> int:
 
 
 @pytest.mark.parametrize("cut", ["", "pick#1"], ids=["whole links", "links cut behind the result"])
-async def test_verdicts_come_from_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: str) -> None:
-    """One node picks, the other inspects and judges, the score has the last word: as in lock step, whatever the links do."""
+async def test_verdicts_come_from_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: str
+) -> None:
+    """One node picks, the other inspects and judges, the score has the last word: as in lock step,
+    whatever the links do."""
     path = [str(FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])]
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
     directory, task, heard = services(tmp_path), sorting(), Heard()
     selector = learner(task)
-    mission = realtime_mission(directory, Setting(task, runs=PARTS, seed=1, selector=selector), "sort-1")
+    mission = realtime_mission(
+        directory, Setting(task, runs=PARTS, seed=1, selector=selector), "sort-1"
+    )
     mission.executor.observers.append(heard)
     async with Supervisor(local_programs(directory), tmp_path / "logs"):
         cuts = await led(mission, directory, cut)

@@ -1,20 +1,30 @@
-"""A toy task on one device for tests of the coordinator: `work`, which a bell may preempt, then `tidy` with the same arm."""
+"""A toy task on one device for tests of the coordinator: `work`, which a bell may preempt, then
+`tidy` with the same arm."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from coordinator.engine import Begin, Engine, Fired, Instruction, Report, RunRecorded, State, Stimulus
-from coordinator.mission.executor import Executor
-from coordinator.mission.partners import Forgetful, Store
-from coordinator.record.recording import Step
-from coordinator.taskfile import loads
-from services.comm import messages as m
-from services.comm.caller import Caller
-from services.comm.directory import Directory, parse
-from services.comm.messages import Event, Message
-from services.comm.notice import Progress
+from petrobot.coordinator.engine import (
+    Begin,
+    Engine,
+    Fired,
+    Instruction,
+    Report,
+    RunRecorded,
+    State,
+    Stimulus,
+)
+from petrobot.coordinator.mission.executor import Executor
+from petrobot.coordinator.mission.partners import Forgetful, Store
+from petrobot.coordinator.record.recording import Step
+from petrobot.coordinator.taskfile import loads
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.messages import Event, Message
+from petrobot.services.comm.notice import Progress
 
 TASK = """
 schema = 1
@@ -91,20 +101,31 @@ WORK, TIDY = "m/work#1", "m/tidy#1"
 
 def directory(on_resume: str = "rejoin", device: str = 'device = "arm"') -> Directory:
     """services.toml of the toy; `device` replaces the line that binds both actions to the arm."""
-    return parse(SERVICES.replace("ON_RESUME", on_resume).replace('device = "arm"', device), Path("services.toml"))
+    return parse(
+        SERVICES.replace("ON_RESUME", on_resume).replace('device = "arm"', device),
+        Path("services.toml"),
+    )
 
 
 class Bench:
-    """An executor over one caller; the test is the node: it reads what was sent and says what comes back."""
+    """An executor over one caller; the test is the node: it reads what was sent and says what comes
+    back."""
 
     def __init__(
-        self, *, on_resume: str = "rejoin", epoch: int = 1, store: Store | None = None, device: str = 'device = "arm"'
+        self,
+        *,
+        on_resume: str = "rejoin",
+        epoch: int = 1,
+        store: Store | None = None,
+        device: str = 'device = "arm"',
     ) -> None:
         self.caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", f"c{epoch}", epoch))
         places = directory(on_resume, device)
         task = loads(TASK, "toy")
         engine = Engine(task, {a.name: a.device for a in places.actions.values() if a.device})
-        self.executor = Executor(task, engine, places, {"motion": self.caller}, "m", store=store or Forgetful())
+        self.executor = Executor(
+            task, engine, places, {"motion": self.caller}, "m", store=store or Forgetful()
+        )
         self.executor.observers.append(self)
         self.fired: list[str] = []
         self.records: list[RunRecorded] = []
@@ -115,7 +136,7 @@ class Bench:
         self.now = 0.0
         self._out: list[Message] = []
 
-    # --- an observer: keeps what happened ----------------------------------------------------------------------------
+    # --- an observer: keeps what happened -----------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         self._stimulus = stimulus, []
@@ -137,9 +158,11 @@ class Bench:
         assert self._stimulus is not None
         stimulus, instructions = self._stimulus
         boots = {"motion": self.boot}
-        self.steps.append(Step(len(self.steps) + 1, now, stimulus, tuple(instructions), state, boots))
+        self.steps.append(
+            Step(len(self.steps) + 1, now, stimulus, tuple(instructions), state, boots)
+        )
 
-    # --- the node ----------------------------------------------------------------------------------------------------
+    # --- the node -----------------------------------------------------------------------------
 
     def link(self, now: float, boot: str = "n1", runs: Sequence[str] = ()) -> None:
         """The node welcomes us."""
@@ -186,8 +209,11 @@ class Bench:
         """The bell preempts work."""
         self.say(now, Event("bell", "desk", number))
 
-    def resumed(self, now: float, *, on_resume: str = "rejoin", boot: str = "n1", runs: Sequence[str] = ()) -> Bench:
-        """Another process takes over what this one has recorded; `runs` is what the node still keeps."""
+    def resumed(
+        self, now: float, *, on_resume: str = "rejoin", boot: str = "n1", runs: Sequence[str] = ()
+    ) -> Bench:
+        """Another process takes over what this one has recorded; `runs` is what the node still
+        keeps."""
         bench = Bench(on_resume=on_resume, epoch=2)
         for step in self.steps:
             bench.executor.relive(step.time, step)

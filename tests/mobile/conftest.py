@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mobile.floor import FloorView
-from services.mobile.model import nominal_rover
+from petrobot.services.mobile.floor import FloorView
+from petrobot.services.mobile.model import nominal_rover
 
 Vector = NDArray[np.float64]
 TURN = {"S": 0, "L": 1, "R": -1}
@@ -26,35 +26,48 @@ class Pose:
     def moved(self, forward: float, left: float = 0.0, turn: float = 0.0) -> Pose:
         """The pose that lies there as seen from this one."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
-        return Pose(self.x + forward * cos - left * sin, self.y + forward * sin + left * cos, self.heading + turn)
+        return Pose(
+            self.x + forward * cos - left * sin,
+            self.y + forward * sin + left * cos,
+            self.heading + turn,
+        )
 
 
 class Floor:
-    """Elements ("S", "L", "R"; lower case: unpainted) from (0, 0) along x; squares of 2 m with their first edge there.
+    """Elements ("S", "L", "R"; lower case: unpainted) from (0, 0) along x; squares of 2 m with
+    their first edge there.
 
-    `inverted` swaps black and white; `bar` ends the last element, a straight one, in a T 0.25 m before its square's edge.
+    `inverted` swaps black and white; `bar` ends the last element, a straight one, in a T 0.25 m
+    before its square's edge.
     """
 
-    def __init__(self, elements: str, *, inverted: bool = False, bar: bool = False, width: float = 0.05) -> None:
+    def __init__(
+        self, elements: str, *, inverted: bool = False, bar: bool = False, width: float = 0.05
+    ) -> None:
         self.inverted, self.bar, self.width = inverted, bar, width
         self.elements = []
         pose = Pose(0.0, 0.0, 0.0)
         for letter in elements:
             turn = TURN[letter.upper()]
             self.elements.append((letter, pose))
-            pose = pose.moved(2.0) if turn == 0 else pose.moved(1.0, float(turn), turn * math.pi / 2)
+            pose = (
+                pose.moved(2.0) if turn == 0 else pose.moved(1.0, float(turn), turn * math.pi / 2)
+            )
         self.end = pose
         self.t = pose.moved(-0.25)
 
     def at(self, s: float, aside: float = 0.0, turn: float = 0.0) -> Pose:
-        """The pose `s` metres along the centre line, `aside` m to its left, turned by `turn` rad."""
+        """The pose `s` metres along the centre line, `aside` m to its left, turned by `turn`
+        rad."""
         for letter, pose in self.elements:
             bend = TURN[letter.upper()]
             length = 2.0 if bend == 0 else math.pi / 2
             if s <= length + 1e-9:
                 if bend == 0:
                     return pose.moved(s).moved(0.0, aside, turn)
-                return pose.moved(math.sin(s), bend * (1.0 - math.cos(s)), bend * s).moved(0.0, aside, turn)
+                return pose.moved(math.sin(s), bend * (1.0 - math.cos(s)), bend * s).moved(
+                    0.0, aside, turn
+                )
             s -= length
         return self.end.moved(s, aside, turn)
 
@@ -86,7 +99,8 @@ def _body(pose: Pose, x: Vector, y: Vector) -> tuple[Vector, Vector]:
 
 
 class Photographer:
-    """Takes images of a floor with the nominal camera: each pixel is the mean of 2 x 2 spots, then noise."""
+    """Takes images of a floor with the nominal camera: each pixel is the mean of 2 x 2 spots, then
+    noise."""
 
     def __init__(self, noise: float = 3.0, black: float = 40.0, white: float = 200.0) -> None:
         self.view = FloorView(nominal_rover().camera)

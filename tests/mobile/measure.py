@@ -1,7 +1,7 @@
 """Measures what docs/mobile.md quotes: detectors on rendered floors, and whole runs seed by seed.
 
-python -m tests.mobile.measure detectors
-python -m tests.mobile.measure runs arcs --speed 0.5 --first 20000 --count 100 --use recover_track=search_pattern
+python -m tests.mobile.measure detectors python -m tests.mobile.measure runs arcs --speed 0.5
+--first 20000 --count 100 --use recover_track=search_pattern
 """
 
 from __future__ import annotations
@@ -16,13 +16,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.launch import Setting, lockstep_cell
-from coordinator.mission.partners import FirstAlternative
-from coordinator.taskfile import load
-from services.comm.directory import load as load_directory
-from services.mobile.detection import Detector, TemplateBank, consensus, detect_edges, detect_ridge
-from services.mobile.floor import ScanGrid
-from services.mobile.sight import Sight
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.taskfile import load
+from petrobot.services.comm.directory import load as load_directory
+from petrobot.services.mobile.detection import (
+    Detector,
+    TemplateBank,
+    consensus,
+    detect_edges,
+    detect_ridge,
+)
+from petrobot.services.mobile.floor import ScanGrid
+from petrobot.services.mobile.sight import Sight
 from tests.mobile.conftest import Floor, Photographer, Pose
 
 ROOT = Path(__file__).parents[2]
@@ -37,7 +43,9 @@ GOOD = 0.012
 
 def main() -> None:
     """Parse and measure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(required=True)
     detectors = commands.add_parser("detectors")
     detectors.set_defaults(act=measure_detectors)
@@ -52,7 +60,7 @@ def main() -> None:
     options.act(options)
 
 
-# --- detectors -----------------------------------------------------------------------------------------------------------
+# --- detectors --------------------------------------------------------------------------------
 
 
 def measure_detectors(options: argparse.Namespace) -> None:
@@ -81,8 +89,11 @@ def _detectors() -> dict[str, Detector]:
     }
 
 
-def _judge(detector: Detector, photographer: Photographer, grid: ScanGrid) -> tuple[float, float, float]:
-    """Share of images with a right line, median distance of its points (m), and CPU time of an image (s)."""
+def _judge(
+    detector: Detector, photographer: Photographer, grid: ScanGrid
+) -> tuple[float, float, float]:
+    """Share of images with a right line, median distance of its points (m), and CPU time of an
+    image (s)."""
     right, off, cpu = 0, [], 0.0
     cases = list(_cases())
     for floor, pose, s, seed in cases:
@@ -102,7 +113,12 @@ def _cases() -> Iterator[tuple[Floor, Pose, float, int]]:
     for seed in range(240):
         floor = Floor(("SSS", "SLS", "SRS", "SLLS", "SRLS", "SSLS")[seed % 6])
         s = float(random.uniform(0.1, 2.9))
-        yield floor, floor.at(s, float(random.normal(0.0, 0.02)), float(random.normal(0.0, 0.05))), s, seed
+        yield (
+            floor,
+            floor.at(s, float(random.normal(0.0, 0.02)), float(random.normal(0.0, 0.05))),
+            s,
+            seed,
+        )
 
 
 def _off(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.float64]:
@@ -112,11 +128,13 @@ def _off(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.float64
     x = pose.x + sight.x[near] * cos - sight.y[near] * sin
     y = pose.y + sight.x[near] * sin + sight.y[near] * cos
     lx, ly = np.array([p.x for p in line]), np.array([p.y for p in line])
-    off: NDArray[np.float64] = np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(axis=1)
+    off: NDArray[np.float64] = np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(
+        axis=1
+    )
     return off
 
 
-# --- runs ----------------------------------------------------------------------------------------------------------------
+# --- runs -------------------------------------------------------------------------------------
 
 
 def measure_runs(options: argparse.Namespace) -> None:
@@ -139,8 +157,11 @@ def measure_runs(options: argparse.Namespace) -> None:
     _summary(results)
 
 
-def run(seed: int, parameters: dict[str, Any], chosen: dict[str, str]) -> tuple[dict[str, Any], list[str]]:
-    """A run's result with its CPU time `cpu` (s), and the runs in it that did not end with success."""
+def run(
+    seed: int, parameters: dict[str, Any], chosen: dict[str, str]
+) -> tuple[dict[str, Any], list[str]]:
+    """A run's result with its CPU time `cpu` (s), and the runs in it that did not end with
+    success."""
     setting = Setting(load(TASK), parameters, None, seed, FirstAlternative(chosen))
     cell, party = lockstep_cell(load_directory(SERVICES), setting)
     begun = time.process_time()
@@ -157,10 +178,17 @@ def _summary(results: Sequence[dict[str, Any]]) -> None:
     gaps, recovered = (sum(r[key] for r in results) for key in ("interruptions", "recovered"))
     rms = [r["rms_mm"] for r in results]
     simulated, cpu = (sum(r[key] for r in results) for key in ("sim_s", "cpu"))
-    print(f"finished and stopped at the T: {good} of {count} ({good / count:.1%}; 95 %: {low:.1%} to {high:.1%})")
-    print(f"interruptions recovered: {recovered} of {gaps}; penalties: {sum(len(r['penalties']) for r in results)}")
     print(
-        f"cross-track error: rms {np.mean(rms):.1f} mm (largest {max(rms):.1f}), max {max(r['max_mm'] for r in results)} mm"
+        f"finished and stopped at the T: {good} of {count} ({good / count:.1%}; 95 %: "
+        f"{low:.1%} to {high:.1%})"
+    )
+    print(
+        f"interruptions recovered: {recovered} of {gaps}; penalties: "
+        f"{sum(len(r['penalties']) for r in results)}"
+    )
+    print(
+        f"cross-track error: rms {np.mean(rms):.1f} mm (largest {max(rms):.1f}), max "
+        f"{max(r['max_mm'] for r in results)} mm"
     )
     print(f"time: mean {simulated / count:.1f} s; {simulated / cpu:.1f} x real time by CPU time")
 

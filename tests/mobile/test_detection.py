@@ -1,4 +1,5 @@
-"""Every detector recovers the line on rendered floors, whatever the colours, and tells nothing where there is none."""
+"""Every detector recovers the line on rendered floors, whatever the colours, and tells nothing
+where there is none."""
 
 from __future__ import annotations
 
@@ -11,9 +12,15 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.mobile.detection import Detector, TemplateBank, consensus, detect_edges, detect_ridge
-from services.mobile.floor import ScanGrid
-from services.mobile.sight import Sight
+from petrobot.services.mobile.detection import (
+    Detector,
+    TemplateBank,
+    consensus,
+    detect_edges,
+    detect_ridge,
+)
+from petrobot.services.mobile.floor import ScanGrid
+from petrobot.services.mobile.sight import Sight
 from tests.mobile.conftest import Floor, Photographer, Pose
 
 PHOTOGRAPHER = Photographer()
@@ -28,27 +35,37 @@ DETECTORS: dict[str, Callable[[], Detector]] = {
 EVERY = pytest.mark.parametrize("name", DETECTORS)
 
 
-def look(name: str, floor: Floor, pose: Pose, seed: int = 1, photographer: Photographer = PHOTOGRAPHER) -> Sight:
+def look(
+    name: str, floor: Floor, pose: Pose, seed: int = 1, photographer: Photographer = PHOTOGRAPHER
+) -> Sight:
     """What a detector sees of a floor from a pose."""
     image = photographer(floor, pose, np.random.default_rng(seed))
     return DETECTORS[name]()(GRID, GRID.sample(image), WIDTH, None)
 
 
 def off_line(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.float64]:
-    """Distances (m) of the nearest half metre of a sight from the centre line around s + 0.3 to s + 1.6 m."""
+    """Distances (m) of the nearest half metre of a sight from the centre line around s + 0.3 to s +
+    1.6 m."""
     line = [floor.at(s + 0.3 + 0.005 * i) for i in range(260)]
     near = sight.x <= sight.x[0] + 0.5
     cos, sin = math.cos(pose.heading), math.sin(pose.heading)
     x = pose.x + sight.x[near] * cos - sight.y[near] * sin
     y = pose.y + sight.x[near] * sin + sight.y[near] * cos
     lx, ly = np.array([p.x for p in line]), np.array([p.y for p in line])
-    off: NDArray[np.float64] = np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(axis=1)
+    off: NDArray[np.float64] = np.hypot(x[:, None] - lx[None, :], y[:, None] - ly[None, :]).min(
+        axis=1
+    )
     return off
 
 
 @EVERY
 @settings(max_examples=12)
-@given(aside=st.floats(-0.12, 0.12), turn=st.floats(-0.2, 0.2), s=st.floats(0.1, 1.0), seed=st.integers(0, 99))
+@given(
+    aside=st.floats(-0.12, 0.12),
+    turn=st.floats(-0.2, 0.2),
+    s=st.floats(0.1, 1.0),
+    seed=st.integers(0, 99),
+)
 def test_offset_and_heading_of_a_straight_line_are_recovered(
     name: str, aside: float, turn: float, s: float, seed: int
 ) -> None:
@@ -75,21 +92,29 @@ def test_curvature_of_an_arc_is_recovered(name: str, elements: str, bend: float)
 @EVERY
 @settings(max_examples=8)
 @given(s=st.floats(0.2, 2.5), aside=st.floats(-0.08, 0.08), turn=st.floats(-0.1, 0.1))
-def test_swapping_black_and_white_changes_nothing(name: str, s: float, aside: float, turn: float) -> None:
+def test_swapping_black_and_white_changes_nothing(
+    name: str, s: float, aside: float, turn: float
+) -> None:
     """Without noise the negative of a floor gives the same line."""
     quiet = Photographer(noise=0.0)
     pose = Floor("SLS").at(s, aside, turn)
-    one, other = (look(name, Floor("SLS", inverted=inverted), pose, photographer=quiet) for inverted in (False, True))
+    one, other = (
+        look(name, Floor("SLS", inverted=inverted), pose, photographer=quiet)
+        for inverted in (False, True)
+    )
     assume(name != "template" or (one.seen and other.seen))  # its lattice misses one image in sixty
     assert one.seen and other.seen
     a, b = one.describe(), other.describe()
-    assert a.offset == pytest.approx(b.offset, abs=0.006) and a.heading == pytest.approx(b.heading, abs=0.04)
+    assert a.offset == pytest.approx(b.offset, abs=0.006) and a.heading == pytest.approx(
+        b.heading, abs=0.04
+    )
 
 
 @EVERY
 @pytest.mark.parametrize("back", [0.5, 0.7, 0.9, 1.1])
 def test_the_line_goes_on_where_its_colour_is_inverted(name: str, back: float) -> None:
-    """The edge of a square lies across the view: the same line is seen before and behind it, and has not ended."""
+    """The edge of a square lies across the view: the same line is seen before and behind it, and
+    has not ended."""
     floor = Floor("SSS")
     pose = floor.at(2.0 - back, 0.02, 0.06)
     sight = look(name, floor, pose)
@@ -120,15 +145,21 @@ def test_the_line_before_decides_which_of_two_is_followed(name: str) -> None:
     image = PHOTOGRAPHER(floor, pose, np.random.default_rng(3))
     distances = PHOTOGRAPHER.view.distances()
     for row in range(20, 120):
-        left, right = PHOTOGRAPHER.view.pixels(np.full(2, distances[row]), np.array([0.245, 0.195]))[0]
+        left, right = PHOTOGRAPHER.view.pixels(
+            np.full(2, distances[row]), np.array([0.245, 0.195])
+        )[0]
         image[row, int(left) : int(right) + 1] = 40  # a second stripe, 0.22 m to the left
     detector = DETECTORS[name]()
-    expected = detector(GRID, GRID.sample(PHOTOGRAPHER(floor, pose, np.random.default_rng(4))), WIDTH, None).line()
+    expected = detector(
+        GRID, GRID.sample(PHOTOGRAPHER(floor, pose, np.random.default_rng(4))), WIDTH, None
+    ).line()
     again = detector(GRID, GRID.sample(image), WIDTH, expected)
     assert again.seen and abs(again.describe().offset) < 0.02
 
 
-@pytest.mark.parametrize(("name", "noise"), [("edges", 10.0), ("ridge", 16.0), ("consensus", 10.0), ("template", 20.0)])
+@pytest.mark.parametrize(
+    ("name", "noise"), [("edges", 10.0), ("ridge", 16.0), ("consensus", 10.0), ("template", 20.0)]
+)
 def test_noise_is_stood(name: str, noise: float) -> None:
     """Three to seven times the nominal noise: nine of ten images still show the line."""
     loud = Photographer(noise=noise)
@@ -137,7 +168,9 @@ def test_noise_is_stood(name: str, noise: float) -> None:
     for i in range(20):
         pose = floor.at(0.1 + 0.06 * i)
         sight = look(name, floor, pose, i, loud)
-        good += sight.seen and float(np.median(off_line(sight, floor, pose, 0.1 + 0.06 * i))) < 0.012
+        good += (
+            sight.seen and float(np.median(off_line(sight, floor, pose, 0.1 + 0.06 * i))) < 0.012
+        )
     assert good >= 18
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.mobile.floor import FloorView, ScanGrid
-from services.mobile.model import nominal_rover
+from petrobot.services.mobile.floor import FloorView, ScanGrid
+from petrobot.services.mobile.model import nominal_rover
 from tests.mobile.conftest import Floor, Photographer
 
 VIEW = FloorView(nominal_rover().camera)
@@ -41,7 +41,9 @@ def test_scan_rows_are_about_as_far_apart_as_asked_and_reach_as_far() -> None:
 
 
 def test_both_ways_of_sampling_agree_where_the_image_shows_the_floor() -> None:
-    image = Photographer(noise=0.0)(Floor("SLS"), Floor("SLS").at(1.0, 0.05, 0.1), np.random.default_rng(0))
+    image = Photographer(noise=0.0)(
+        Floor("SLS"), Floor("SLS").at(1.0, 0.05, 0.1), np.random.default_rng(0)
+    )
     grid = ScanGrid.of(VIEW, 1.2)
     rows = grid.sample(image)
     x, y = np.broadcast_arrays(grid.x[:, None], grid.y[None, :])

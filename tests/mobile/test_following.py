@@ -1,4 +1,5 @@
-"""Both laws bring a rover with lagging wheels onto lines and arcs and keep it there; speed goes with curve and knowledge."""
+"""Both laws bring a rover with lagging wheels onto lines and arcs and keep it there; speed goes
+with curve and knowledge."""
 
 from __future__ import annotations
 
@@ -9,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.mobile.following import LAWS, TIGHTEST, SpeedProfile
-from services.mobile.odometry import Pose
-from services.mobile.track_map import Fit
+from petrobot.services.mobile.following import LAWS, TIGHTEST, SpeedProfile
+from petrobot.services.mobile.odometry import Pose
+from petrobot.services.mobile.track_map import Fit
 from tests.mobile.conftest import Floor
 
 PERIOD, LAG = 0.02, 0.06
@@ -33,14 +34,21 @@ def looking(floor: Floor, pose: Pose, s: float) -> dict[float, Fit]:
 
 
 def drive(law: str, floor: Floor, begin: Pose, speed: float, seconds: float) -> list[float]:
-    """Distances (m) from the centre line, each cycle: wheels of first order, one cycle of delay, the speed profile's speed."""
+    """Distances (m) from the centre line, each cycle: wheels of first order, one cycle of delay,
+    the speed profile's speed."""
     profile, pose, turning, pending = SpeedProfile(), begin, 0.0, 0.0
     present, errors = 0.0, []
     samples = [(w, floor.at(float(w))) for w in np.arange(0.0, 6.5, 0.02)]
     for _ in range(round(seconds / PERIOD)):
-        s, off = min(((w, math.hypot(p.x - pose.x, p.y - pose.y)) for w, p in samples), key=lambda pair: pair[1])
+        s, off = min(
+            ((w, math.hypot(p.x - pose.x, p.y - pose.y)) for w, p in samples),
+            key=lambda pair: pair[1],
+        )
         fits = looking(floor, pose, s)
-        curvature = LAWS[law].curvature(lambda d: fits.get(round(round(d / 0.02) * 0.02, 2)), present)  # noqa: B023
+        curvature = LAWS[law].curvature(
+            lambda d, fits=fits: fits.get(round(round(d / 0.02) * 0.02, 2)),  # type: ignore[misc]
+            present,
+        )
         assert curvature is not None, "the line is known all around"
         present = profile.towards(present, profile.speed(speed, curvature, 9.0), PERIOD)
         wanted, pending = pending, present * curvature
@@ -48,7 +56,9 @@ def drive(law: str, floor: Floor, begin: Pose, speed: float, seconds: float) -> 
             turning += PERIOD / 4 / LAG * (wanted - turning)
             heading = pose.heading + turning * PERIOD / 4
             step = present * PERIOD / 4
-            pose = Pose(pose.x + step * math.cos(heading), pose.y + step * math.sin(heading), heading)
+            pose = Pose(
+                pose.x + step * math.cos(heading), pose.y + step * math.sin(heading), heading
+            )
         errors.append(off)
     return errors
 
@@ -56,7 +66,9 @@ def drive(law: str, floor: Floor, begin: Pose, speed: float, seconds: float) -> 
 @EVERY
 @settings(max_examples=4, deadline=None)
 @given(st.floats(-0.2, 0.2), st.floats(-0.3, 0.3))
-def test_a_rover_beside_a_straight_comes_onto_it_and_stays(law: str, aside: float, askew: float) -> None:
+def test_a_rover_beside_a_straight_comes_onto_it_and_stays(
+    law: str, aside: float, askew: float
+) -> None:
     errors = drive(law, Floor("SSS"), Pose(0.4, aside, askew), 0.5, 4.5)
     assert max(errors) < abs(aside) + 0.12
     assert max(errors[-25:]) < 0.012
@@ -97,12 +109,16 @@ def test_left_and_right_are_mirror_images(law: str, y: float, slope: float, bend
 
 
 @given(st.floats(0.1, 1.2), st.floats(-3.0, 3.0), st.floats(-0.5, 3.0))
-def test_the_speed_never_outruns_curve_or_knowledge(asked: float, curvature: float, ahead: float) -> None:
+def test_the_speed_never_outruns_curve_or_knowledge(
+    asked: float, curvature: float, ahead: float
+) -> None:
     profile = SpeedProfile()
     speed = profile.speed(asked, curvature, ahead)
     assert 0.0 <= speed <= asked
     assert speed**2 * abs(curvature) <= profile.sideways + 1e-9
-    assert speed**2 / (2.0 * profile.braking) <= max(0.0, ahead) + 1e-9, "it can still stand before the end"
+    assert speed**2 / (2.0 * profile.braking) <= max(0.0, ahead) + 1e-9, (
+        "it can still stand before the end"
+    )
 
 
 @given(st.floats(0.0, 1.2), st.floats(0.0, 1.2))
@@ -111,5 +127,8 @@ def test_set_speeds_change_gently_and_arrive(present: float, wanted: float) -> N
     for _ in range(200):
         speeds.append(profile.towards(speeds[-1], wanted, PERIOD))
     steps = np.diff(speeds)
-    assert steps.max() <= profile.raising * PERIOD + 1e-9 and steps.min() >= -1.6 * profile.braking * PERIOD - 1e-9
+    assert (
+        steps.max() <= profile.raising * PERIOD + 1e-9
+        and steps.min() >= -1.6 * profile.braking * PERIOD - 1e-9
+    )
     assert speeds[-1] == pytest.approx(wanted)

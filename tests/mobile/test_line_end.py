@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from services.mobile.detection import detect_edges
-from services.mobile.model import nominal_rover
-from services.mobile.sight import TrackEnd
-from services.mobile.watching import FloorWatch, LineWatcher
+from petrobot.services.mobile.detection import detect_edges
+from petrobot.services.mobile.model import nominal_rover
+from petrobot.services.mobile.sight import TrackEnd
+from petrobot.services.mobile.watching import FloorWatch, LineWatcher
 from tests.mobile.conftest import Floor, Photographer, Pose
 
 WATCH = FloorWatch.of(nominal_rover())
@@ -20,11 +20,14 @@ PHOTOGRAPHER = Photographer()
 def drive(
     floor: Floor, first: float, last: float, step: float = 0.02, seed: int = 5
 ) -> list[tuple[Pose, TrackEnd, tuple[float, float]]]:
-    """Images every `step` m along the line, with a little weaving: poses, and the end that a watcher believes in."""
+    """Images every `step` m along the line, with a little weaving: poses, and the end that a
+    watcher believes in."""
     random = np.random.default_rng(seed)
     watcher, seen = LineWatcher(WATCH, detect_edges), []
     for s in np.arange(first, last, step):
-        pose = floor.at(float(s), float(random.normal(0.0, 0.008)), float(random.normal(0.0, 0.015)))
+        pose = floor.at(
+            float(s), float(random.normal(0.0, 0.008)), float(random.normal(0.0, 0.015))
+        )
         end = watcher.look(PHOTOGRAPHER(floor, pose, random)).end
         if end is not None:
             seen.append((pose, end.kind, (end.x, end.y)))
@@ -63,7 +66,11 @@ def test_one_image_is_not_believed() -> None:
     floor = Floor("SSs")
     watcher, random = LineWatcher(WATCH, detect_edges), np.random.default_rng(0)
     sights = [watcher.look(PHOTOGRAPHER(floor, floor.at(3.2 + 0.02 * i), random)) for i in range(4)]
-    assert sights[0].broke_off and [sight.end is None for sight in sights[:3]] == [True, True, False]
+    assert sights[0].broke_off and [sight.end is None for sight in sights[:3]] == [
+        True,
+        True,
+        False,
+    ]
 
 
 def test_a_line_that_vanishes_is_looked_for_anew_after_three_images() -> None:
@@ -72,5 +79,7 @@ def test_a_line_that_vanishes_is_looked_for_anew_after_three_images() -> None:
     blank = np.full((120, 160), 90, dtype=np.uint8)
     assert watcher.look(PHOTOGRAPHER(floor, floor.at(0.2), random)).seen
     assert not any(watcher.look(blank).seen for _ in range(3))
-    assert watcher.look(PHOTOGRAPHER(floor, floor.at(0.2, 0.2), random)).seen, "20 cm aside of where it was"
+    assert watcher.look(PHOTOGRAPHER(floor, floor.at(0.2, 0.2), random)).seen, (
+        "20 cm aside of where it was"
+    )
     assert watcher.share == pytest.approx(0.4) and watcher.unseen == 0

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from coordinator.launch import Setting, lockstep_mission, lockstep_party
-from coordinator.mission.lockstep_party import CoordinatorParty
-from coordinator.mission.partners import FirstAlternative
-from coordinator.taskfile import load
-from services.comm.cell import Cell, Delays
-from services.comm.directory import load as load_directory
+from petrobot.coordinator.launch import Setting, lockstep_mission, lockstep_party
+from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
+from petrobot.coordinator.mission.partners import FirstAlternative
+from petrobot.coordinator.taskfile import load
+from petrobot.services.comm.cell import Cell, Delays
+from petrobot.services.comm.directory import load as load_directory
 
 ROOT = Path(__file__).parents[2]
 TASK = ROOT / "coordinator" / "tasks" / "follow_track.toml"
@@ -21,7 +21,9 @@ LONGEST = 150.0
 TICK = 0.004
 
 
-def run(seed: int, regime: str, *, faults: dict[str, Any] | None = None, **use: str) -> dict[str, Any]:
+def run(
+    seed: int, regime: str, *, faults: dict[str, Any] | None = None, **use: str
+) -> dict[str, Any]:
     """A run's result without its wall-clock time, with what its runs came to."""
     directory = load_directory(SERVICES)
     setting = Setting(load(TASK), {"regime": regime}, None, seed, FirstAlternative(use))
@@ -53,9 +55,16 @@ def test_a_run_ends_at_the_t(usual: dict[str, Any]) -> None:
     assert usual["status"] == "success" and usual["finished"] and usual["stopped_at_T"]
     assert usual["penalties"] == [] and usual["interruptions"] == usual["recovered"] == 2
     assert usual["rms_mm"] < 10.0 and usual["max_mm"] < 60.0
-    assert {"finished", "stopped_at_T", "time_s", "penalties", "rms_mm", "max_mm", "interruptions", "recovered"} <= {
-        *usual
-    }
+    assert {
+        "finished",
+        "stopped_at_T",
+        "time_s",
+        "penalties",
+        "rms_mm",
+        "max_mm",
+        "interruptions",
+        "recovered",
+    } <= {*usual}
 
 
 def test_each_end_of_a_stretch_was_a_choice_by_a_variable(usual: dict[str, Any]) -> None:

@@ -6,9 +6,9 @@ from importlib.resources import files
 
 import pytest
 
-from services.mobile.model import ModelError, nominal_rover, read_rover
+from petrobot.services.mobile.model import ModelError, nominal_rover, read_rover
 
-TEXT = files("services.mobile").joinpath("rover.toml").read_text(encoding="utf-8")
+TEXT = files("petrobot.services.mobile").joinpath("rover.toml").read_text(encoding="utf-8")
 
 
 def test_the_shipped_file_is_read() -> None:

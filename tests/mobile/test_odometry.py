@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.mobile.odometry import Odometry, Pose, turned
+from petrobot.services.mobile.odometry import Odometry, Pose, turned
 
 ANGLE = st.floats(-20.0, 20.0)
 PLACE = st.floats(-5.0, 5.0)
@@ -33,7 +33,9 @@ def test_turning_on_the_spot_is_no_way() -> None:
 
 
 @given(PLACE, PLACE, ANGLE, PLACE, PLACE)
-def test_body_and_floor_are_inverse(x: float, y: float, heading: float, ahead: float, left: float) -> None:
+def test_body_and_floor_are_inverse(
+    x: float, y: float, heading: float, ahead: float, left: float
+) -> None:
     pose = Pose(x, y, heading)
     assert pose.body(*pose.floor(ahead, left)) == pytest.approx((ahead, left), abs=1e-9)
 

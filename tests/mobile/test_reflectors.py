@@ -1,4 +1,5 @@
-"""Echoes become reflectors: through misses and false returns, wherever the rover is when it hears them."""
+"""Echoes become reflectors: through misses and false returns, wherever the rover is when it hears
+them."""
 
 from __future__ import annotations
 
@@ -8,9 +9,9 @@ import struct
 import numpy as np
 import pytest
 
-from services.mobile.model import nominal_rover
-from services.mobile.odometry import Pose
-from services.mobile.reflectors import ReflectorMap, parse_echoes
+from petrobot.services.mobile.model import nominal_rover
+from petrobot.services.mobile.odometry import Pose
+from petrobot.services.mobile.reflectors import ReflectorMap, parse_echoes
 
 ROVER = nominal_rover()
 
@@ -31,7 +32,9 @@ def test_a_reflector_is_placed_while_the_rover_moves_among_misses_and_false_retu
         echoes = []
         if random.random() > 0.4:
             bearing, slant = echo(pose, 2.4, 0.9)
-            echoes.append((bearing + float(random.normal(0, 0.005)), slant + float(random.normal(0, 0.02))))
+            echoes.append(
+                (bearing + float(random.normal(0, 0.005)), slant + float(random.normal(0, 0.02)))
+            )
         if random.random() < 0.15:
             echoes.append((float(random.uniform(-1, 1)), float(random.uniform(0.6, 6.0))))
         heard.take(0.04 * i, pose, echoes)

@@ -1,4 +1,5 @@
-"""The driver on the simulated bus, and the actions that use it: follow, recover, search, stop, and what can go wrong."""
+"""The driver on the simulated bus, and the actions that use it: follow, recover, search, stop, and
+what can go wrong."""
 
 from __future__ import annotations
 
@@ -8,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from services.comm.cia402 import Fault
-from services.mobile import driving
-from services.mobile.odometry import Pose as Odo
-from services.mobile.odometry import turned
-from services.mobile.paths import arc
-from services.rehearsal import Rehearsal, rehearse
+from petrobot.services.comm.cia402 import Fault
+from petrobot.services.mobile import driving
+from petrobot.services.mobile.odometry import Pose as Odo
+from petrobot.services.mobile.odometry import turned
+from petrobot.services.mobile.paths import arc
+from petrobot.services.rehearsal import Rehearsal, rehearse
 from tests.mobile.conftest import Floor, Pose
 from tests.mobile.yard import Yard
 
@@ -21,9 +22,14 @@ START = Pose(0.0, 0.0, 0.0)
 
 
 def play(
-    yard: Yard, action: Callable[..., Any], *, happening: Callable[[float], None] | None = None, **arguments: Any
+    yard: Yard,
+    action: Callable[..., Any],
+    *,
+    happening: Callable[[float], None] | None = None,
+    **arguments: Any,
 ) -> Rehearsal:
-    """Rehearse an action in the yard, whose clock goes on from one to the next; `happening` is told each tick."""
+    """Rehearse an action in the yard, whose clock goes on from one to the next; `happening` is told
+    each tick."""
     begun = yard.ports.now
 
     def world(now: float) -> None:
@@ -80,15 +86,21 @@ def test_the_drives_are_enabled_and_nothing_moves() -> None:
     assert yard.rover.stopped() and math.hypot(yard.body.x, yard.body.y) < 0.001
 
 
-@pytest.mark.parametrize(("action", "bound"), [(driving.follow_feed_forward, 0.02), (driving.follow_pursuit, 0.06)])
-def test_following_comes_to_the_end_and_stays_on_the_line(action: Callable[..., Any], bound: float) -> None:
+@pytest.mark.parametrize(
+    ("action", "bound"), [(driving.follow_feed_forward, 0.02), (driving.follow_pursuit, 0.06)]
+)
+def test_following_comes_to_the_end_and_stays_on_the_line(
+    action: Callable[..., Any], bound: float
+) -> None:
     yard = enabled(Yard(Floor("SLRs"), START))
     result = play(yard, action, speed=0.5).result
     end = Floor("SLR").end
     assert result.status == "success" and result.values["at_t"] is False
     assert max(yard.errors) < bound
     ahead, aside = yard.beyond(end)
-    assert -0.45 < ahead < -0.2 and abs(aside) < bound + 0.06, "it is taken over before the line ends, on an arc"
+    assert -0.45 < ahead < -0.2 and abs(aside) < bound + 0.06, (
+        "it is taken over before the line ends, on an arc"
+    )
 
 
 def test_the_t_is_told_from_an_interruption_and_stopped_at() -> None:
@@ -116,7 +128,11 @@ def test_homing_on_the_reflector_crosses_every_gap(kind: str) -> None:
 def test_homing_without_a_reflector_fails_and_the_rover_rests() -> None:
     yard, followed = gap_yard("s", reflector=False)
     result = play(yard, driving.home_on_reflector, line_end=followed.values["line_end"]).result
-    assert (result.status, result.cause, result.values["recovered"]) == ("failure", "no_reflector", False)
+    assert (result.status, result.cause, result.values["recovered"]) == (
+        "failure",
+        "no_reflector",
+        False,
+    )
     yard.run(0.6)
     assert yard.rover.stopped()
 
@@ -156,14 +172,19 @@ def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:
 
 
 def test_a_rover_that_stands_beyond_the_gap_goes_on_and_not_back() -> None:
-    """It stands where a first attempt has ended: nearer to where the track resumes than where a search goes to look."""
+    """It stands where a first attempt has ended: nearer to where the track resumes than where a
+    search goes to look."""
     yard, followed = gap_yard("s", reflector=False)
     line_end = Odo(*followed.values["line_end"])
     blindly_on(yard, line_end, 1.3)
     stood = yard.rover.state()["pose"]
     result = play(yard, driving.search_pattern, line_end=list(line_end)).result
     x, y, heading = yard.rover.state()["pose"]
-    assert result.status == "success" and Odo(*stood).body(x, y)[0] > 0.05 and abs(turned(heading - stood[2])) < 0.3
+    assert (
+        result.status == "success"
+        and Odo(*stood).body(x, y)[0] > 0.05
+        and abs(turned(heading - stood[2])) < 0.3
+    )
 
 
 def test_a_line_seen_in_passing_is_not_regained_by_turning_away_from_it() -> None:
@@ -171,7 +192,9 @@ def test_a_line_seen_in_passing_is_not_regained_by_turning_away_from_it() -> Non
     yard, followed = gap_yard("s", reflector=False)
     end = Odo(*followed.values["line_end"])
     blindly_on(yard, end, 1.0)
-    yard.rover.command(yard.ports.now, {"do": "stretch", "gates": [tuple(Odo(*end.floor(2.0, 0.0), end.heading))]})
+    yard.rover.command(
+        yard.ports.now, {"do": "stretch", "gates": [tuple(Odo(*end.floor(2.0, 0.0), end.heading))]}
+    )
     yard.run(0.3)
     assert yard.rover.state()["sights"] > 3 and not yard.rover.state()["regained"]
     for _ in range(20):
@@ -212,11 +235,17 @@ def test_a_drive_fault_ends_the_run_and_a_reset_mends_it() -> None:
             yard.bus.bus.trip(0, Fault.OVERCURRENT)
 
     result = play(yard, driving.follow_feed_forward, happening=trip).result
-    assert (result.status, result.cause, result.values["wheel"]) == ("error", "drive_fault", "left wheel")
+    assert (result.status, result.cause, result.values["wheel"]) == (
+        "error",
+        "drive_fault",
+        "left wheel",
+    )
     yard.run(1.0)
     assert yard.body.standing
     enabled(yard)
-    assert play(yard, driving.follow_feed_forward).result.values["at_t"] is False, "it goes on where it was"
+    assert play(yard, driving.follow_feed_forward).result.values["at_t"] is False, (
+        "it goes on where it was"
+    )
 
 
 def test_a_cut_bus_is_an_error_and_comes_back() -> None:

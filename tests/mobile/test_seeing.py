@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.camera import MemoryImages
-from services.comm.image import Image
-from services.mobile import seeing
-from services.mobile.camera import CameraError, FloorCamera
-from services.mobile.sight import TrackAhead, TrackEnd
-from services.rehearsal import Rehearsal, rehearse
+from petrobot.services.comm.camera import MemoryImages
+from petrobot.services.comm.image import Image
+from petrobot.services.mobile import seeing
+from petrobot.services.mobile.camera import CameraError, FloorCamera
+from petrobot.services.mobile.sight import TrackAhead, TrackEnd
+from petrobot.services.rehearsal import Rehearsal, rehearse
 from tests.mobile.conftest import Floor, Photographer
 
 PHOTOGRAPHER = Photographer()
@@ -37,9 +37,12 @@ class Ports:
 
 
 class Drive:
-    """A camera that is carried along a floor at `speed` m/s from `s` on; `dark` is when it stops sending images (s)."""
+    """A camera that is carried along a floor at `speed` m/s from `s` on; `dark` is when it stops
+    sending images (s)."""
 
-    def __init__(self, floor: Floor, s: float, speed: float = 0.5, dark: float = 1e9, small: bool = False) -> None:
+    def __init__(
+        self, floor: Floor, s: float, speed: float = 0.5, dark: float = 1e9, small: bool = False
+    ) -> None:
         self.ports = Ports()
         self.camera = FloorCamera({}, self.ports)  # type: ignore[arg-type]
         self._floor, self._s, self._speed, self._dark, self._small = floor, s, speed, dark, small
@@ -51,21 +54,29 @@ class Drive:
         self.ports.now = now
         if now >= self._due - 1e-9 and now < self._dark:
             self._due = now + PERIOD
-            pixels = PHOTOGRAPHER(self._floor, self._floor.at(self._s + self._speed * now, 0.005), self._random)
-            self.ports.source.put(Image(pixels[:60] if self._small else pixels, now - 0.012, self._sequence))
+            pixels = PHOTOGRAPHER(
+                self._floor, self._floor.at(self._s + self._speed * now, 0.005), self._random
+            )
+            self.ports.source.put(
+                Image(pixels[:60] if self._small else pixels, now - 0.012, self._sequence)
+            )
             self._sequence += 1
 
     def play(self, action: Callable[..., Any], **arguments: Any) -> Rehearsal:
         """Rehearse."""
         streams = {"track_ahead": PERIOD}
-        return rehearse(action, device=self.camera, world=self.world, streams=streams, limit=40.0, **arguments)
+        return rehearse(
+            action, device=self.camera, world=self.world, streams=streams, limit=40.0, **arguments
+        )
 
 
 @pytest.mark.parametrize("name", ["edges", "ridge", "consensus", "template"])
 def test_a_track_is_found_in_three_images(name: str) -> None:
     played = Drive(Floor("SSS"), 0.3, 0.1).play(getattr(seeing, f"find_{name}"))
     assert played.result.status == "success" and played.result.values["images"] == 3
-    assert abs(played.result.values["offset"]) < 0.02 and abs(played.result.values["heading"]) < 0.06
+    assert (
+        abs(played.result.values["offset"]) < 0.02 and abs(played.result.values["heading"]) < 0.06
+    )
     ahead = TrackAhead.parse(played.published[-1][2])
     assert 0.0 < ahead.age < 0.05 and len(ahead.points) > 4
 

@@ -10,7 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.mobile.sight import STREAMED, UNSEEN, End, Sight, TrackAhead, TrackEnd, fit_line, thinned
+from petrobot.services.mobile.sight import (
+    STREAMED,
+    UNSEEN,
+    End,
+    Sight,
+    TrackAhead,
+    TrackEnd,
+    fit_line,
+    thinned,
+)
 
 SMALL = st.floats(-2.0, 2.0)
 
@@ -41,7 +50,8 @@ def test_a_set_point_comes_back_older_by_what_it_was_held(
 
 
 @pytest.mark.parametrize(
-    "values", [[], [0.1, 1.0, 0.0, 0.0], [0.1, 1.0, 0.0, 0.0, 0.0, 0.5], [-0.1, 1, 0, 0, 0], [0, 1, 7, 0, 0]]
+    "values",
+    [[], [0.1, 1.0, 0.0, 0.0], [0.1, 1.0, 0.0, 0.0, 0.0, 0.5], [-0.1, 1, 0, 0, 0], [0, 1, 7, 0, 0]],
 )
 def test_numbers_that_are_no_set_point_are_refused(values: list[float]) -> None:
     with pytest.raises(ValueError, match="track_ahead"):
@@ -62,12 +72,18 @@ def test_nothing_seen_cannot_be_described() -> None:
 
 
 @given(st.floats(-0.3, 0.3), st.floats(-0.7, 0.7), st.floats(-1.1, 1.1))
-def test_offset_heading_and_curvature_of_a_circle_come_back(offset: float, heading: float, curvature: float) -> None:
+def test_offset_heading_and_curvature_of_a_circle_come_back(
+    offset: float, heading: float, curvature: float
+) -> None:
     way = np.linspace(0.0, 0.5, 20)
     angle = heading + curvature * way
     step = way[1]
-    x = 0.43 + np.concatenate([[0.0], np.cumsum(np.cos(angle[:-1] + 0.5 * curvature * step) * step)])
-    y = offset + np.concatenate([[0.0], np.cumsum(np.sin(angle[:-1] + 0.5 * curvature * step) * step)])
+    x = 0.43 + np.concatenate(
+        [[0.0], np.cumsum(np.cos(angle[:-1] + 0.5 * curvature * step) * step)]
+    )
+    y = offset + np.concatenate(
+        [[0.0], np.cumsum(np.sin(angle[:-1] + 0.5 * curvature * step) * step)]
+    )
     ahead = np.concatenate([[True], np.diff(x) > 0.0])
     shape = Sight(x[ahead], y[ahead], 1.0).describe()
     assert shape.offset == pytest.approx(offset, abs=0.002)

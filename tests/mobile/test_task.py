@@ -1,4 +1,5 @@
-"""The task of figure 3: what check says, what its state space holds, and what happens on each ending of a run."""
+"""The task of figure 3: what check says, what its state space holds, and what happens on each
+ending of a run."""
 
 from __future__ import annotations
 
@@ -7,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.analysis.commands import analyse_command
-from coordinator.analysis.space import Limits
-from coordinator.check import check
-from coordinator.task import Scope, Task
-from coordinator.taskfile import load
-from services.comm.directory import Directory
-from services.comm.directory import load as load_directory
+from petrobot.coordinator.analysis.commands import analyse_command
+from petrobot.coordinator.analysis.space import Limits
+from petrobot.coordinator.check import check
+from petrobot.coordinator.task import Scope, Task
+from petrobot.coordinator.taskfile import load
+from petrobot.services.comm.directory import Directory
+from petrobot.services.comm.directory import load as load_directory
 
 ROOT = Path(__file__).parents[2]
 PATH = ROOT / "coordinator" / "tasks" / "follow_track.toml"
@@ -52,11 +53,16 @@ def test_all_events_are_internal_and_conflicts_are_settled_by_variables(task: Ta
             ways = [
                 t
                 for t in task.transitions.values()
-                if any(a.place == place.name and a.end is not None and a.end.value == end for a in t.inputs)
+                if any(
+                    a.place == place.name and a.end is not None and a.end.value == end
+                    for a in t.inputs
+                )
             ]
             assert len(ways) <= 2, "binary choices, as the paper says"
             if len(ways) == 2:
-                assert all(t.when is not None and t.priority == 0 and t.weight is None for t in ways)
+                assert all(
+                    t.when is not None and t.priority == 0 and t.weight is None for t in ways
+                )
 
 
 def test_the_state_space_holds_what_a_task_must() -> None:
@@ -64,17 +70,31 @@ def test_the_state_space_holds_what_a_task_must() -> None:
     assert data["complete"] and data["states"] < 1000
     verdicts = {name: verdict["holds"] for name, verdict in data["verdicts"].items()}
     assert verdicts.pop("safe") is False, "six attempts lie in one place"
-    assert set(verdicts) >= {"bounded", "deadlock_free", "quasi_live", "live", "proper", "sound", "controllable"}
+    assert set(verdicts) >= {
+        "bounded",
+        "deadlock_free",
+        "quasi_live",
+        "live",
+        "proper",
+        "sound",
+        "controllable",
+    }
     assert all(verdicts.values()), verdicts
-    assert data["bounds"]["attempts"] == 6 and max(v for k, v in data["bounds"].items() if "attempts" not in k) == 1
+    assert (
+        data["bounds"]["attempts"] == 6
+        and max(v for k, v in data["bounds"].items() if "attempts" not in k) == 1
+    )
     assert len(data["recoveries"]) >= 9
     for recovery in data["recoveries"]:
-        assert recovery["possible"]["holds"] and recovery["almost_sure"]["holds"], recovery["error_exit"]
+        assert recovery["possible"]["holds"] and recovery["almost_sure"]["holds"], recovery[
+            "error_exit"
+        ]
 
 
 def test_nothing_of_this_application_is_known_to_the_runtime() -> None:
-    """Another robot, another net, another services file: no name of them in coordinator/ (tasks/ aside) or services/comm."""
-    named = {"follow_track", "recover_track", "track_ahead", "services.mobile", "rover"}
+    """Another robot, another net, another services file: no name of them in coordinator/ (tasks/
+    aside) or services/comm."""
+    named = {"follow_track", "recover_track", "track_ahead", "petrobot.services.mobile", "rover"}
     for room in (ROOT / "coordinator", ROOT / "services" / "comm"):
         for path in room.rglob("*.py"):
             text = path.read_text(encoding="utf-8")

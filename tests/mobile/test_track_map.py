@@ -9,16 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.mobile.odometry import Pose
-from services.mobile.paths import arc
-from services.mobile.sight import End, TrackAhead, TrackEnd
-from services.mobile.track_map import TrackMap
+from petrobot.services.mobile.odometry import Pose
+from petrobot.services.mobile.paths import arc
+from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.mobile.track_map import TrackMap
 
 FAR = 12
 
 
-def sight(pose: Pose, line: Pose, bend: float = 0.0, end: End | None = None, noise: float = 0.0) -> TrackAhead:
-    """What a camera at `pose` tells of a line (a circle of that curvature through `line`), from 0.43 m ahead on."""
+def sight(
+    pose: Pose, line: Pose, bend: float = 0.0, end: End | None = None, noise: float = 0.0
+) -> TrackAhead:
+    """What a camera at `pose` tells of a line (a circle of that curvature through `line`), from
+    0.43 m ahead on."""
     random = np.random.default_rng(round(1e6 * abs(pose.x + pose.y)))
     points: list[tuple[float, float]] = []
     for x, y in arc(Pose(*line.floor(-1.0, 0.0), line.heading) if bend == 0.0 else line, bend, 5.0):
@@ -110,7 +113,9 @@ def test_a_plan_stands_in_until_the_line_is_seen() -> None:
     pose = Pose(2.5, 0, 0)
     assert track.take(pose, sight(pose, Pose(2.0, 0.03, 0)))
     seen = track.fit(pose, 0.8)
-    assert seen is not None and seen.y == pytest.approx(0.03, abs=1e-6), "the plan is dropped where the line is seen"
+    assert seen is not None and seen.y == pytest.approx(0.03, abs=1e-6), (
+        "the plan is dropped where the line is seen"
+    )
 
 
 def test_a_line_well_beside_the_plan_replaces_it_by_a_smooth_way() -> None:
@@ -120,7 +125,9 @@ def test_a_line_well_beside_the_plan_replaces_it_by_a_smooth_way() -> None:
     far = TrackAhead(0.0, 1.0, None, tuple((x, y) for x, y in sight(pose, line).points if x > 0.8))
     assert track.take(pose, far)
     here, there = track.fit(pose, 0.0), track.fit(pose, 1.0)
-    assert here is not None and abs(here.y) < 0.01 and abs(here.heading) < 0.1, "it begins where the rover is"
+    assert here is not None and abs(here.y) < 0.01 and abs(here.heading) < 0.1, (
+        "it begins where the rover is"
+    )
     assert there is not None and there.y == pytest.approx(0.15, abs=0.005), "it ends on the line"
     bends = [fit.curvature for i in range(11) if (fit := track.fit(pose, 0.1 * i)) is not None]
     assert len(bends) == 11 and max(map(abs, bends)) < 2.0, "no step, which would look like a bend"
@@ -131,7 +138,11 @@ def test_only_a_line_through_a_gate_begins_a_gated_stretch() -> None:
     track.begin([Pose(2.0, 0.0, 0.0)])
     pose = Pose(1.2, 0, 0)
     assert not track.take(pose, sight(pose, Pose(2.0, 0.45, 0.0))) and track.sights == 0
-    assert track.take(pose, sight(pose, Pose(2.0, 0.1, 0.1))) and track.sights == 1 and track.entry is not None
+    assert (
+        track.take(pose, sight(pose, Pose(2.0, 0.1, 0.1)))
+        and track.sights == 1
+        and track.entry is not None
+    )
     assert track.entry.heading == pytest.approx(0.1, abs=1e-6)
 
 
@@ -140,7 +151,9 @@ def test_gates_are_asked_until_the_stretch_has_been_found() -> None:
     track.begin([Pose(2.0, 0.0, 0.0)])
     regained = [track.regained]
     assert track.take(pose, sight(pose, Pose(2.0, 0.0, 0.0)))
-    assert not track.take(behind, sight(behind, Pose(1.2, 0.0, math.pi))), "turned back: where it came from is in view"
+    assert not track.take(behind, sight(behind, Pose(1.2, 0.0, math.pi))), (
+        "turned back: where it came from is in view"
+    )
     track.settle()
     regained.append(track.regained)
     assert track.take(behind, sight(behind, Pose(1.2, 0.0, math.pi)))

@@ -1,4 +1,5 @@
-"""The rover's bus master on the simulated bus: what stops the wheels, what is only reported, and what a reset mends."""
+"""The rover's bus master on the simulated bus: what stops the wheels, what is only reported, and
+what a reset mends."""
 
 from __future__ import annotations
 
@@ -6,11 +7,11 @@ from collections.abc import Callable
 
 import pytest
 
-from services.comm.canbus import Frame
-from services.comm.canopen import EMCY_BASE, HEARTBEAT_BASE, TPDO1_BASE, emergency
-from services.comm.canopen_master import Phase, Power
-from services.comm.cia402 import Command, Fault, State
-from services.mobile.wheel_drives import SILENT_CYCLES, WheelMaster
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import EMCY_BASE, HEARTBEAT_BASE, TPDO1_BASE, emergency
+from petrobot.services.comm.canopen_master import Phase, Power
+from petrobot.services.comm.cia402 import Command, Fault, State
+from petrobot.services.mobile.wheel_drives import SILENT_CYCLES, WheelMaster
 from tests.mobile.conftest import Floor, Pose
 from tests.mobile.yard import Yard
 
@@ -77,14 +78,20 @@ def test_a_drive_that_never_answers_is_named_and_tried_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("base", "text"), [(TPDO1_BASE, "right wheel: the drive is silent"), (HEARTBEAT_BASE, "node 2 sends no heartbeat")]
+    ("base", "text"),
+    [
+        (TPDO1_BASE, "right wheel: the drive is silent"),
+        (HEARTBEAT_BASE, "node 2 sends no heartbeat"),
+    ],
 )
 def test_silence_of_one_drive_stops_both(base: int, text: str) -> None:
     bench = Bench().enabled()
     bench.run(0.5, 3.0)
     bench.passes = without(RIGHT, base)
     bench.run(SILENT_CYCLES * CYCLE + 0.3, 3.0)
-    assert [(t.cause, bench.master.wheel(t), t.text) for t in bench.master.troubles] == [("bus", "right wheel", text)]
+    assert [(t.cause, bench.master.wheel(t), t.text) for t in bench.master.troubles] == [
+        ("bus", "right wheel", text)
+    ]
     bench.run(1.0, 3.0)
     assert not bench.master.wanted and bench.yard.body.standing
     bench.passes = lambda frame: True
@@ -107,7 +114,10 @@ def test_a_restarted_sensor_is_no_trouble_and_a_restarted_drive_is() -> None:
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + SENSOR, b"\0"))
     told = [trouble.text for trouble in bench.master.troubles]
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + LEFT, b"\0"))
-    assert (told, [trouble.text for trouble in bench.master.troubles]) == ([], ["node 1 has restarted"])
+    assert (told, [trouble.text for trouble in bench.master.troubles]) == (
+        [],
+        ["node 1 has restarted"],
+    )
 
 
 def test_power_brakes_first_and_resets_a_fault_only_now_and_then() -> None:

@@ -1,4 +1,5 @@
-"""A rover on its bus in a yard with a track, for the tests of driver and actions: simulated drives, an ideal camera."""
+"""A rover on its bus in a yard with a track, for the tests of driver and actions: simulated drives,
+an ideal camera."""
 
 from __future__ import annotations
 
@@ -9,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from services.comm.canbus import Frame
-from services.comm.party import TICK
-from services.mobile.rover import Rover
-from services.mobile.sight import End, TrackAhead, TrackEnd
-from services.setpoints import SetpointReceiver
-from sim.rover import Rover as Body
-from sim.rover_drives import RoverBus
-from sim.rover_sensor import Echo, ReflectorSensor, look
-from sim.track_truth import read_track_site
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.party import TICK
+from petrobot.services.mobile.rover import Rover
+from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.setpoints import SetpointReceiver
+from petrobot.sim.rover import Rover as Body
+from petrobot.sim.rover_drives import RoverBus
+from petrobot.sim.rover_sensor import Echo, ReflectorSensor, look
+from petrobot.sim.track_truth import read_track_site
 from tests.mobile.conftest import Floor, Pose
 
 ROVER_FILE = Path(__file__).parents[2] / "services" / "mobile" / "rover.toml"
@@ -77,10 +78,16 @@ class Ports:
 
 
 class Yard:
-    """A floor with a track, the rover's body, its bus and its driver. `world` is for `rehearse(..., world=yard.world)`."""
+    """A floor with a track, the rover's body, its bus and its driver. `world` is for `rehearse(...,
+    world=yard.world)`."""
 
     def __init__(
-        self, floor: Floor, begin: Pose, *, reflectors: Sequence[tuple[float, float]] = (), seed: int = 1
+        self,
+        floor: Floor,
+        begin: Pose,
+        *,
+        reflectors: Sequence[tuple[float, float]] = (),
+        seed: int = 1,
     ) -> None:
         truth = read_track_site(ROVER_FILE).truth("plain")
         self.floor, self.reflectors = floor, reflectors
@@ -105,7 +112,9 @@ class Yard:
         self.bus.bus.step(now)
         if now >= self._due - 1e-9:
             self._due = now + IMAGE
-            self.errors.append(min(math.hypot(p.x - self.body.x, p.y - self.body.y) for p in self._line))
+            self.errors.append(
+                min(math.hypot(p.x - self.body.x, p.y - self.body.y) for p in self._line)
+            )
             if self.camera:
                 self.ports.receiver.take(self._sight().values())
 
@@ -132,7 +141,8 @@ class Yard:
         return look(self._sensor, self.body.pose, self.reflectors, self._random)
 
     def _sight(self) -> TrackAhead:
-        """What an ideal camera tells: painted points in its view, the nearest connected row of them, and where that ends."""
+        """What an ideal camera tells: painted points in its view, the nearest connected row of
+        them, and where that ends."""
         rows: list[tuple[float, float]] = []
         end: End | None = None
         for place, painted in zip(self._line, self._painted, strict=True):
@@ -142,7 +152,12 @@ class Yard:
             inside = 0.43 < x < 1.5 and abs(y) < 0.3 + 0.2 * x
             if rows and not painted and inside and end is None and x - rows[-1][0] < 0.05:
                 end = End(TrackEnd.INTERRUPTION, x, y)
-            if inside and painted and end is None and (not rows or math.hypot(x - rows[-1][0], y - rows[-1][1]) < 0.1):
+            if (
+                inside
+                and painted
+                and end is None
+                and (not rows or math.hypot(x - rows[-1][0], y - rows[-1][1]) < 0.1)
+            ):
                 rows.append((x, y))
             if self.floor.bar and inside and place is self._line[-1] and rows:
                 end = End(TrackEnd.T, x, y)

@@ -1,4 +1,5 @@
-"""A rig for the motion room: the driver `Arm` on a bus of simulated drives around a simple arm, on a clock of its own."""
+"""A rig for the motion room: the driver `Arm` on a bus of simulated drives around a simple arm, on
+a clock of its own."""
 
 from __future__ import annotations
 
@@ -12,17 +13,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.action import Cancelled, Result, Wait
-from services.comm.canbus import Frame
-from services.motion.arm import PERIOD, Arm
-from services.motion.model import nominal_arm
-from sim.drives import DriveBus, ratings
+from petrobot.services.action import Cancelled, Result, Wait
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.motion.arm import PERIOD, Arm
+from petrobot.services.motion.model import nominal_arm
+from petrobot.sim.drives import DriveBus, ratings
 
-TABLE = tomllib.loads(files("services.motion").joinpath("puma560.toml").read_text(encoding="utf-8"))
+TABLE = tomllib.loads(
+    files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
+)
 
 
 class SimplePlant:
-    """Six joints that do not feel each other: inertia, gravity on joints 2 and 3, dry and viscous friction, brakes."""
+    """Six joints that do not feel each other: inertia, gravity on joints 2 and 3, dry and viscous
+    friction, brakes."""
 
     GRAVITY = (0.0, 37.0, 9.0, 0.0, 0.3, 0.0)
 
@@ -70,7 +74,8 @@ class SimplePlant:
 
 
 class Wire:
-    """Both directions between the arm and its drives; may be cut, and delivers by the next cycle."""
+    """Both directions between the arm and its drives; may be cut, and delivers by the next
+    cycle."""
 
     def __init__(self) -> None:
         self.to_drives: deque[Frame] = deque()
@@ -140,12 +145,15 @@ class Rig:
         self.wire = Wire()
         self.stream_port = Stream(self, 0.02)
         home = nominal_arm().poses["home"]
-        self.plant = plant if plant is not None else SimplePlant(start if start is not None else home)
+        self.plant = (
+            plant if plant is not None else SimplePlant(start if start is not None else home)
+        )
         self.drives = drives if drives is not None else DriveBus(self.plant, ratings(TABLE))
         self.commanded: list[list[float]] = []
         self.on_step: Callable[[float], None] | None = None
         self.thinking = 0.0
-        """s by which the clock is ahead of the cycle's beginning: what a real host's cycle takes."""
+        """s by which the clock is ahead of the cycle's beginning: what a real host's cycle
+        takes."""
         self.arm = Arm(config or {}, self)
         self.sync = True
 
@@ -291,7 +299,8 @@ class Play:
         cancel: Callable[[], bool] | None = None,
         most: float = 20.0,
     ) -> Result | None:
-        """To the action's end; `each` acts as the world in each cycle. None if `cancel` came true and ended it."""
+        """To the action's end; `each` acts as the world in each cycle. None if `cancel` came true
+        and ended it."""
         wait: Wait = action.send(None)
         until = self.now + most
         while self.now < until:

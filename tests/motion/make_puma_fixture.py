@@ -1,12 +1,14 @@
-"""Makes `puma560_golden.json` from an independent implementation: the Robotics Toolbox for Python's Puma560 (MIT licence).
+"""Makes `puma560_golden.json` from an independent implementation: the Robotics Toolbox for Python's
+Puma560 (MIT licence).
 
 Run once, in an environment of its own (the toolbox is large and no dependency of this project):
 
     python -m venv /tmp/rtb && /tmp/rtb/bin/pip install roboticstoolbox-python==1.5.0
     /tmp/rtb/bin/python tests/motion/make_puma_fixture.py
 
-Each case: joint angles (rad), pose of frame 6 (4 x 4, m) and geometric Jacobian in the base frame (6 x 6). For the home pose:
-gravity torques (N m) and joint-space inertia with rotors (6 x 6, kg m^2) of the arm without cup.
+Each case: joint angles (rad), pose of frame 6 (4 x 4, m) and geometric Jacobian in the base frame
+(6 x 6). For the home pose: gravity torques (N m) and joint-space inertia with rotors (6 x 6, kg
+m^2) of the arm without cup.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ def main() -> None:
             "inertia": np.asarray(puma.inertia(home)).tolist(),
         },
     }
-    Path(__file__).with_name("puma560_golden.json").write_text(json.dumps(body) + "\n", encoding="utf-8")
+    Path(__file__).with_name("puma560_golden.json").write_text(
+        json.dumps(body) + "\n", encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

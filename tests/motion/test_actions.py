@@ -8,21 +8,22 @@ from typing import Any
 
 import pytest
 
-from services.action import Status
-from services.comm.cia402 import Fault
-from services.motion import actions
-from services.motion.kinematics import Puma
-from services.motion.limits import Guard
-from services.motion.model import nominal_arm, nominal_cell
+from petrobot.services.action import Status
+from petrobot.services.comm.cia402 import Fault
+from petrobot.services.motion import actions
+from petrobot.services.motion.kinematics import Puma
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 FALL = math.sqrt(2 * 0.055 / 9.81)
 
 
 class Ball:
-    """A ball that leaves the edge `leaves` seconds from the start, as vision would predict it 50 times a second from `seen` on.
+    """A ball that leaves the edge `leaves` seconds from the start, as vision would predict it 50
+    times a second from `seen` on.
 
-    Predictions go on until `until` (s after the start, default: when the ball has fallen). The ball lies in the cup from
-    its arrival on if it is to be `caught`.
+    Predictions go on until `until` (s after the start, default: when the ball has fallen). The ball
+    lies in the cup from its arrival on if it is to be `caught`.
     """
 
     def __init__(
@@ -34,7 +35,14 @@ class Ball:
         caught: bool = True,
         sigma: float = 0.002,
     ) -> None:
-        self.leaves, self.y, self.seen, self.until, self.caught, self.sigma = leaves, y, seen, until, caught, sigma
+        self.leaves, self.y, self.seen, self.until, self.caught, self.sigma = (
+            leaves,
+            y,
+            seen,
+            until,
+            caught,
+            sigma,
+        )
         self.begun: float | None = None
         self.speed = 1.4
 
@@ -43,7 +51,9 @@ class Ball:
             self.begun = play.now
         age = play.now - self.begun
         if self.seen <= age < min(self.until, self.leaves + 0.15) and play.rig.cycle % 5 == 0:
-            play.rig.feed([self.leaves - age, 0.62, self.y, 0.62, -self.speed, 0.0, 0.0, self.sigma, 0.01])
+            play.rig.feed(
+                [self.leaves - age, 0.62, self.y, 0.62, -self.speed, 0.0, 0.0, self.sigma, 0.01]
+            )
         if self.caught and age >= self.leaves + FALL:
             play.rig.drives.ball(True)
 
@@ -124,7 +134,8 @@ def test_the_two_actions_of_a_catch_hand_over(play: Any) -> None:
     assert play.now - ball.begun < 1.0 + FALL + 0.06 + 0.3 + 0.05
     assert play.rig.arm.state()["stale_executed"] == 0
     result = play.play(
-        actions.empty_and_home(play), lambda play: play.rig.drives.ball(play.rig.arm.state()["mode"] != "move")
+        actions.empty_and_home(play),
+        lambda play: play.rig.drives.ball(play.rig.arm.state()["mode"] != "move"),
     )
     assert result.status is Status.SUCCESS
 
@@ -205,7 +216,9 @@ def test_reset_and_home_says_why_it_cannot(play: Any) -> None:
 def test_an_arm_that_cannot_get_home_past_the_table_says_so_and_does_not_touch_it(
     make_rig: Any, make_play: Any
 ) -> None:
-    rig = make_rig(start=[math.radians(angle) for angle in (0.0, 90.0, -90.0, 0.0, 0.0, 0.0)]).enable()
+    rig = make_rig(
+        start=[math.radians(angle) for angle in (0.0, 90.0, -90.0, 0.0, 0.0, 0.0)]
+    ).enable()
     arm = nominal_arm()
     bare = Guard(Puma.of(arm), arm, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
     play = make_play(rig)
@@ -235,9 +248,14 @@ def test_actions_that_find_the_drives_off_say_so(make_rig: Any, make_play: Any) 
 
 
 def test_reset_and_home_turns_a_full_cup_over(play: Any) -> None:
-    """Seen after a resumed run: a ball left in the cup by recovery kept the next one from being thrown."""
+    """Seen after a resumed run: a ball left in the cup by recovery kept the next one from being
+    thrown."""
     play.rig.drives.ball(True)
     play.rig.run(0.1)
     play.device.state = play.rig.arm.state()
     play.play(actions.reset_and_home(play, timeout=40.0))
-    assert [body.get("pose") for body in play.device.sent if body["do"] == "move"][:3] == ["home", "empty", "home"]
+    assert [body.get("pose") for body in play.device.sent if body["do"] == "move"][:3] == [
+        "home",
+        "empty",
+        "home",
+    ]

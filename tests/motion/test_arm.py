@@ -1,4 +1,5 @@
-"""The driver `Arm` on simulated drives, in simulated time: enabling, moving, following, and everything that makes it stop."""
+"""The driver `Arm` on simulated drives, in simulated time: enabling, moving, following, and
+everything that makes it stop."""
 
 from __future__ import annotations
 
@@ -10,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.comm.cia402 import Fault
-from services.motion.kinematics import Puma
-from services.motion.limits import Guard
-from services.motion.model import nominal_arm, nominal_cell
+from petrobot.services.comm.cia402 import Fault
+from petrobot.services.motion.kinematics import Puma
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 ARM = nominal_arm()
 PUMA = Puma.of(ARM)
@@ -109,7 +110,9 @@ def test_speed_is_a_share(rig: Any) -> None:
         ({"do": "follow", "strategy": "net"}, "unknown strategy 'net': know tilted, upright"),
     ],
 )
-def test_bad_commands_are_refused_and_change_nothing(rig: Any, body: dict[str, Any], says: str) -> None:
+def test_bad_commands_are_refused_and_change_nothing(
+    rig: Any, body: dict[str, Any], says: str
+) -> None:
     with pytest.raises(ValueError, match=says):
         rig.arm.command(rig.now, body)
     rig.run(0.2)
@@ -148,7 +151,8 @@ def test_following_brings_the_cup_to_the_predicted_point(rig: Any) -> None:
 
 @pytest.mark.parametrize("thinking", [0.001, 0.003, 0.011, 0.050])
 def test_a_cycle_that_takes_long_executes_nothing_stale(rig: Any, thinking: float) -> None:
-    """What is fresh when a cycle begins may be stale when its target leaves: the clock at the last moment decides."""
+    """What is fresh when a cycle begins may be stale when its target leaves: the clock at the last
+    moment decides."""
     _follow(rig, 0.12, y=0.3)
     rig.thinking = thinking
     assert rig.run(0.1, lambda: rig.arm.state()["reason"] == "no_setpoint")
@@ -177,7 +181,9 @@ def test_it_holds_within_three_periods_of_the_stream(rig: Any) -> None:
 
 @pytest.mark.parametrize("y", [-0.3, 0.3])
 @pytest.mark.parametrize("speed", [0.38, 0.5])
-def test_slow_balls_close_to_the_edge_are_reached_by_a_way_round(rig: Any, y: float, speed: float) -> None:
+def test_slow_balls_close_to_the_edge_are_reached_by_a_way_round(
+    rig: Any, y: float, speed: float
+) -> None:
     begun = rig.now
     for cycle in range(250):
         if cycle % 20 == 0:
@@ -213,7 +219,9 @@ def test_repeats_keep_a_set_point_alive(rig: Any) -> None:
         rig.tick()
     state = rig.arm.state()
     assert state["in_place"]
-    assert state["plan"]["arrival"] == pytest.approx(1.0 - 1.0 + math.sqrt(2 * 0.055 / 9.81), abs=0.03)
+    assert state["plan"]["arrival"] == pytest.approx(
+        1.0 - 1.0 + math.sqrt(2 * 0.055 / 9.81), abs=0.03
+    )
 
 
 def test_it_holds_when_its_action_falls_silent(rig: Any) -> None:
@@ -408,7 +416,9 @@ def test_a_slow_arm_is_driven_at_its_own_speed(make_rig: Any, factor: float) -> 
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.3])
-def test_an_arm_that_slows_down_in_mid_motion_is_followed_by_its_commands(rig: Any, factor: float) -> None:
+def test_an_arm_that_slows_down_in_mid_motion_is_followed_by_its_commands(
+    rig: Any, factor: float
+) -> None:
     _follow(rig, 0.2, y=-0.3)
     rig.drives.slow_down(factor)
     _follow(rig, 3.3, y=0.3, arrival=3.5)
@@ -444,7 +454,9 @@ def test_a_ball_in_the_cup_is_told_once_when_it_has_come_to_stay(rig: Any) -> No
 
 
 def test_strategies_take_their_values_from_the_command(rig: Any) -> None:
-    rig.arm.command(rig.now, {"do": "follow", "strategy": "tilted", "tilt": 0.2, "depths": [0.06, 0.09]})
+    rig.arm.command(
+        rig.now, {"do": "follow", "strategy": "tilted", "tilt": 0.2, "depths": [0.06, 0.09]}
+    )
     for cycle in range(100):
         if cycle % 5 == 0:
             rig.feed(_point(0.0, 2.0 - cycle * CYCLE))
@@ -457,9 +469,14 @@ def test_strategies_take_their_values_from_the_command(rig: Any) -> None:
 WORLD = st.lists(
     st.tuples(
         st.one_of(
-            st.builds(lambda y: {"do": "move", "pose": y}, st.sampled_from(["home", "empty", "ready"])),
+            st.builds(
+                lambda y: {"do": "move", "pose": y}, st.sampled_from(["home", "empty", "ready"])
+            ),
             st.just({"do": "hold"}),
-            st.builds(lambda name: {"do": "follow", "strategy": name}, st.sampled_from(["tilted", "upright"])),
+            st.builds(
+                lambda name: {"do": "follow", "strategy": name},
+                st.sampled_from(["tilted", "upright"]),
+            ),
             st.just({"do": "move", "pose": [9.0] * 6}),
         ),
         st.lists(st.floats(-3.0, 3.0, allow_nan=False), min_size=9, max_size=9),

@@ -1,4 +1,5 @@
-"""The python-can interface `petrobot_stream`: conformance as python-can tests its own interfaces, the hub, and bad input."""
+"""The python-can interface `petrobot_stream`: conformance as python-can tests its own interfaces,
+the hub, and bad input."""
 
 from __future__ import annotations
 
@@ -14,9 +15,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm.can_hub import Hub
-from services.comm.can_ports import PythonCanBus, StreamPort, open_can
-from services.comm.can_stream import (
+from petrobot.services.comm.can_hub import Hub
+from petrobot.services.comm.can_ports import PythonCanBus, StreamPort, open_can
+from petrobot.services.comm.can_stream import (
     EXTENDED,
     GREETING,
     REMOTE,
@@ -26,7 +27,7 @@ from services.comm.can_stream import (
     encode,
     parse_channel,
 )
-from services.comm.canbus import CanBus, Frame
+from petrobot.services.comm.canbus import CanBus, Frame
 from tests.waiting import Limit
 
 PATIENCE = 5.0
@@ -54,7 +55,9 @@ class RunningHub:
 
 @pytest.fixture(params=["tcp", "unix"])
 def channel(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    running = RunningHub("tcp://127.0.0.1:0" if request.param == "tcp" else f"unix://{tmp_path}/can")
+    running = RunningHub(
+        "tcp://127.0.0.1:0" if request.param == "tcp" else f"unix://{tmp_path}/can"
+    )
     yield running.channel
     running.close()
 
@@ -72,7 +75,9 @@ def pair(channel: str) -> Iterator[tuple[can.BusABC, can.BusABC]]:
     for sender, receiver in ((first, second), (second, first)):
         sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
         limit = Limit("the first message")
-        while receiver.recv(timeout=0.05) is None and limit.left():  # the hub had not taken the other one in yet
+        while (
+            receiver.recv(timeout=0.05) is None and limit.left()
+        ):  # the hub had not taken the other one in yet
             sender.send(can.Message(arbitration_id=0x7FF, is_extended_id=False))
     _flush(first)
     _flush(second)
@@ -88,7 +93,8 @@ def _flush(bus: can.BusABC) -> None:
 
 
 MESSAGES = [
-    can.Message(arbitration_id=0x123, is_extended_id=False, data=data) for data in (b"", b"\x00", bytes(range(8)))
+    can.Message(arbitration_id=0x123, is_extended_id=False, data=data)
+    for data in (b"", b"\x00", bytes(range(8)))
 ] + [
     can.Message(arbitration_id=0x1FFFFFFF, is_extended_id=True, data=b"\x01\x02"),
     can.Message(arbitration_id=0x1, is_extended_id=True, data=b"\x01"),
@@ -114,7 +120,8 @@ def test_many_frames_arrive_in_order_and_none_is_lost(pair: tuple[can.BusABC, ca
     sender, receiver = pair
     for number in range(2000):
         sender.send(
-            can.Message(arbitration_id=0x100, is_extended_id=False, data=struct.pack("<I", number)), timeout=PATIENCE
+            can.Message(arbitration_id=0x100, is_extended_id=False, data=struct.pack("<I", number)),
+            timeout=PATIENCE,
         )
     times = []
     for number in range(2000):
@@ -135,7 +142,11 @@ def test_filters_hold(pair: tuple[can.BusABC, can.BusABC]) -> None:
     receiver.set_filters([{"can_id": 0x200, "can_mask": 0x700, "extended": False}])
     for cob_id in (0x181, 0x201, 0x301, 0x2FF):
         sender.send(can.Message(arbitration_id=cob_id, is_extended_id=False))
-    seen = [message.arbitration_id for message in (receiver.recv(PATIENCE), receiver.recv(PATIENCE)) if message]
+    seen = [
+        message.arbitration_id
+        for message in (receiver.recv(PATIENCE), receiver.recv(PATIENCE))
+        if message
+    ]
     assert seen == [0x201, 0x2FF]
     assert receiver.recv(timeout=0.02) is None
 
@@ -228,7 +239,8 @@ def _collect(hub: Hub, port: CanBus, got: list[Frame]) -> None:
 
 
 @pytest.mark.parametrize(
-    "rubbish", [b"GET / HTTP/1.1\r\n", GREETING + b"\x00\x00\x01\x23\x09", GREETING + b"\x00\x00\x08\x00\x00"]
+    "rubbish",
+    [b"GET / HTTP/1.1\r\n", GREETING + b"\x00\x00\x01\x23\x09", GREETING + b"\x00\x00\x08\x00\x00"],
 )
 def test_a_port_that_talks_rubbish_is_dropped_and_the_others_go_on(rubbish: bytes) -> None:
     hub = Hub()
@@ -276,7 +288,11 @@ def test_local_ports_and_python_can_and_stream_ports_hear_each_other() -> None:
     foreign = PythonCanBus(_open(hub.channel))
     _poll_until(hub, lambda: hub.ports == 2)
     frame = Frame(0x181, b"\x01\x02\x03")
-    for sender, receivers in ((local, (stream, foreign)), (stream, (local, foreign)), (foreign, (local, stream))):
+    for sender, receivers in (
+        (local, (stream, foreign)),
+        (stream, (local, foreign)),
+        (foreign, (local, stream)),
+    ):
         sender.send(frame)
         for receiver in receivers:
             got: list[Frame] = []
@@ -321,15 +337,23 @@ def test_a_socket_file_left_behind_is_replaced_but_one_in_use_is_not(tmp_path: P
 
 
 FRAMES = st.lists(
-    st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)).map(lambda pair: (pair[0], len(pair[1]), pair[1]))
-    | st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)).map(lambda p: (p[0] | EXTENDED, len(p[1]), p[1]))
-    | st.tuples(st.integers(0, 0x7FF), st.integers(0, 8)).map(lambda pair: (pair[0] | REMOTE, pair[1], b"")),
+    st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8)).map(
+        lambda pair: (pair[0], len(pair[1]), pair[1])
+    )
+    | st.tuples(st.integers(0, 0x1FFFFFFF), st.binary(max_size=8)).map(
+        lambda p: (p[0] | EXTENDED, len(p[1]), p[1])
+    )
+    | st.tuples(st.integers(0, 0x7FF), st.integers(0, 8)).map(
+        lambda pair: (pair[0] | REMOTE, pair[1], b"")
+    ),
     max_size=20,
 )
 
 
 @given(FRAMES, st.lists(st.integers(1, 40), max_size=60))
-def test_frames_survive_any_cutting_of_the_bytes(frames: list[tuple[int, int, bytes]], cuts: list[int]) -> None:
+def test_frames_survive_any_cutting_of_the_bytes(
+    frames: list[tuple[int, int, bytes]], cuts: list[int]
+) -> None:
     raw = GREETING + b"".join(encode(word, data, dlc) for word, dlc, data in frames)
     splitter, got, at = Splitter(), [], 0
     for cut in [*cuts, len(raw)]:
@@ -357,8 +381,13 @@ def test_the_framing_byte_by_byte() -> None:
 
 @given(st.integers(0, 10_000))
 def test_one_changed_bit_is_noticed(bit: int) -> None:
-    """It becomes neither another identifier nor other data; a changed length waits for more, and that is checked in its turn."""
-    frames = [(0x181, 2, b"\x01\x02"), (0x1ABCDEF | EXTENDED, 8, bytes(8)), (0x300 | REMOTE, 4, b"")]
+    """It becomes neither another identifier nor other data; a changed length waits for more, and
+    that is checked in its turn."""
+    frames = [
+        (0x181, 2, b"\x01\x02"),
+        (0x1ABCDEF | EXTENDED, 8, bytes(8)),
+        (0x300 | REMOTE, 4, b""),
+    ]
     raw = bytearray(b"".join(encode(word, data, dlc) for word, dlc, data in frames))
     raw[bit // 8 % len(raw)] ^= 1 << bit % 8
     splitter = Splitter()

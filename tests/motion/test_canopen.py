@@ -8,10 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm import canopen, cia402
-from services.comm.canbus import Frame
-from services.comm.canopen import Abort, Mapped, NmtCommand, NmtState, SdoAbortError, SdoClient, Transfer, Type
-from services.comm.cia402 import Command, State
+from petrobot.services.comm import canopen, cia402
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import (
+    Abort,
+    Mapped,
+    NmtCommand,
+    NmtState,
+    SdoAbortError,
+    SdoClient,
+    Transfer,
+    Type,
+)
+from petrobot.services.comm.cia402 import Command, State
 from tests.waiting import Limit
 
 WRITTEN_OUT = [
@@ -24,7 +33,11 @@ WRITTEN_OUT = [
     (canopen.emergency(2, 0x8611, 0x21, b"\x07"), 0x082, "11 86 21 07 00 00 00 00"),
     (canopen.sdo_write_request(1, 0x6060, 0, b"\x08"), 0x601, "2f 60 60 00 08 00 00 00"),
     (canopen.sdo_write_request(1, 0x1017, 0, b"\x32\x00"), 0x601, "2b 17 10 00 32 00 00 00"),
-    (canopen.sdo_write_request(1, 0x1016, 1, b"\xc8\x00\x7f\x00"), 0x601, "23 16 10 01 c8 00 7f 00"),
+    (
+        canopen.sdo_write_request(1, 0x1016, 1, b"\xc8\x00\x7f\x00"),
+        0x601,
+        "23 16 10 01 c8 00 7f 00",
+    ),
     (canopen.sdo_read_request(6, 0x6041, 0), 0x606, "40 41 60 00 00 00 00 00"),
     (canopen.sdo_write_reply(1, 0x6060, 0), 0x581, "60 60 60 00 00 00 00 00"),
     (canopen.sdo_read_reply(6, 0x6041, 0, b"\x37\x12"), 0x586, "4b 41 60 00 37 12 00 00"),
@@ -39,8 +52,12 @@ def test_frames_byte_by_byte(frame: Frame, cob_id: int, data: str) -> None:
 
 
 def test_process_data_byte_by_byte() -> None:
-    assert canopen.pdo_struct(cia402.RECEIVED).pack(0x000F, -1) == bytes.fromhex("0f 00 ff ff ff ff")
-    assert canopen.pdo_struct(cia402.SENT).pack(0x1237, 1_000_000, -2) == bytes.fromhex("37 12 40 42 0f 00 fe ff")
+    assert canopen.pdo_struct(cia402.RECEIVED).pack(0x000F, -1) == bytes.fromhex(
+        "0f 00 ff ff ff ff"
+    )
+    assert canopen.pdo_struct(cia402.SENT).pack(0x1237, 1_000_000, -2) == bytes.fromhex(
+        "37 12 40 42 0f 00 fe ff"
+    )
     assert cia402.RECEIVED[1].entry == 0x607A0020
     assert cia402.SENT[2].entry == 0x60770010
 
@@ -195,7 +212,12 @@ def test_every_controlword_is_a_command_and_every_command_has_its_word() -> None
 
 
 def test_enabling_leads_from_every_resting_state_to_operation() -> None:
-    for start in (State.SWITCH_ON_DISABLED, State.FAULT, State.QUICK_STOP_ACTIVE, State.SWITCHED_ON):
+    for start in (
+        State.SWITCH_ON_DISABLED,
+        State.FAULT,
+        State.QUICK_STOP_ACTIVE,
+        State.SWITCHED_ON,
+    ):
         state = start
         limit = Limit("operation", steps=5)
         while state is not State.OPERATION_ENABLED and limit.left():
@@ -209,7 +231,11 @@ def test_a_fault_is_left_by_a_reset_alone(command: Command) -> None:
 
 
 def test_no_state_but_switched_on_and_quick_stop_leads_into_operation() -> None:
-    ways = {state for (state, _), after in cia402.TRANSITIONS.items() if after is State.OPERATION_ENABLED}
+    ways = {
+        state
+        for (state, _), after in cia402.TRANSITIONS.items()
+        if after is State.OPERATION_ENABLED
+    }
     assert ways == {State.SWITCHED_ON, State.QUICK_STOP_ACTIVE}
 
 

@@ -1,6 +1,8 @@
-"""Closed loop in small: balls that roll off the edge, noisy predictions, the servo on its drives, and a cup that they fall into.
+"""Closed loop in small: balls that roll off the edge, noisy predictions, the servo on its drives,
+and a cup that they fall into.
 
-The ball-in-cup mechanics here is the test's own: a sphere in a smooth-walled cylinder with a rim, restitution 0.3, friction.
+The ball-in-cup mechanics here is the test's own: a sphere in a smooth-walled cylinder with a rim,
+restitution 0.3, friction.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from services.motion.model import nominal_arm, nominal_cell
+from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 CELL = nominal_cell()
 RADIUS, DEPTH, WALL, BALL = CELL.cup.radius, CELL.cup.depth, CELL.cup.wall, CELL.ball_radius
@@ -22,7 +24,8 @@ Vector = np.ndarray[Any, np.dtype[np.float64]]
 
 
 class Throw(NamedTuple):
-    """A ball as it leaves the edge: at y (m), with speed and heading (m/s, rad), so many seconds after its release."""
+    """A ball as it leaves the edge: at y (m), with speed and heading (m/s, rad), so many seconds
+    after its release."""
 
     y: float
     speed: float
@@ -31,11 +34,14 @@ class Throw(NamedTuple):
 
     @property
     def velocity(self) -> Vector:
-        return np.array([-self.speed * math.cos(self.heading), self.speed * math.sin(self.heading), 0.0])
+        return np.array(
+            [-self.speed * math.cos(self.heading), self.speed * math.sin(self.heading), 0.0]
+        )
 
 
 def throw(rng: np.random.Generator, low: float, high: float) -> Throw:
-    """A nominal throw: released 0.1 m from the far edge with 70 to 100 % of the spin of rolling, unknown rolling resistance."""
+    """A nominal throw: released 0.1 m from the far edge with 70 to 100 % of the spin of rolling,
+    unknown rolling resistance."""
     length = 1.5
     release, target = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3)
     rolling = rng.uniform(low, high) * (0.6 + 0.4 * rng.uniform(0.7, 1.0))
@@ -101,8 +107,11 @@ class BallInCup:
         self.w = self.w + 1.5 / BALL * np.cross(-normal, drag)
 
 
-def _catch(rig: Any, ball: Throw, strategy: str, rng: np.random.Generator, noise: float, blind: float) -> bool:
-    """One throw: vision sees it after `blind` s, with errors of `noise` (m at the edge for each second that is left)."""
+def _catch(
+    rig: Any, ball: Throw, strategy: str, rng: np.random.Generator, noise: float, blind: float
+) -> bool:
+    """One throw: vision sees it after `blind` s, with errors of `noise` (m at the edge for each
+    second that is left)."""
     begun = rig.now
     bias = rng.normal(0.0, 0.5 * noise)
     rig.arm.command(rig.now, {"do": "follow", "strategy": strategy})
@@ -113,7 +122,9 @@ def _catch(rig: Any, ball: Throw, strategy: str, rng: np.random.Generator, noise
             sigma = 0.001 + noise * max(left, 0.0)
             y = ball.y + bias * max(left, 0.0) + rng.normal(0.0, 0.5 * sigma)
             vx, vy, _ = ball.velocity * (1.0 + rng.normal(0.0, 0.3 * sigma))
-            rig.feed([left + rng.normal(0.0, 0.2 * sigma), 0.62, y, 0.62, vx, vy, 0.0, sigma, sigma])
+            rig.feed(
+                [left + rng.normal(0.0, 0.2 * sigma), 0.62, y, 0.62, vx, vy, 0.0, sigma, sigma]
+            )
         if cycle % 20 == 0:
             rig.arm.command(rig.now, {"do": "follow"})
         rig.tick()
@@ -143,7 +154,10 @@ REGIMES = {"A": (0.7, 1.5), "B": (1.5, 2.0), "C": (2.0, 2.5)}
 @pytest.mark.parametrize(("regime", "noise"), [("A", 0.02), ("B", 0.02), ("C", 0.02), ("C", 0.0)])
 def test_tilted_catches_nearly_all(rig: Any, regime: str, noise: float) -> None:
     number = 5
-    assert _caught(rig, REGIMES[regime], number, strategy="tilted", noise=noise, blind=0.2) >= number - 1
+    assert (
+        _caught(rig, REGIMES[regime], number, strategy="tilted", noise=noise, blind=0.2)
+        >= number - 1
+    )
 
 
 def test_upright_is_good_at_slow_balls(rig: Any) -> None:
@@ -159,23 +173,33 @@ def test_a_cup_that_is_not_there_catches_nothing() -> None:
 @pytest.mark.parametrize(("regime", "floor"), [("A", 0.98), ("B", 0.94), ("C", 0.89)])
 def test_a_thousand_throws(make_rig: Callable[[], Any], regime: str, floor: float) -> None:
     number = 1000
-    share = _caught(make_rig().enable(), REGIMES[regime], number, strategy="tilted", noise=0.02, blind=0.25) / number
+    share = (
+        _caught(
+            make_rig().enable(), REGIMES[regime], number, strategy="tilted", noise=0.02, blind=0.25
+        )
+        / number
+    )
     z = 1.96
     centre = share + z * z / (2 * number)
-    lower = (centre - z * math.sqrt(share * (1 - share) / number + (z / (2 * number)) ** 2)) / (1 + z * z / number)
+    lower = (centre - z * math.sqrt(share * (1 - share) / number + (z / (2 * number)) ** 2)) / (
+        1 + z * z / number
+    )
     assert lower >= floor
 
 
 def test_the_home_pose_is_near_every_ball() -> None:
-    """From home every throw of A to C can be met by the joints in 0.55 s, which leaves vision a tenth of a second at the least."""
-    from services.motion.interception import STRATEGIES, Interceptor, Prediction
-    from services.motion.kinematics import Puma, branch_of
-    from services.motion.limits import Guard
+    """From home every throw of A to C can be met by the joints in 0.55 s, which leaves vision a
+    tenth of a second at the least."""
+    from petrobot.services.motion.interception import STRATEGIES, Interceptor, Prediction
+    from petrobot.services.motion.kinematics import Puma, branch_of
+    from petrobot.services.motion.limits import Guard
 
     arm = nominal_arm()
     puma = Puma.of(arm)
     home = arm.poses["home"]
-    interceptor = Interceptor(puma, CELL, Guard(puma, arm, CELL), home, branch_of(puma, np.array(home)))
+    interceptor = Interceptor(
+        puma, CELL, Guard(puma, arm, CELL), home, branch_of(puma, np.array(home))
+    )
     rng = np.random.default_rng(7)
     for low, high in REGIMES.values():
         for _ in range(150):
@@ -183,7 +207,12 @@ def test_the_home_pose_is_near_every_ball() -> None:
             vx, vy, vz = ball.velocity
             prediction = Prediction(ball.time, (0.62, ball.y, 0.62), (vx, vy, vz), 0.0, 0.0)
             plan = interceptor.plan(
-                STRATEGIES["tilted"], prediction, home, [0.0] * 6, arm.speed.tolist(), arm.acceleration.tolist()
+                STRATEGIES["tilted"],
+                prediction,
+                home,
+                [0.0] * 6,
+                arm.speed.tolist(),
+                arm.acceleration.tolist(),
             )
             assert plan is not None
             assert plan.reach < 0.55

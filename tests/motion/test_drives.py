@@ -1,4 +1,5 @@
-"""The simulated drives and inputs as seen from the bus alone: dictionary, state machine, watchdogs in simulated time."""
+"""The simulated drives and inputs as seen from the bus alone: dictionary, state machine, watchdogs
+in simulated time."""
 
 from __future__ import annotations
 
@@ -8,12 +9,30 @@ from typing import Any
 
 import pytest
 
-from services.comm import canopen
-from services.comm.canbus import Frame
-from services.comm.canopen import Abort, NmtCommand, NmtState, SdoAbortError, SdoClient, Transfer, Type
-from services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, State, from_units, state_of, to_units
-from services.motion.drive_link import DriveLink, DriveSettings
-from sim.drives import DriveBus, ratings
+from petrobot.services.comm import canopen
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import (
+    Abort,
+    NmtCommand,
+    NmtState,
+    SdoAbortError,
+    SdoClient,
+    Transfer,
+    Type,
+)
+from petrobot.services.comm.cia402 import (
+    RECEIVED,
+    SENT,
+    Command,
+    Fault,
+    Object,
+    State,
+    from_units,
+    state_of,
+    to_units,
+)
+from petrobot.services.motion.drive_link import DriveLink, DriveSettings
+from petrobot.sim.drives import DriveBus, ratings
 from tests.waiting import Limit
 
 TPDO, RPDO = canopen.pdo_struct(SENT), canopen.pdo_struct(RECEIVED)
@@ -84,14 +103,18 @@ class Bench:
         assert self.state() is State.OPERATION_ENABLED
 
     def status(self) -> tuple[int, float, int]:
-        word, position, torque = TPDO.unpack([frame for frame in self.frames if frame.id == 0x181][-1].data)
+        word, position, torque = TPDO.unpack(
+            [frame for frame in self.frames if frame.id == 0x181][-1].data
+        )
         return word, from_units(position), torque
 
     def state(self) -> State:
         return state_of(self.status()[0])
 
     def emergencies(self) -> list[int]:
-        return [canopen.parse_emergency(frame).code for frame in self.frames if 0x81 <= frame.id <= 0xFF]
+        return [
+            canopen.parse_emergency(frame).code for frame in self.frames if 0x81 <= frame.id <= 0xFF
+        ]
 
 
 @pytest.fixture
@@ -111,10 +134,20 @@ def test_no_process_data_before_the_node_is_started(bench: Bench) -> None:
 def test_the_way_to_operation_state_by_state(bench: Bench) -> None:
     bench.configure()
     seen = []
-    for command in (Command.SHUTDOWN, Command.SWITCH_ON, Command.ENABLE_OPERATION, Command.ENABLE_OPERATION):
+    for command in (
+        Command.SHUTDOWN,
+        Command.SWITCH_ON,
+        Command.ENABLE_OPERATION,
+        Command.ENABLE_OPERATION,
+    ):
         bench.cycle(command.word)
         seen.append(bench.state())
-    assert seen == [State.READY_TO_SWITCH_ON, State.SWITCHED_ON, State.OPERATION_ENABLED, State.OPERATION_ENABLED]
+    assert seen == [
+        State.READY_TO_SWITCH_ON,
+        State.SWITCHED_ON,
+        State.OPERATION_ENABLED,
+        State.OPERATION_ENABLED,
+    ]
     assert not bench.plant.braked[0]
     assert all(bench.plant.braked[1:])
     bench.cycle(Command.DISABLE_VOLTAGE.word, 2)
@@ -167,7 +200,9 @@ def test_abort_codes(bench: Bench, frame: Frame, code: Abort) -> None:
 )
 def test_what_cannot_be_mapped_is_refused(bench: Bench, entry: int, code: Abort) -> None:
     bench.sdo(Transfer(0x1600, 0, Type.UNSIGNED8, 0))
-    assert bench.refused(canopen.sdo_write_request(1, 0x1600, 1, entry.to_bytes(4, "little"))) == code
+    assert (
+        bench.refused(canopen.sdo_write_request(1, 0x1600, 1, entry.to_bytes(4, "little"))) == code
+    )
 
 
 def test_a_mapping_beyond_eight_bytes_is_refused(bench: Bench) -> None:
@@ -278,7 +313,11 @@ def test_open_power_chain_drops_the_brakes_and_forbids_reset(bench: Bench) -> No
     bench.enable()
     bench.bus.power(False)
     assert bench.plant.braked[0]
-    for word in (Command.DISABLE_VOLTAGE.word, Command.FAULT_RESET.word, Command.DISABLE_VOLTAGE.word):
+    for word in (
+        Command.DISABLE_VOLTAGE.word,
+        Command.FAULT_RESET.word,
+        Command.DISABLE_VOLTAGE.word,
+    ):
         bench.cycle(word)
     assert bench.state() is State.FAULT
     assert Fault.UNDERVOLTAGE in bench.emergencies()
@@ -296,7 +335,9 @@ def test_leaving_operational_while_enabled_stops_the_motion(bench: Bench) -> Non
     bench.frames.clear()
     bench.send(canopen.sdo_read_request(1, 0x1000, 0))
     bench.step()
-    assert not [frame for frame in bench.frames if frame.id == 0x581], "a stopped node answers no SDO"
+    assert not [frame for frame in bench.frames if frame.id == 0x581], (
+        "a stopped node answers no SDO"
+    )
 
 
 def test_reset_gives_a_boot_up_and_the_defaults_again(bench: Bench) -> None:
@@ -314,7 +355,9 @@ def test_slow_drives_say_so_and_cut_what_is_too_fast(bench: Bench) -> None:
     rated = bench.sdo(Transfer(Object.MAX_SPEED, 0, Type.UNSIGNED32))
     bench.bus.slow_down(0.5)
     assert rated is not None
-    assert bench.sdo(Transfer(Object.MAX_SPEED, 0, Type.UNSIGNED32)) == pytest.approx(rated / 2, abs=1)
+    assert bench.sdo(Transfer(Object.MAX_SPEED, 0, Type.UNSIGNED32)) == pytest.approx(
+        rated / 2, abs=1
+    )
     bench.target += 0.0055
     bench.cycle(Command.ENABLE_OPERATION.word)
     assert bench.status()[0] & 0x0800
@@ -349,5 +392,8 @@ def test_short_process_data_is_reported_and_not_obeyed(bench: Bench) -> None:
 
 
 def test_abort_errors_name_code_and_object() -> None:
-    assert str(SdoAbortError(Abort.READ_ONLY, 0x6041, 0)) == "SDO abort 0x06010002 (read only) at 0x6041:0"
+    assert (
+        str(SdoAbortError(Abort.READ_ONLY, 0x6041, 0))
+        == "SDO abort 0x06010002 (read only) at 0x6041:0"
+    )
     assert "unknown" in str(SdoAbortError(0x12345678))

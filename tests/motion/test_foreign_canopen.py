@@ -1,4 +1,5 @@
-"""Independent check by the `canopen` package: it masters our drives, and our master runs drives made of it."""
+"""Independent check by the `canopen` package: it masters our drives, and our master runs drives
+made of it."""
 
 from __future__ import annotations
 
@@ -13,17 +14,17 @@ from typing import Any
 import can
 import pytest
 
-from services.comm.can_hub import Hub
-from services.comm.canbus import Frame
-from services.comm.cia402 import Command, Fault, Object, State, command_of, from_units
-from services.motion.drive_link import DriveSettings
-from services.motion.drive_master import DriveMaster, Phase
-from sim.drives import DriveBus, ratings
+from petrobot.services.comm.can_hub import Hub
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.cia402 import Command, Fault, Object, State, command_of, from_units
+from petrobot.services.motion.drive_link import DriveSettings
+from petrobot.services.motion.drive_master import DriveMaster, Phase
+from petrobot.sim.drives import DriveBus, ratings
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
-EDS = str(files("services.comm.eds").joinpath("joint_drive.eds"))
-INPUTS_EDS = str(files("services.comm.eds").joinpath("digital_inputs.eds"))
+EDS = str(files("petrobot.services.comm.eds").joinpath("joint_drive.eds"))
+INPUTS_EDS = str(files("petrobot.services.comm.eds").joinpath("digital_inputs.eds"))
 PATIENCE = 10.0
 
 
@@ -123,7 +124,9 @@ def test_the_canopen_package_masters_our_drive(live: LiveDrives, network: Any) -
         node.rpdo[1].update()
         seen = node.tpdo[1].timestamp
         _until(partial(_changed, node.tpdo[1], seen), f"no TPDO in step {step}")
-    _until(lambda: bool(abs(node.tpdo[1][0x6064].raw - target) < 2000), "the set point was not reached")
+    _until(
+        lambda: bool(abs(node.tpdo[1][0x6064].raw - target) < 2000), "the set point was not reached"
+    )
     assert live.drives.plant.q[0] == pytest.approx(from_units(target), abs=2e-3)
     with pytest.raises(canopen.SdoAbortedError) as refused:
         node.sdo[0x6060].raw = 1
@@ -134,7 +137,8 @@ def test_the_canopen_package_masters_our_drive(live: LiveDrives, network: Any) -
 
 
 class ForeignDrive:
-    """A drive whose protocol is the `canopen` package's LocalNode; the state machine is written here from the standard."""
+    """A drive whose protocol is the `canopen` package's LocalNode; the state machine is written
+    here from the standard."""
 
     WORDS: dict[State, int] = {  # noqa: RUF012
         State.SWITCH_ON_DISABLED: 0x0250,
@@ -170,7 +174,9 @@ class ForeignDrive:
         if self.state is State.OPERATION_ENABLED:
             self.position = self._target
         sent = (
-            self.WORDS[self.state].to_bytes(2, "little") + self.position.to_bytes(4, "little", signed=True) + bytes(2)
+            self.WORDS[self.state].to_bytes(2, "little")
+            + self.position.to_bytes(4, "little", signed=True)
+            + bytes(2)
         )
         self.node.network.send_message(self.node.sdo[0x1800][1].raw & 0x7FF, sent)
 
@@ -189,7 +195,11 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
         moved, now = 0, 0.0
         while moved < 50:
             now += 0.004  # never faster than the wall's clock, by which the foreign nodes live
-            assert now < PATIENCE, (master.phase, master.troubles, [drive.state for drive in master.drives])
+            assert now < PATIENCE, (
+                master.phase,
+                master.troubles,
+                [drive.state for drive in master.drives],
+            )
             while (message := bus.recv(timeout=0.0)) is not None:
                 master.receive(now, Frame(message.arbitration_id, bytes(message.data)))
             if master.enabled:
@@ -198,7 +208,9 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
             elif master.phase is Phase.RUNNING:
                 targets = master.positions
             for frame in master.advance(now, targets):
-                bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
+                bus.send(
+                    can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
+                )
             pause.wait(0.004)
         assert not master.troubles
         for drive, target in zip(drives, targets, strict=True):

@@ -1,4 +1,5 @@
-"""Choosing catching poses: the cup is where the ball will be, in time, clear of the table, and without jumps."""
+"""Choosing catching poses: the cup is where the ball will be, in time, clear of the table, and
+without jumps."""
 
 from __future__ import annotations
 
@@ -10,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.motion.interception import STRATEGIES, Interceptor, Plan, Prediction
-from services.motion.kinematics import Puma, branch_of
-from services.motion.limits import Guard
-from services.motion.model import nominal_arm, nominal_cell
-from services.motion.trajectory import reach_time
+from petrobot.services.motion.interception import STRATEGIES, Interceptor, Plan, Prediction
+from petrobot.services.motion.kinematics import Puma, branch_of
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import nominal_arm, nominal_cell
+from petrobot.services.motion.trajectory import reach_time
 
 ARM, CELL = nominal_arm(), nominal_cell()
 PUMA = Puma.of(ARM)
@@ -25,14 +26,22 @@ STILL = (0.0,) * 6
 SPEED, ACCELERATION = ARM.speed.tolist(), ARM.acceleration.tolist()
 
 
-def _exit(y: float, speed: float, heading: float, time_to_go: float = 0.5, sigma_y: float = 0.0) -> Prediction:
+def _exit(
+    y: float, speed: float, heading: float, time_to_go: float = 0.5, sigma_y: float = 0.0
+) -> Prediction:
     """A ball that leaves the edge at `y`, `heading` rad off the straight way."""
     velocity = (-speed * math.cos(heading), speed * math.sin(heading), 0.0)
-    return Prediction(time_to_go, (CELL.near_edge, y, CELL.table_top + CELL.ball_radius), velocity, sigma_y, 0.0)
+    return Prediction(
+        time_to_go, (CELL.near_edge, y, CELL.table_top + CELL.ball_radius), velocity, sigma_y, 0.0
+    )
 
 
-def _plan(prediction: Prediction, strategy: str = "tilted", before: Plan | None = None) -> Plan | None:
-    return INTERCEPTOR.plan(STRATEGIES[strategy], prediction, HOME, STILL, SPEED, ACCELERATION, before)
+def _plan(
+    prediction: Prediction, strategy: str = "tilted", before: Plan | None = None
+) -> Plan | None:
+    return INTERCEPTOR.plan(
+        STRATEGIES[strategy], prediction, HOME, STILL, SPEED, ACCELERATION, before
+    )
 
 
 THROWS = st.builds(_exit, st.floats(-0.3, 0.3), st.floats(0.4, 2.45), st.floats(-0.2, 0.2))
@@ -40,7 +49,9 @@ THROWS = st.builds(_exit, st.floats(-0.3, 0.3), st.floats(0.4, 2.45), st.floats(
 
 @settings(max_examples=60)
 @given(THROWS, st.sampled_from(["tilted", "upright"]))
-def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(prediction: Prediction, strategy: str) -> None:
+def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(
+    prediction: Prediction, strategy: str
+) -> None:
     plan = _plan(prediction, strategy)
     assert plan is not None
     pose = PUMA.forward(np.array(plan.q))
@@ -51,8 +62,11 @@ def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(predicti
     fall = plan.arrival - prediction.time_to_go
     x, y, z = prediction.point
     vx, vy, _ = prediction.velocity
-    assert np.allclose(plan.point, (x + vx * fall, y + vy * fall, z - 0.5 * CELL.gravity * fall**2), atol=1e-9)
-    # The cup is held as the strategy says, against the ball, and the pose is clear and on the arm's own branch.
+    assert np.allclose(
+        plan.point, (x + vx * fall, y + vy * fall, z - 0.5 * CELL.gravity * fall**2), atol=1e-9
+    )
+    # The cup is held as the strategy says, against the ball, and the pose is clear and on the arm's
+    # own branch.
     assert axis[2] == pytest.approx(math.cos(STRATEGIES[strategy].tilt))
     assert axis[0] * vx + axis[1] * vy <= 1e-12
     assert GUARD.violation(plan.q) == ""
@@ -68,7 +82,9 @@ def test_every_nominal_ball_has_a_pose_on_its_way_that_the_arm_can_take(predicti
 
 @settings(max_examples=60)
 @given(THROWS, st.floats(-0.001, 0.001), st.floats(-0.005, 0.005))
-def test_small_changes_of_the_prediction_move_the_pose_a_little(prediction: Prediction, dy: float, dv: float) -> None:
+def test_small_changes_of_the_prediction_move_the_pose_a_little(
+    prediction: Prediction, dy: float, dv: float
+) -> None:
     first = _plan(prediction)
     assert first is not None
     x, y, z = prediction.point
@@ -79,7 +95,8 @@ def test_small_changes_of_the_prediction_move_the_pose_a_little(prediction: Pred
     if second.candidate == first.candidate:
         assert np.abs(np.subtract(second.q, first.q)).max() < 0.05
         return
-    # Another candidate is taken only where limits or guard forbid the old one now, or have forbidden the new one before.
+    # Another candidate is taken only where limits or guard forbid the old one now, or have
+    # forbidden the new one before.
     assert _alone(first.candidate, changed) is None or _alone(second.candidate, prediction) is None
 
 
@@ -97,7 +114,13 @@ def test_a_cup_in_place_stays_there_until_the_ball_comes(strategy: str) -> None:
     assert far is not None
     for time_to_go in (0.5, 0.2, 0.05, 0.0, 0.04 - far.arrival + 1.0):
         near = INTERCEPTOR.plan(
-            STRATEGIES[strategy], _exit(0.1, 1.2, 0.0, time_to_go), far.q, STILL, SPEED, ACCELERATION, far
+            STRATEGIES[strategy],
+            _exit(0.1, 1.2, 0.0, time_to_go),
+            far.q,
+            STILL,
+            SPEED,
+            ACCELERATION,
+            far,
         )
         assert near is not None
         assert near.candidate == far.candidate

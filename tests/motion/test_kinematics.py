@@ -13,14 +13,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.motion.kinematics import BRANCHES, Puma, branch_of
-from services.motion.model import nominal_arm
+from petrobot.services.motion.kinematics import BRANCHES, Puma, branch_of
+from petrobot.services.motion.model import nominal_arm
 
-GOLDEN: dict[str, Any] = json.loads(Path(__file__).with_name("puma560_golden.json").read_text(encoding="utf-8"))
+GOLDEN: dict[str, Any] = json.loads(
+    Path(__file__).with_name("puma560_golden.json").read_text(encoding="utf-8")
+)
 MODEL = nominal_arm()
 PUMA = Puma.of(MODEL)
 ANGLES = st.tuples(
-    *(st.floats(low, high) for low, high in zip(MODEL.lower.tolist(), MODEL.upper.tolist(), strict=True))
+    *(
+        st.floats(low, high)
+        for low, high in zip(MODEL.lower.tolist(), MODEL.upper.tolist(), strict=True)
+    )
 )
 
 
@@ -36,18 +41,27 @@ def test_jacobian_agrees_with_the_robotics_toolbox() -> None:
 
 
 def _urdf() -> str:
-    """The arm as URDF: the joint of DH row i turns about z of frame i - 1, and carries Tz(d) Tx(a) Rx(alpha) behind it."""
-    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    """The arm as URDF: the joint of DH row i turns about z of frame i - 1, and carries Tz(d) Tx(a)
+    Rx(alpha) behind it."""
+    inertial = (
+        '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" '
+        'iyz="0"/></inertial>'
+    )
     parts = [f'<link name="l{number}">{inertial}</link>' for number in range(8)]
     xyz, roll = "0 0 0", 0.0
     for number in range(6):
         parts.append(
-            f'<joint name="j{number}" type="continuous"><parent link="l{number}"/><child link="l{number + 1}"/>'
+            f'<joint name="j{number}" type="continuous"><parent link="l{number}"/><child '
+            f'link="l{number + 1}"/>'
             f'<origin xyz="{xyz}" rpy="{roll!r} 0 0"/><axis xyz="0 0 1"/></joint>'
         )
-        xyz, roll = f"{float(MODEL.a[number])!r} 0 {float(MODEL.d[number])!r}", float(MODEL.alpha[number])
+        xyz, roll = (
+            f"{float(MODEL.a[number])!r} 0 {float(MODEL.d[number])!r}",
+            float(MODEL.alpha[number]),
+        )
     parts.append(
-        f'<joint name="flange" type="fixed"><parent link="l6"/><child link="l7"/><origin xyz="{xyz}" rpy="{roll!r} 0 0"/></joint>'
+        '<joint name="flange" type="fixed"><parent link="l6"/><child link="l7"/><origin '
+        f'xyz="{xyz}" rpy="{roll!r} 0 0"/></joint>'
     )
     return f'<robot name="puma">{"".join(parts)}</robot>'
 
@@ -61,7 +75,9 @@ def test_forward_agrees_with_pybullet(tmp_path: Path) -> None:
         for case in GOLDEN["cases"]:
             for joint, angle in enumerate(case["q"]):
                 pybullet.resetJointState(body, joint, angle, physicsClientId=client)
-            state = pybullet.getLinkState(body, 6, computeForwardKinematics=1, physicsClientId=client)
+            state = pybullet.getLinkState(
+                body, 6, computeForwardKinematics=1, physicsClientId=client
+            )
             pose = PUMA.forward(np.array(case["q"]))
             assert np.abs(np.array(state[4]) - pose[:3, 3]).max() < 1e-6
             turn = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
@@ -98,7 +114,9 @@ def test_the_pose_that_was_asked_for_is_among_the_solutions(angles: tuple[float,
 
 def test_eight_solutions_are_eight() -> None:
     """Without joint limits a pose inside the workspace has all eight, all different."""
-    free = Puma(PUMA.d1, PUMA.a2, PUMA.a3, PUMA.d3, PUMA.d4, np.full(6, -math.pi), np.full(6, math.pi))
+    free = Puma(
+        PUMA.d1, PUMA.a2, PUMA.a3, PUMA.d3, PUMA.d4, np.full(6, -math.pi), np.full(6, math.pi)
+    )
     q = np.array([0.3, 0.6, -2.4, 0.4, 0.8, -0.5])
     solutions = free.inverse(free.forward(q))
     assert not np.isnan(solutions).any()
@@ -136,7 +154,10 @@ def test_jacobian_is_the_derivative(angles: tuple[float, ...]) -> None:
         before, after = PUMA.forward(q - step), PUMA.forward(q + step)
         assert np.abs((after - before)[:3, 3] / (2 * h) - jacobian[:3, joint]).max() < 1e-7
         spin = (after - before)[:3, :3] / (2 * h) @ PUMA.forward(q)[:3, :3].T
-        assert np.abs(np.array([spin[2, 1], spin[0, 2], spin[1, 0]]) - jacobian[3:, joint]).max() < 1e-7
+        assert (
+            np.abs(np.array([spin[2, 1], spin[0, 2], spin[1, 0]]) - jacobian[3:, joint]).max()
+            < 1e-7
+        )
 
 
 def test_batches_give_what_single_poses_give() -> None:

@@ -7,19 +7,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm.compiled import COMPILED, plain
-from services.motion.clearance import Point, clear, clear_step
-from services.motion.kinematics import Puma
-from services.motion.limits import LOOKS, NEAR, Guard
-from services.motion.model import nominal_arm, nominal_cell
-from services.motion.steering import CLOSER, Steering
-from services.motion.trajectory import Six, Trajectory, six
+from petrobot.services.comm.compiled import COMPILED, plain
+from petrobot.services.motion.clearance import Point, clear, clear_step
+from petrobot.services.motion.kinematics import Puma
+from petrobot.services.motion.limits import LOOKS, NEAR, Guard
+from petrobot.services.motion.model import nominal_arm, nominal_cell
+from petrobot.services.motion.steering import CLOSER, Steering
+from petrobot.services.motion.trajectory import Six, Trajectory, six
 
 ARM, CELL = nominal_arm(), nominal_cell()
 PUMA = Puma.of(ARM)
 GUARD = Guard(PUMA, ARM, CELL)
 HOME = np.array(ARM.poses["home"])
-ANGLES = st.tuples(*(st.floats(low, high) for low, high in zip(ARM.lower.tolist(), ARM.upper.tolist(), strict=True)))
+ANGLES = st.tuples(
+    *(
+        st.floats(low, high)
+        for low, high in zip(ARM.lower.tolist(), ARM.upper.tolist(), strict=True)
+    )
+)
 NEARBY = st.tuples(*(st.floats(-0.9, 0.9) for _ in range(6)))
 
 
@@ -40,13 +45,17 @@ def _surface(q: np.ndarray) -> np.ndarray:
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    ring = (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second) * (CELL.cup.radius + CELL.cup.wall)
+    ring = (np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second) * (
+        CELL.cup.radius + CELL.cup.wall
+    )
     heights = np.linspace(0.0, CELL.cup.depth + CELL.cup.wall, 5)
     return np.concatenate([np.array(at.mouth) - height * axis + ring for height in heights])
 
 
 @given(NEARBY)
-def test_a_pose_that_counts_as_clear_has_no_part_of_the_cup_in_the_table(offset: tuple[float, ...]) -> None:
+def test_a_pose_that_counts_as_clear_has_no_part_of_the_cup_in_the_table(
+    offset: tuple[float, ...],
+) -> None:
     q = HOME + offset
     if GUARD.violation(q.tolist()):
         return
@@ -59,14 +68,18 @@ def test_a_pose_that_counts_as_clear_has_no_part_of_the_cup_in_the_table(offset:
 
 @settings(max_examples=12)
 @given(st.lists(st.tuples(NEARBY, st.integers(5, 90)), min_size=2, max_size=8))
-def test_no_sequence_of_set_points_passes_the_guard(steps: list[tuple[tuple[float, ...], int]]) -> None:
+def test_no_sequence_of_set_points_passes_the_guard(
+    steps: list[tuple[tuple[float, ...], int]],
+) -> None:
     trajectory = Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
     for offset, cycles in steps:
         trajectory.aim((HOME + offset).tolist())
         for _ in range(cycles):
             before = trajectory.qd
             GUARD.advance(trajectory)
-            assert np.all(np.abs(np.subtract(trajectory.qd, before)) <= ARM.acceleration * 0.004 * (1 + 1e-9))
+            assert np.all(
+                np.abs(np.subtract(trajectory.qd, before)) <= ARM.acceleration * 0.004 * (1 + 1e-9)
+            )
             assert np.all(np.abs(trajectory.qd) <= ARM.speed * (1 + 1e-9))
             # 5 mm of margin are left to what happens between the poses that are looked at.
             points = _surface(np.array(trajectory.q))
@@ -109,7 +122,9 @@ def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_creeping() -> None:
     steering.move(HOME.tolist())
     fastest, close = np.zeros(6), GUARD.closer(CLOSER)
     for _ in range(1000):
-        before = close.violation(steering.trajectory.resting(steering.trajectory.q, steering.trajectory.qd))
+        before = close.violation(
+            steering.trajectory.resting(steering.trajectory.q, steering.trajectory.qd)
+        )
         steering.cycle()
         if before:
             assert close.violation(stuck.tolist())
@@ -140,21 +155,28 @@ class Thorough(Guard):
 def test_an_arm_that_is_far_from_everything_touches_nothing(angles: tuple[float, ...]) -> None:
     """The short cuts for an arm that is far away never hide a touch."""
     for margins in ((0.0, 0.0), (0.005, 0.01), (0.05, 0.05)):
-        assert Guard(PUMA, ARM, CELL, *margins).violation(angles) == Thorough(PUMA, ARM, CELL, *margins).violation(
-            angles
-        )
+        assert Guard(PUMA, ARM, CELL, *margins).violation(angles) == Thorough(
+            PUMA, ARM, CELL, *margins
+        ).violation(angles)
 
 
 @settings(max_examples=40)
 @given(NEARBY, st.integers(1, 60))
-def test_a_rest_pose_found_clear_is_not_taken_for_another_arms(offset: tuple[float, ...], cycles: int) -> None:
+def test_a_rest_pose_found_clear_is_not_taken_for_another_arms(
+    offset: tuple[float, ...], cycles: int
+) -> None:
     guard = Guard(PUMA, ARM, CELL)
-    moving, stuck = (Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist()) for _ in range(2))
+    moving, stuck = (
+        Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
+        for _ in range(2)
+    )
     moving.aim((HOME + offset).tolist())
     stuck.reset(np.radians([18.7, 30.0, -190.0, 6.7, 48.6, 3.4]).tolist())
     for _ in range(cycles):
         guard.advance(moving)
-        assert guard.stops_clear(moving) == (GUARD.violation(moving.resting(moving.q, moving.qd)) == "")
+        assert guard.stops_clear(moving) == (
+            GUARD.violation(moving.resting(moving.q, moving.qd)) == ""
+        )
         assert not guard.stops_clear(stuck)
 
 

@@ -1,4 +1,5 @@
-"""The arm's numbers: the file is read whole, faults are named, and the accelerations can be had for the torques."""
+"""The arm's numbers: the file is read whole, faults are named, and the accelerations can be had for
+the torques."""
 
 from __future__ import annotations
 
@@ -9,12 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.motion.kinematics import Puma
-from services.motion.limits import Guard
-from services.motion.model import ModelError, nominal_arm, nominal_cell, read_arm, read_cell
+from petrobot.services.motion.kinematics import Puma
+from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.model import (
+    ModelError,
+    nominal_arm,
+    nominal_cell,
+    read_arm,
+    read_cell,
+)
 
-ARM = files("services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
-CELL = files("services").joinpath("cell.toml").read_text(encoding="utf-8")
+ARM = files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
+CELL = files("petrobot.services").joinpath("cell.toml").read_text(encoding="utf-8")
 
 
 def test_the_nominal_arm_is_the_published_one() -> None:
@@ -32,7 +39,11 @@ def test_the_nominal_arm_is_the_published_one() -> None:
         ("torque = 186.4", 'torque = "much"', "joint 2: torque must be a finite number"),
         ("wrist = 0.055", "", "body: wrist must be a finite number"),
         ("home = [18.7", "home = [180.0", "home lies outside the joint limits"),
-        ("[[link]]\nmass = 17.4", "[[spare]]\nmass = 17.4", "needs 6 [[joint]] and [[link]], has 6 and 5"),
+        (
+            "[[link]]\nmass = 17.4",
+            "[[spare]]\nmass = 17.4",
+            "needs 6 [[joint]] and [[link]], has 6 and 5",
+        ),
     ],
 )
 def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
@@ -62,15 +73,21 @@ def test_kinematics_refuses_another_arm() -> None:
 
 
 def test_the_accelerations_can_be_had_for_the_torques() -> None:
-    """Inertia and gravity of the independent model, friction of ours: at home every joint may accelerate at its limit, all
-    together in any combination of signs, while it turns at its greatest speed."""
+    """Inertia and gravity of the independent model, friction of ours: at home every joint may
+    accelerate at its limit, all together in any combination of signs, while it turns at its
+    greatest speed."""
     golden = json.loads(Path(__file__).with_name("puma560_golden.json").read_text(encoding="utf-8"))
     arm = nominal_arm()
     home = golden["home"]
-    assert np.allclose(home["q"], arm.poses["home"], atol=1e-9), "make the fixture again: the home pose has changed"
+    assert np.allclose(home["q"], arm.poses["home"], atol=1e-9), (
+        "make the fixture again: the home pose has changed"
+    )
     inertia, gravity = np.array(home["inertia"]), np.abs(home["gravity"])
     needed = (
-        np.abs(inertia) @ arm.acceleration + gravity + arm.coulomb * arm.gear + arm.viscous * arm.gear**2 * arm.speed
+        np.abs(inertia) @ arm.acceleration
+        + gravity
+        + arm.coulomb * arm.gear
+        + arm.viscous * arm.gear**2 * arm.speed
     )
     assert np.all(needed <= arm.torque), (needed / arm.torque).tolist()
 

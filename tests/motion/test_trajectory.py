@@ -1,4 +1,5 @@
-"""Online trajectories: limits for any sequence of targets, exact and nearly time-optimal arrival."""
+"""Online trajectories: limits for any sequence of targets, exact and nearly time-optimal
+arrival."""
 
 from __future__ import annotations
 
@@ -9,8 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.motion.model import nominal_arm
-from services.motion.trajectory import Trajectory, braking_distance, reach_time, synchronised
+from petrobot.services.motion.model import nominal_arm
+from petrobot.services.motion.trajectory import (
+    Trajectory,
+    braking_distance,
+    reach_time,
+    synchronised,
+)
 from tests.waiting import Limit
 
 ARM = nominal_arm()
@@ -29,7 +35,9 @@ def _advance(trajectory: Trajectory) -> None:
 
 @settings(max_examples=40)
 @given(st.lists(STEP, min_size=1, max_size=12))
-def test_limits_hold_for_any_sequence_of_targets(steps: list[tuple[list[float] | None, int]]) -> None:
+def test_limits_hold_for_any_sequence_of_targets(
+    steps: list[tuple[list[float] | None, int]],
+) -> None:
     trajectory = _trajectory()
     for target, cycles in steps:
         trajectory.aim(target)
@@ -39,7 +47,9 @@ def test_limits_hold_for_any_sequence_of_targets(steps: list[tuple[list[float] |
             change = np.abs(np.subtract(trajectory.qd, qd))
             assert np.all(np.abs(trajectory.qd) <= ARM.speed * (1 + 1e-9))
             assert np.all(change <= ARM.acceleration * PERIOD * (1 + 1e-9))
-            assert np.allclose(np.subtract(trajectory.q, q), 0.5 * PERIOD * np.add(trajectory.qd, qd), atol=1e-12)
+            assert np.allclose(
+                np.subtract(trajectory.q, q), 0.5 * PERIOD * np.add(trajectory.qd, qd), atol=1e-12
+            )
 
 
 @settings(max_examples=40)
@@ -52,7 +62,9 @@ def test_it_arrives_exactly_and_nearly_as_soon_as_can_be(
         trajectory.aim(before)
         for _ in range(cycles):
             _advance(trajectory)
-    least = reach_time(np.subtract(target, trajectory.q), np.array(trajectory.qd), ARM.speed, ARM.acceleration)
+    least = reach_time(
+        np.subtract(target, trajectory.q), np.array(trajectory.qd), ARM.speed, ARM.acceleration
+    )
     trajectory.aim(target)
     arrived = [math.inf] * 6
     for cycle in range(1, math.ceil(float(least.max()) / PERIOD) + 4):
@@ -80,7 +92,9 @@ def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int)
         trajectory.accept(*trajectory.braking())
         path.append(trajectory.q)
     for number, pose in enumerate(path):
-        assert np.allclose(next(trajectory.stopping(q, qd, number / max(len(path) - 1, 1))), pose, atol=1e-9)
+        assert np.allclose(
+            next(trajectory.stopping(q, qd, number / max(len(path) - 1, 1))), pose, atol=1e-9
+        )
     assert trajectory.still
     assert np.allclose(trajectory.q, rest, atol=1e-9)
 
@@ -89,14 +103,21 @@ def test_braking_ends_where_it_was_said_to_end(target: list[float], cycles: int)
 def test_from_rest_the_time_is_that_of_the_textbook(distance: float) -> None:
     speed, acceleration = ARM.speed, ARM.acceleration
     ramp = speed * speed / acceleration
-    expected = np.where(distance < ramp, 2 * np.sqrt(distance / acceleration), speed / acceleration + distance / speed)
+    expected = np.where(
+        distance < ramp,
+        2 * np.sqrt(distance / acceleration),
+        speed / acceleration + distance / speed,
+    )
     assert np.allclose(reach_time(np.full(6, distance), np.zeros(6), speed, acceleration), expected)
-    assert np.allclose(reach_time(np.full(6, -distance), np.zeros(6), speed, acceleration), expected)
+    assert np.allclose(
+        reach_time(np.full(6, -distance), np.zeros(6), speed, acceleration), expected
+    )
 
 
 def test_overshoot_is_counted_when_the_joint_is_too_fast_to_stop() -> None:
     one = np.ones(1)
-    # 1 rad/s towards a target 0.1 rad ahead at 1 rad/s^2: rests 0.5 m ahead after 1 s, then 0.4 rad back.
+    # 1 rad/s towards a target 0.1 rad ahead at 1 rad/s^2: rests 0.5 m ahead after 1 s, then 0.4 rad
+    # back.
     assert reach_time(0.1 * one, one, 2 * one, one)[0] == pytest.approx(1.0 + 2 * math.sqrt(0.4))
 
 

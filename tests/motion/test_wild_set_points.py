@@ -1,6 +1,8 @@
-"""No set point, however wild, takes the arm past table, floor, pedestal, joint limits, speeds or accelerations.
+"""No set point, however wild, takes the arm past table, floor, pedestal, joint limits, speeds or
+accelerations.
 
-What is touched is judged by points all over cup and forearm, apart from the guard that is to prevent it.
+What is touched is judged by points all over cup and forearm, apart from the guard that is to
+prevent it.
 """
 
 from __future__ import annotations
@@ -12,8 +14,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.motion.kinematics import Puma
-from services.motion.model import nominal_arm, nominal_cell
+from petrobot.services.motion.kinematics import Puma
+from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 Array = NDArray[np.float64]
 
@@ -42,7 +44,9 @@ MONSTERS = [
 
 def _numbers(low: float, high: float) -> st.SearchStrategy[float]:
     """Mostly what could be a set point; sometimes what never can."""
-    return st.one_of(st.floats(low, high), st.floats(low, high), st.floats(), st.sampled_from(MONSTERS))
+    return st.one_of(
+        st.floats(low, high), st.floats(low, high), st.floats(), st.sampled_from(MONSTERS)
+    )
 
 
 POINTS = st.tuples(
@@ -58,21 +62,30 @@ POINTS = st.tuples(
 )
 POSES = st.one_of(
     st.lists(_numbers(-6.0, 6.0), min_size=6, max_size=6),
-    st.tuples(*(st.floats(lo, hi) for lo, hi in zip(ARM.lower.tolist(), ARM.upper.tolist(), strict=True))).map(list),
+    st.tuples(
+        *(st.floats(lo, hi) for lo, hi in zip(ARM.lower.tolist(), ARM.upper.tolist(), strict=True))
+    ).map(list),
     st.sampled_from(["home", "empty", "ready"]),
 )
 COMMANDS = st.one_of(
-    st.builds(lambda name: {"do": "follow", "strategy": name}, st.sampled_from(["tilted", "upright"])),
-    st.builds(lambda pose, speed: {"do": "move", "pose": pose, "speed": speed}, POSES, _numbers(0.1, 1.0)),
+    st.builds(
+        lambda name: {"do": "follow", "strategy": name}, st.sampled_from(["tilted", "upright"])
+    ),
+    st.builds(
+        lambda pose, speed: {"do": "move", "pose": pose, "speed": speed}, POSES, _numbers(0.1, 1.0)
+    ),
     st.just({"do": "hold"}),
 )
 STEPS = st.lists(
-    st.tuples(COMMANDS, st.lists(POINTS, min_size=1, max_size=6), st.integers(5, 60)), min_size=1, max_size=6
+    st.tuples(COMMANDS, st.lists(POINTS, min_size=1, max_size=6), st.integers(5, 60)),
+    min_size=1,
+    max_size=6,
 )
 
 
 def _solid(q: Array) -> Array:
-    """Points (n, 3) of the outside of cup and forearm (m, base frame) at a joint pose, by the kinematics alone."""
+    """Points (n, 3) of the outside of cup and forearm (m, base frame) at a joint pose, by the
+    kinematics alone."""
     frame = PUMA.forward(q)
     turn, wrist = frame[:3, :3], frame[:3, 3]
     mouth, axis = turn @ CELL.cup.mouth + wrist, turn @ CELL.cup.axis
@@ -105,11 +118,14 @@ def _check(commanded: list[list[float]]) -> None:
     assert np.all(np.abs(np.diff(qd, axis=0)) / CYCLE <= ARM.acceleration * (1 + 1e-6))
     for pose in q[np.append(True, np.any(qd != 0.0, axis=1))]:
         points = _solid(pose)
-        assert not np.any((points[:, 0] > CELL.near_edge) & (points[:, 2] < CELL.table_top)), "in the table"
+        assert not np.any((points[:, 0] > CELL.near_edge) & (points[:, 2] < CELL.table_top)), (
+            "in the table"
+        )
         assert points[:, 2].min() > 0.0, "in the floor"
 
 
-# a failing arm session is long: making it smaller would take minutes, and it shows what is wrong as it is
+# a failing arm session is long: making it smaller would take minutes, and it shows what is wrong as
+# it is
 @settings(
     max_examples=25,
     deadline=None,
@@ -117,7 +133,9 @@ def _check(commanded: list[list[float]]) -> None:
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(STEPS)
-def test_no_set_point_takes_the_arm_past_its_limits(make_rig: Any, steps: list[tuple[Any, list[Any], int]]) -> None:
+def test_no_set_point_takes_the_arm_past_its_limits(
+    make_rig: Any, steps: list[tuple[Any, list[Any], int]]
+) -> None:
     rig = make_rig().enable()
     begun = len(rig.commanded)
     for body, points, cycles in steps:

@@ -1,4 +1,5 @@
-"""A clock that a test moves, a device that takes its time to stop, and a runner driven tick by tick."""
+"""A clock that a test moves, a device that takes its time to stop, and a runner driven tick by
+tick."""
 
 from __future__ import annotations
 
@@ -10,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from services.comm.directory import ActionEntry
-from services.comm.party import TICK
-from services.runner import Runner
-from services.runs import Answered, Begin, Ended, Order, Report
+from petrobot.services.comm.directory import ActionEntry
+from petrobot.services.comm.party import TICK
+from petrobot.services.runner import Runner
+from petrobot.services.runs import Answered, Begin, Ended, Order, Report
 
 OUTSIDE = Path(__file__).parent / "outside"
 """Stands for the folder of a laboratory's own packages."""
@@ -32,7 +33,8 @@ class Clock:
 
 @dataclass
 class Device:
-    """A device under test: moves while told to, comes to rest `halting` seconds after its stop routine (None: never)."""
+    """A device under test: moves while told to, comes to rest `halting` seconds after its stop
+    routine (None: never)."""
 
     clock: Clock
     halting: float | None = 0.1
@@ -47,7 +49,12 @@ class Device:
         self.stops.append(now)
 
     def stopped(self) -> bool:
-        if self.moving and self.stops and self.halting is not None and self.clock.now >= self.stops[0] + self.halting:
+        if (
+            self.moving
+            and self.stops
+            and self.halting is not None
+            and self.clock.now >= self.stops[0] + self.halting
+        ):
             self.moving = False
         return not self.moving
 
@@ -62,7 +69,9 @@ class Bench:
     seen: list[Report] = field(default_factory=list)
     begun: int = 0
 
-    def begin(self, action: str, deadline: float | None = None, seed: int = 1, **arguments: Any) -> str:
+    def begin(
+        self, action: str, deadline: float | None = None, seed: int = 1, **arguments: Any
+    ) -> str:
         self.begun += 1
         identity = f"run{self.begun}"
         self.runner.take(self.clock.now, Begin(identity, action, arguments, deadline, seed))
@@ -95,19 +104,37 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Callable[..., Bench]:
-    """Makes a bench: `bench(name=function, ...)`, with a device if `device=True` or one is given."""
+    """Makes a bench: `bench(name=function, ...)`, with a device if `device=True` or one is
+    given."""
 
-    def make(device: Any = None, virtual: bool = True, limits: dict[str, Any] | None = None, **actions: Any) -> Bench:
+    def make(
+        device: Any = None,
+        virtual: bool = True,
+        limits: dict[str, Any] | None = None,
+        **actions: Any,
+    ) -> Bench:
         clock = Clock()
         owner = Device(clock) if device is True else device
         if owner is not None:
             owner.clock = clock
         entries = {
-            name: ActionEntry(name, "tests:none", "task", "here", "it" if owner else "", **(limits or {}).get(name, {}))
+            name: ActionEntry(
+                name,
+                "tests:none",
+                "task",
+                "here",
+                "it" if owner else "",
+                **(limits or {}).get(name, {}),
+            )
             for name in actions
         }
         runner = Runner(
-            entries, clock=clock, device=owner, streams={"points": 0.02}, substitutes=actions, virtual=virtual
+            entries,
+            clock=clock,
+            device=owner,
+            streams={"points": 0.02},
+            substitutes=actions,
+            virtual=virtual,
         )
         return Bench(clock, owner, runner)
 

@@ -1,4 +1,5 @@
-"""What user code does wrong ends its own run alone: what it leaves behind, how it blocks, what it takes, and who is spared."""
+"""What user code does wrong ends its own run alone: what it leaves behind, how it blocks, what it
+takes, and who is spared."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from tests.node.test_processes import CELL, PATIENCE, Nodes, Operator, alive, op
 pytestmark = pytest.mark.processes
 DEADLINE = 1.0
 LATE = 5.0
-"""Seconds after its deadline in which a run must have ended, on a host as busy as this: grace, kill, and a margin."""
+"""Seconds after its deadline in which a run must have ended, on a host as busy as this: grace,
+kill, and a margin."""
 TEXT = (
     CELL.replace("worker_memory_mb = 900\n", "worker_memory_mb = 900\nworkers = 6\n")
     + """\
@@ -59,7 +61,9 @@ async def gone(operator: Operator, process: int) -> None:
 
 
 @pytest.mark.parametrize("how", WAYS)
-async def test_a_deadline_holds_whatever_was_left_behind(operator: Operator, tmp_path: Path, how: str) -> None:
+async def test_a_deadline_holds_whatever_was_left_behind(
+    operator: Operator, tmp_path: Path, how: str
+) -> None:
     for service in PLACES:
         mark = tmp_path / f"{service} {how}"
         began = time.monotonic()
@@ -74,7 +78,9 @@ async def test_a_deadline_holds_whatever_was_left_behind(operator: Operator, tmp
 
 
 @pytest.mark.parametrize("how", WAYS)
-async def test_what_a_crashed_worker_left_ends_with_it(operator: Operator, tmp_path: Path, how: str) -> None:
+async def test_what_a_crashed_worker_left_ends_with_it(
+    operator: Operator, tmp_path: Path, how: str
+) -> None:
     for service in PLACES:
         mark = tmp_path / f"{service} {how}"
         end = await operator.call(service, PATIENCE, how=how, mark=str(mark), then="crash")
@@ -83,7 +89,9 @@ async def test_what_a_crashed_worker_left_ends_with_it(operator: Operator, tmp_p
 
 
 @pytest.mark.parametrize("way", ["worker killed", "node killed", "node stopped"])
-async def test_what_an_action_left_lives_as_long_as_its_worker(nodes: Nodes, tmp_path: Path, way: str) -> None:
+async def test_what_an_action_left_lives_as_long_as_its_worker(
+    nodes: Nodes, tmp_path: Path, way: str
+) -> None:
     async with operator_of(nodes.directory, "left", "right") as operator:
         left, workers = [], []
         for how in WAYS:
@@ -106,7 +114,9 @@ async def test_what_an_action_left_lives_as_long_as_its_worker(nodes: Nodes, tmp
             await gone(operator, process)
 
 
-async def test_an_action_that_closes_its_pipe_ends_alone(operator: Operator, tmp_path: Path) -> None:
+async def test_an_action_that_closes_its_pipe_ends_alone(
+    operator: Operator, tmp_path: Path
+) -> None:
     for then in ("block", "return"):
         mark = tmp_path / then
         began = time.monotonic()
@@ -117,13 +127,17 @@ async def test_an_action_that_closes_its_pipe_ends_alone(operator: Operator, tmp
     assert (await operator.call("add", a=1)).values == {"sum": 2}
 
 
-async def test_a_copy_that_returns_from_the_action_does_nothing_more(operator: Operator, tmp_path: Path) -> None:
+async def test_a_copy_that_returns_from_the_action_does_nothing_more(
+    operator: Operator, tmp_path: Path
+) -> None:
     for number, service in enumerate(PLACES):
         mark = tmp_path / f"{number}"
         end = await operator.call(service, 10.0, how="fork that returns", mark=str(mark))
         assert (end.status, end.values["pid"]) == ("success", int(mark.read_text()))
     assert (await operator.call("add", a=1)).values == {"sum": 2}
-    assert (await operator.call("go", to=0.5)).status == "success", "a copy has stopped the device, or taken its link"
+    assert (await operator.call("go", to=0.5)).status == "success", (
+        "a copy has stopped the device, or taken its link"
+    )
 
 
 async def test_a_stopped_worker_is_killed_at_the_deadline(operator: Operator) -> None:
@@ -140,10 +154,12 @@ async def test_a_stopped_worker_is_killed_at_the_deadline(operator: Operator) ->
 
 
 async def test_one_that_blocks_and_one_that_crashes_end_alone(operator: Operator) -> None:
-    # The workers are started beforehand: how long that takes on a busy host is not what this is about.
-    assert {run.status for run in await asyncio.gather(*(operator.call("nap", seconds=1.0) for _ in range(5)))} == {
-        "success"
-    }
+    # The workers are started beforehand: how long that takes on a busy host is not what this is
+    # about.
+    assert {
+        run.status
+        for run in await asyncio.gather(*(operator.call("nap", seconds=1.0) for _ in range(5)))
+    } == {"success"}
     naps = [asyncio.create_task(operator.call("nap", 20.0, seconds=2.5)) for _ in range(3)]
     began = time.monotonic()
     blocking = asyncio.create_task(operator.call("block", DEADLINE, seconds=30.0))
@@ -164,11 +180,17 @@ async def test_at_the_limit_a_run_is_refused_and_says_so(operator: Operator) -> 
 
     await operator.until(full)
     refused = await operator.call("add", a=1)
-    assert (refused.status, refused.cause, refused.executed) == ("error", "busy", "no") and "workers" in refused.text
+    assert (refused.status, refused.cause, refused.executed) == (
+        "error",
+        "busy",
+        "no",
+    ) and "workers" in refused.text
     assert [(await nap).status for nap in naps] == ["success"] * 6
     assert (await operator.call("add", a=1)).values == {"sum": 2}
     status = await operator.command("left", "status")
-    assert status.data["answers"]["left"] == "up" and len(status.data["devices"]["left"]["pids"]) == 6
+    assert (
+        status.data["answers"]["left"] == "up" and len(status.data["devices"]["left"]["pids"]) == 6
+    )
 
 
 async def test_too_much_memory_ends_one_run_and_no_other(operator: Operator) -> None:
@@ -179,7 +201,9 @@ async def test_too_much_memory_ends_one_run_and_no_other(operator: Operator) -> 
     kept = await operator.call("keep_memory", 20.0)
     assert (kept.status, kept.cause) == ("error", "out_of_memory"), kept
     assert (await nap).status == "success"
-    assert (await operator.call("eat", megabytes=600)).values == {"bytes": 600 << 20}, "the memory of another run"
+    assert (await operator.call("eat", megabytes=600)).values == {"bytes": 600 << 20}, (
+        "the memory of another run"
+    )
     assert (await operator.call("pid")).values != before.values
 
 

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from services.comm.directory import MEMORY_CALLS, Directory, DirectoryError, load, parse, verify_imports
+from petrobot.services.comm.directory import (
+    MEMORY_CALLS,
+    Directory,
+    DirectoryError,
+    load,
+    parse,
+    verify_imports,
+)
 
 GOOD = """\
 schema = 1
@@ -22,7 +29,7 @@ port = 7302
 [nodes.world]
 host = "127.0.0.1"
 port = 7300
-sim = "sim.laboratory:make_laboratory"
+sim = "petrobot.sim.laboratory:make_laboratory"
 [devices.eye]
 node = "vision"
 driver = "json:JSONDecoder"
@@ -72,10 +79,18 @@ def good() -> Directory:
 
 def test_what_a_good_file_gives() -> None:
     d = good()
-    assert d.where("look") == "vision" and d.where("add") == "motion" and d.where("where") == "motion"
-    assert d.where("memory.get") == "vision" and d.where("beat") == "vision" and d.where("eye") == "vision"
+    assert (
+        d.where("look") == "vision" and d.where("add") == "motion" and d.where("where") == "motion"
+    )
+    assert (
+        d.where("memory.get") == "vision"
+        and d.where("beat") == "vision"
+        and d.where("eye") == "vision"
+    )
     assert d.alternatives("find") == ("look", "look_twice") and d.alternatives("nothing") == ()
-    assert d.offers("vision") == ("look", "look_twice", *MEMORY_CALLS) and d.offers("world") == ("throw",)
+    assert d.offers("vision") == ("look", "look_twice", *MEMORY_CALLS) and d.offers("world") == (
+        "throw",
+    )
     assert d.devices["eye"].config == {"source": "sim"}
     assert d.actions["look"].orphan_time == 1.0 and d.actions["add"].orphan_time is None
     assert d.actions["look"].deadline == 5.0 and d.actions["look_twice"].at_once
@@ -97,38 +112,106 @@ FAULTS = [
     ("schema = 1", "schema = 2", ":1: schema: is 2; write schema = 1"),
     ("schema = 1\n", "", "schema: is missing; write schema = 1"),
     ("[timers.beat]", "[timer.beat]", ":47: timer: unknown table; did you mean 'timers'?"),
-    ("port = 7301", "port = 7302", "127.0.0.1:7302 is already node 'vision''s; give each its own port"),
-    ("port = 7301", "port = 70000", ":6: nodes.vision.port: is 70000; write a port from 1 to 65535"),
+    (
+        "port = 7301",
+        "port = 7302",
+        "127.0.0.1:7302 is already node 'vision''s; give each its own port",
+    ),
+    (
+        "port = 7301",
+        "port = 70000",
+        ":6: nodes.vision.port: is 70000; write a port from 1 to 65535",
+    ),
     ("port = 7301", "port = true", ":6: nodes.vision.port: is True; write a port from 1 to 65535"),
     ("port = 7301\n", "", ":4: nodes.vision.port: is missing; write a port from 1 to 65535"),
     ("port = 7301", "prot = 7301", "nodes.vision.prot: unknown key; did you mean 'port'?"),
-    ('node = "vision"\ndriver', 'node = "vison"\ndriver', "no node is named 'vison'; did you mean 'vision'?"),
-    ('driver = "json:JSONDecoder"\n', "", 'devices.eye.driver: is missing; write an import path "module:Class"'),
-    ('"json:JSONDecoder"', '"json.JSONDecoder"', "devices.eye.driver: is 'json.JSONDecoder'; write an import path"),
-    ('device = "eye"\ndeadline', 'device = "ear"\ndeadline', "actions.look.device: no device is named 'ear'"),
+    (
+        'node = "vision"\ndriver',
+        'node = "vison"\ndriver',
+        "no node is named 'vison'; did you mean 'vision'?",
+    ),
+    (
+        'driver = "json:JSONDecoder"\n',
+        "",
+        'devices.eye.driver: is missing; write an import path "module:Class"',
+    ),
+    (
+        '"json:JSONDecoder"',
+        '"json.JSONDecoder"',
+        "devices.eye.driver: is 'json.JSONDecoder'; write an import path",
+    ),
+    (
+        'device = "eye"\ndeadline',
+        'device = "ear"\ndeadline',
+        "actions.look.device: no device is named 'ear'",
+    ),
     ('device = "eye"\ndeadline', "deadline", 'actions.look: is on no node; write device = "..."'),
-    ('device = "eye"\ndeadline', 'device = "eye"\nnode = "motion"\ndeadline', "actions.look.node: is on two nodes"),
-    ('node = "motion"\n[services.m', 'node = ["motion", "vision"]\n[services.m', "write the name of one node"),
-    ("[actions.look_twice]", "[actions.look]", "actions.look: is placed twice; each name stands on one node only"),
-    ("[actions.add]", "[actions.beat]", "timers.beat: the name is taken by actions.beat; rename one of them"),
+    (
+        'device = "eye"\ndeadline',
+        'device = "eye"\nnode = "motion"\ndeadline',
+        "actions.look.node: is on two nodes",
+    ),
+    (
+        'node = "motion"\n[services.m',
+        'node = ["motion", "vision"]\n[services.m',
+        "write the name of one node",
+    ),
+    (
+        "[actions.look_twice]",
+        "[actions.look]",
+        "actions.look: is placed twice; each name stands on one node only",
+    ),
+    (
+        "[actions.add]",
+        "[actions.beat]",
+        "timers.beat: the name is taken by actions.beat; rename one of them",
+    ),
     ('task = "sum"\n', "", "actions.add.task: is missing; write the name of the primitive task"),
-    ("deadline = 5", "deadline = 0", ":25: actions.look.deadline: is 0; write a number of seconds above 0"),
-    ("deadline = 5", "deadline = nan", "actions.look.deadline: is nan; write a number of seconds above 0"),
+    (
+        "deadline = 5",
+        "deadline = 0",
+        ":25: actions.look.deadline: is 0; write a number of seconds above 0",
+    ),
+    (
+        "deadline = 5",
+        "deadline = nan",
+        "actions.look.deadline: is nan; write a number of seconds above 0",
+    ),
     ("deadline = 5", "deadlin = 5", "actions.look.deadlin: unknown key; did you mean 'deadline'?"),
     ("deadline = 5", 'on_resume = "retry"', 'write one of "rejoin", "error", "ask"'),
     ('start = "at_once"', 'start = "now"', 'write one of "when_stopped", "at_once"'),
-    ('run = "json:dumps"\nscope', "scope", 'services.secret.run: is missing; write an import path (only "memory"'),
-    ('scope = "local"', 'scope = "host"', 'services.secret.scope: is \'host\'; write one of "network", "local"'),
+    (
+        'run = "json:dumps"\nscope',
+        "scope",
+        'services.secret.run: is missing; write an import path (only "memory"',
+    ),
+    (
+        'scope = "local"',
+        'scope = "host"',
+        'services.secret.scope: is \'host\'; write one of "network", "local"',
+    ),
     ('to = "hand"', 'to = "foot"', "streams.where.to: no device is named 'foot'"),
-    ("period = 0.02", "period = -1", "streams.where.period: is -1; write a number of seconds above 0"),
+    (
+        "period = 0.02",
+        "period = -1",
+        "streams.where.period: is -1; write a number of seconds above 0",
+    ),
     ("period = 0.04\n", "", "timers.beat.period: is missing; write a number of seconds above 0"),
-    ("call = 0.008", "call = 0.001", ":51: links.call: is 0.001; write a delay in seconds, 0.004 (one tick) or more"),
+    (
+        "call = 0.008",
+        "call = 0.001",
+        ":51: links.call: is 0.001; write a delay in seconds, 0.004 (one tick) or more",
+    ),
     (
         "call = 0.008",
         "cal = 0.008",
         "links.cal: unknown link; write a channel or \"source/target\"; did you mean 'call'?",
     ),
-    ('cell = "cell.toml"', "cell = 3", "parameters.cell: is 3; write the path of a file, relative to this one"),
+    (
+        'cell = "cell.toml"',
+        "cell = 3",
+        "parameters.cell: is 3; write the path of a file, relative to this one",
+    ),
     ("[devices.hand]", '[devices."a hand"]', "a name has letters, digits, _ and - only"),
     ("port = 7301", "port = ", ":6: not valid TOML"),
     (GOOD, "schema = 1\n", "nodes: there is no node; write at least one [nodes.NAME]"),
@@ -146,7 +229,11 @@ def test_faults_are_named_with_their_remedy(old: str, new: str, says: str) -> No
 
 
 def test_all_faults_are_told_at_once() -> None:
-    text = GOOD.replace("port = 7301", "port = 0").replace("deadline = 5", "deadline = -5").replace("to =", "too =")
+    text = (
+        GOOD.replace("port = 7301", "port = 0")
+        .replace("deadline = 5", "deadline = -5")
+        .replace("to =", "too =")
+    )
     with pytest.raises(DirectoryError) as caught:
         parse(text, Path("services.toml"))
     assert len(caught.value.faults) == 4  # two numbers, an unknown key, a missing one
@@ -166,7 +253,10 @@ def test_an_unreadable_file_raises_what_the_system_says(tmp_path: Path) -> None:
     ("path", "says"),
     [
         ("json:JSONDecode", "'json' has no callable 'JSONDecode'; did you mean 'JSONDecoder'?"),
-        ("jsonn:loads", "cannot import 'jsonn' (No module named 'jsonn'); install its package on this host"),
+        (
+            "jsonn:loads",
+            "cannot import 'jsonn' (No module named 'jsonn'); install its package on this host",
+        ),
         (
             "broken_driver:Driver",
             "importing 'broken_driver' raises ZeroDivisionError: division by zero; mend the module",
@@ -184,12 +274,16 @@ def test_imports_are_verified_on_the_host_that_runs_them(
     assert verify_imports(directory, "motion") == ()
 
 
-def test_an_action_in_a_laboratorys_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_action_in_a_laboratorys_own_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     package = tmp_path / "our_laboratory"
     package.mkdir()
     (package / "__init__.py").write_text("")
     (package / "grasp.py").write_text("def grasp(ctx, *, force=1.0): ...\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    directory = parse(GOOD.replace("json:dumps", "our_laboratory.grasp:grasp"), Path("services.toml"))
+    directory = parse(
+        GOOD.replace("json:dumps", "our_laboratory.grasp:grasp"), Path("services.toml")
+    )
     assert verify_imports(directory, "motion") == ()
     assert "our_laboratory.grasp" in sys.modules

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from services.comm.cell import Cell
-from services.comm.directory import load, verify_imports
-from services.comm.notice import Ended
-from services.lockstep_node import LockstepNode
-from services.scripted import load as load_script
+from petrobot.services.comm.cell import Cell
+from petrobot.services.comm.directory import load, verify_imports
+from petrobot.services.comm.notice import Ended
+from petrobot.services.lockstep_node import LockstepNode
+from petrobot.services.scripted import load as load_script
 from tests.node.test_lockstep import Coordinator
 
 ROOT = Path(__file__).parents[2]
@@ -24,7 +24,9 @@ PAGE = ROOT / "docs" / "actions.md"
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with all files of the page."""
-    blocks = re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    blocks = re.findall(
+        r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+    )
     assert len(blocks) == 6
     for name, text in blocks:
         path = tmp_path / name
@@ -51,7 +53,9 @@ def test_the_pages_own_test_passes(files: Path) -> None:
 def test_the_pages_node_runs_its_action(files: Path, mocked: bool) -> None:
     directory = load(files / "services.toml")
     assert verify_imports(directory, "bench") == ()
-    node = LockstepNode(directory, "bench", substitutes=load_script(files / "script.toml") if mocked else None)
+    node = LockstepNode(
+        directory, "bench", substitutes=load_script(files / "script.toml") if mocked else None
+    )
     coordinator = Coordinator(directory, [(2, "grip", {}), (400, "grip", {})])
     cell = Cell([node, coordinator])
     cell.run(lambda: False, 800)

@@ -1,4 +1,5 @@
-"""A device that follows a stream from another node stands still when that node, or its worker alone, is killed or frozen."""
+"""A device that follows a stream from another node stands still when that node, or its worker
+alone, is killed or frozen."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from services.comm.caller import PeerLost
+from petrobot.services.comm.caller import PeerLost
 from tests.node.test_processes import Nodes, Operator, operator_of, pids
 
 pytestmark = pytest.mark.processes
@@ -41,7 +42,8 @@ async def test_a_device_stands_when_the_sender_of_its_stream_is_lost(
             if whom == "node":
                 victims.insert(0, running.processes["right"].pid)
             following = asyncio.create_task(operator.call("follow", seconds=60.0))
-            # The goal runs away faster than the device can follow: if it stands, it is because it holds.
+            # The goal runs away faster than the device can follow: if it stands, it is because it
+            # holds.
             leading = asyncio.create_task(operator.call("lead", seconds=60.0, speed=1000.0))
             await operator.until(lambda: _counted(operator, 10))
             for victim in victims:

@@ -1,4 +1,5 @@
-"""A node that is frozen, or whose loop is blocked, does not keep its devices moving: their processes stop them themselves."""
+"""A node that is frozen, or whose loop is blocked, does not keep its devices moving: their
+processes stop them themselves."""
 
 from __future__ import annotations
 
@@ -15,12 +16,12 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli import main
-from services.comm.latch import ALL, Latch, latch_of
-from services.device_process import DeviceLoop
-from services.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
-from services.pipe import Pipe
-from services.remote import EMERGENCY_STOP, NODE_SILENT
+from petrobot.coordinator.cli import main
+from petrobot.services.comm.latch import ALL, Latch, latch_of
+from petrobot.services.device_process import DeviceLoop
+from petrobot.services.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
+from petrobot.services.pipe import Pipe
+from petrobot.services.remote import EMERGENCY_STOP, NODE_SILENT
 from tests.node.test_heard import OneNode, cell
 from tests.node.test_parts import Moving, Process, states
 from tests.node.test_parts import Ports as NoPorts
@@ -45,12 +46,17 @@ device = "the_{name}"
 
 
 class Moved:
-    """A node with a cyclic device and one whose driver lives beside its action; both write down when they stop."""
+    """A node with a cyclic device and one whose driver lives beside its action; both write down
+    when they stop."""
 
     def __init__(self, folder: Path) -> None:
         self.files = {name: folder / f"{name}.log" for name in ("base", "tool")}
-        base = DEVICE.format(name="base", period="period = 0.004", file=self.files["base"], action="order")
-        tool = DEVICE.format(name="tool", period="", file=self.files["tool"], action="order_directly")
+        base = DEVICE.format(
+            name="base", period="period = 0.004", file=self.files["base"], action="order"
+        )
+        tool = DEVICE.format(
+            name="tool", period="", file=self.files["tool"], action="order_directly"
+        )
         self.node = OneNode(folder, cell(base, tool, SERVICES))
         self.node.until_ready()
 
@@ -62,7 +68,9 @@ class Moved:
 
     def stopped(self, name: str) -> float:
         """When it stopped after it had moved (s, monotonic)."""
-        return float(wait(lambda: [at for at, said in self.lines(name)[1:] if said == "stopped"])[0])
+        return float(
+            wait(lambda: [at for at, said in self.lines(name)[1:] if said == "stopped"])[0]
+        )
 
     def moves(self, name: str) -> bool:
         return [said for _, said in self.lines(name)[-1:]] == ["moving"]
@@ -107,7 +115,9 @@ async def moving(moved: Moved, operator: Operator, name: str) -> asyncio.Task[An
         if not run.done():
             return run
         # The node may have to be heard again first.
-        assert time.monotonic() < until and "silent" in f"{run.result().cause} {run.result().text}", run.result()
+        assert (
+            time.monotonic() < until and "silent" in f"{run.result().cause} {run.result().text}"
+        ), run.result()
 
 
 @contextmanager
@@ -123,7 +133,9 @@ def frozen(moved: Moved) -> Iterator[float]:
 async def usable(operator: Operator, name: str) -> None:
     """The device takes commands again, soon after its node goes on; then it is stopped."""
     until = time.monotonic() + PATIENCE
-    while (end := await operator.call(name, None, send=[{"go": True}], seconds=0.01)).status != "success":
+    while (
+        end := await operator.call(name, None, send=[{"go": True}], seconds=0.01)
+    ).status != "success":
         assert time.monotonic() < until, end
         await asyncio.sleep(0.05)
     await operator.command("only", "stop", f"the_{name}")
@@ -131,7 +143,9 @@ async def usable(operator: Operator, name: str) -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("name", ["base", "tool"])
-async def test_the_device_of_a_frozen_node_stops(moved: Moved, operator: Operator, name: str) -> None:
+async def test_the_device_of_a_frozen_node_stops(
+    moved: Moved, operator: Operator, name: str
+) -> None:
     run = await moving(moved, operator, name)
     with frozen(moved):
         await asyncio.to_thread(moved.stopped, name)
@@ -142,7 +156,9 @@ async def test_the_device_of_a_frozen_node_stops(moved: Moved, operator: Operato
 
 @pytest.mark.processes
 @pytest.mark.parametrize("name", ["base", "tool"])
-async def test_a_service_that_blocks_the_node_stops_its_devices(moved: Moved, operator: Operator, name: str) -> None:
+async def test_a_service_that_blocks_the_node_stops_its_devices(
+    moved: Moved, operator: Operator, name: str
+) -> None:
     run = await moving(moved, operator, name)
     blocked = asyncio.create_task(operator.call("block", None, seconds=2.5))
     await asyncio.to_thread(moved.stopped, name)
@@ -154,7 +170,8 @@ async def test_a_service_that_blocks_the_node_stops_its_devices(moved: Moved, op
 
 @pytest.mark.processes
 async def test_the_emergency_stop_of_a_frozen_node(moved: Moved, operator: Operator) -> None:
-    """The command stops both devices although their node is frozen, and they stay so until it is cleared."""
+    """The command stops both devices although their node is frozen, and they stay so until it is
+    cleared."""
     runs = [await moving(moved, operator, name) for name in ("base", "tool")]
     services = ["--services", str(moved.node.file)]
     with frozen(moved):
@@ -163,7 +180,8 @@ async def test_the_emergency_stop_of_a_frozen_node(moved: Moved, operator: Opera
             await asyncio.to_thread(moved.stopped, name)
     for run in runs:
         assert (await run).status == "error"
-    # The first orders after the freeze may come before the node has looked at the latch: its device refuses them itself.
+    # The first orders after the freeze may come before the node has looked at the latch: its device
+    # refuses them itself.
     assert await operator.clients["only"].connected(PATIENCE)
     end = await operator.call("base", None, send=[{"go": True}], seconds=0.05)
     assert end.status == "error" and "emergency" in f"{end.cause} {end.text}", end
@@ -187,24 +205,29 @@ async def test_how_soon_devices_of_a_frozen_node_stop(moved: Moved, operator: Op
                 run = await moving(moved, operator, name)
                 with frozen(moved) as since:
                     if kind == "latch":
-                        since = time.monotonic()  # the time that it takes to put it safely on disk counts
+                        since = (
+                            time.monotonic()
+                        )  # the time that it takes to put it safely on disk counts
                         await asyncio.to_thread(latch.stop, [ALL])
                     took[name].append(await asyncio.to_thread(moved.stopped, name) - since)
                 print(f"{kind}, {name}: {took[name][-1]:.3f} s", flush=True)
                 if kind == "latch":
                     latch.clear(["the_base", "the_tool"], ["the_base", "the_tool"])
-                    await asyncio.to_thread(main, ["estop", "--clear", "--services", str(moved.node.file)])
+                    await asyncio.to_thread(
+                        main, ["estop", "--clear", "--services", str(moved.node.file)]
+                    )
                 await run
                 await usable(operator, name)
         for name, seconds in took.items():
             ordered = sorted(seconds)
             print(
-                f"{kind}, {name}: n {len(ordered)}, median {ordered[15]:.3f} s, most {ordered[-1]:.3f} s, limit {limit} s"
+                f"{kind}, {name}: n {len(ordered)}, median {ordered[15]:.3f} s, most "
+                f"{ordered[-1]:.3f} s, limit {limit} s"
             )
         assert max(max(took["base"]), max(took["tool"])) <= limit
 
 
-# --- the guard itself ------------------------------------------------------------------------------------------------
+# --- the guard itself -------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -234,7 +257,8 @@ def test_silence_and_speech(latch: Latch) -> None:
 
 
 def test_a_process_that_stood_still_itself_blames_nobody(latch: Latch) -> None:
-    """What the node said meanwhile has still to be read: it gets another moment, and no more than that."""
+    """What the node said meanwhile has still to be read: it gets another moment, and no more than
+    that."""
     guard = Guard("base", latch)
     guard.look(0.0)
     guard.heard(0.0, True)

@@ -1,4 +1,5 @@
-"""Drivers are heard: what one raises, refuses or misses is in the run's error, in `petrobot nodes` and in the node's log."""
+"""Drivers are heard: what one raises, refuses or misses is in the run's error, in `petrobot nodes`
+and in the node's log."""
 
 from __future__ import annotations
 
@@ -14,10 +15,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli import main
-from services.comm.directory import Directory, parse
-from services.comm.messages import Call
-from services.comm.notice import Accepted
+from petrobot.coordinator.cli import main
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.messages import Call
+from petrobot.services.comm.notice import Accepted
 from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
 from tests.ports import free_ports
@@ -67,7 +68,7 @@ class OneNode:
         self.began = time.monotonic()
         with self.log.open("w") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "services", "only", "--services", str(self.file)],
+                [sys.executable, "-m", "petrobot.services", "only", "--services", str(self.file)],
                 env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -93,9 +94,12 @@ def cell(*devices: str) -> str:
 
 @pytest.fixture(scope="module")
 def node(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OneNode]:
-    """A node with a device for each fault, and with some that are told to fail by the node itself."""
+    """A node with a device for each fault, and with some that are told to fail by the node
+    itself."""
     names = [*FAULTS, "stop", "hold", "picture", "command", "good"]
-    direct = device("plain_stop", "order_directly", "").replace('breaks = "plain_stop"', 'breaks = "stop"')
+    direct = device("plain_stop", "order_directly", "").replace(
+        'breaks = "plain_stop"', 'breaks = "stop"'
+    )
     one = OneNode(tmp_path_factory.mktemp("heard"), cell(*map(device, names), direct))
     one.until_ready()
     yield one
@@ -118,9 +122,11 @@ async def works(operator: Operator, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-async def test_what_a_driver_raises_is_its_runs_error(node: OneNode, operator: Operator, name: str) -> None:
-    """The run ends at once with the driver's words, the log has them with a traceback, an innocent run goes on, and the
-    device comes back."""
+async def test_what_a_driver_raises_is_its_runs_error(
+    node: OneNode, operator: Operator, name: str
+) -> None:
+    """The run ends at once with the driver's words, the log has them with a traceback, an innocent
+    run goes on, and the device comes back."""
     innocent = asyncio.create_task(operator.call("good", None, send=[{"go": True}], seconds=0.5))
     end = await operator.call(name, None, send=[{"go": True}, {"break": True}], seconds=15.0)
     assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end
@@ -132,35 +138,53 @@ async def test_what_a_driver_raises_is_its_runs_error(node: OneNode, operator: O
 
 
 async def test_a_stop_routine_that_raises(node: OneNode, operator: Operator) -> None:
-    end = await operator.call("stop", None, send=[{"go": True}, {"break": True}], seconds=0.1, ends="raise")
+    end = await operator.call(
+        "stop", None, send=[{"go": True}, {"break": True}], seconds=0.1, ends="raise"
+    )
     assert end.status == "error" and "nothing is right in stop" in end.text, end
     await works(operator, "stop")
 
 
-async def test_a_stop_routine_that_raises_beside_its_action(node: OneNode, operator: Operator) -> None:
+async def test_a_stop_routine_that_raises_beside_its_action(
+    node: OneNode, operator: Operator
+) -> None:
     client = operator.clients["only"]
-    call = Call(f"beside {operator.boot}", "plain_stop", {"send": [{"break": True}, {"go": True}], "seconds": 15.0})
+    call = Call(
+        f"beside {operator.boot}",
+        "plain_stop",
+        {"send": [{"break": True}, {"go": True}], "seconds": 15.0},
+    )
     running = asyncio.create_task(client.call("plain_stop", call.arguments))
     await operator.heard(Accepted)
     await asyncio.sleep(0.3)
     await operator.command("only", "stop", "the_plain_stop")
     end = await asyncio.wait_for(running, PATIENCE)
-    assert (end.status, end.cause) == ("error", "device_died") and "nothing is right in stop" in end.text, end
+    assert (end.status, end.cause) == (
+        "error",
+        "device_died",
+    ) and "nothing is right in stop" in end.text, end
     await works(operator, "plain_stop")
 
 
 async def test_a_hold_that_raises_ends_the_run(node: OneNode, operator: Operator) -> None:
-    running = asyncio.create_task(operator.call("hold", None, send=[{"go": True}, {"break": True}], seconds=15.0))
+    running = asyncio.create_task(
+        operator.call("hold", None, send=[{"go": True}, {"break": True}], seconds=15.0)
+    )
     await operator.heard(Accepted)
     await asyncio.sleep(0.3)
     await operator.command("only", "hold", "the_hold")
     end = await running
-    assert (end.status, end.cause) == ("error", "device_died") and "nothing is right in hold" in end.text, end
+    assert (end.status, end.cause) == (
+        "error",
+        "device_died",
+    ) and "nothing is right in hold" in end.text, end
     await works(operator, "hold")
 
 
 async def test_a_picture_that_raises_stops_nothing(node: OneNode, operator: Operator) -> None:
-    running = asyncio.create_task(operator.call("picture", None, send=[{"break": True}], seconds=1.0))
+    running = asyncio.create_task(
+        operator.call("picture", None, send=[{"break": True}], seconds=1.0)
+    )
     await operator.heard(Accepted)
     await asyncio.sleep(0.3)
     answer = await operator.command("only", "picture", "the_picture")
@@ -210,7 +234,9 @@ async def test_nodes_shows_what_was_refused_and_missed(
     assert status["refused"] >= 3 and status["overruns"] >= 200 and status["late_ms"] >= 1000
     code = await asyncio.to_thread(main, ["nodes", "--services", str(node.file), "--json", "-"])
     said = json.loads(capsys.readouterr().out)
-    assert code == 0 and said["only"]["status"]["devices"]["the_good"]["refused"] == status["refused"]
+    assert (
+        code == 0 and said["only"]["status"]["devices"]["the_good"]["refused"] == status["refused"]
+    )
     code = await asyncio.to_thread(main, ["nodes", "--services", str(node.file)])
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert code == 0 and f"{status['refused']} refused" in shown and "cycles missed" in shown, shown

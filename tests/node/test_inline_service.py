@@ -1,4 +1,5 @@
-"""A service that is a plain function: what its caller is told, also when the function is no good."""
+"""A service that is a plain function: what its caller is told, also when the function is no
+good."""
 
 from __future__ import annotations
 
@@ -7,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from services.comm.directory import ServiceEntry
-from services.comm.messages import Call, Executed
-from services.inline_service import inline_service
-from services.runs import Judged
+from petrobot.services.comm.directory import ServiceEntry
+from petrobot.services.comm.messages import Call, Executed
+from petrobot.services.inline_service import inline_service
+from petrobot.services.runs import Judged
 
 EVENTS: list[tuple[str, str, Mapping[str, Any]]] = []
 VERDICTS: list[tuple[str, Judged]] = []
@@ -30,13 +31,18 @@ def _call(function: str, **arguments: Any) -> Any:
 
 def test_its_values_are_plain_and_its_events_are_told() -> None:
     outcome = _call("double", numbers=[1.0, 2.0])
-    assert (outcome.status, outcome.values, outcome.executed) == ("success", {"numbers": [2.0, 4.0]}, Executed.YES)
+    assert (outcome.status, outcome.values, outcome.executed) == (
+        "success",
+        {"numbers": [2.0, 4.0]},
+        Executed.YES,
+    )
     assert type(outcome.values["numbers"]) is list, "as its caller would see it over the wire"
     assert EVENTS == [("it", "doubled", {"count": 2})]
 
 
 def test_its_verdicts_are_told() -> None:
-    """A service may judge as an action may: it is on nobody's device, and sees what all of them did."""
+    """A service may judge as an action may: it is on nobody's device, and sees what all of them
+    did."""
     assert _call("judge", run="m/pick#1").status == "success"
     assert [("it", Judged("c1", "m/pick#1", "failure", "crooked"))] == VERDICTS
     assert _call("judge", run="pick").cause == "exception" and VERDICTS == []
@@ -54,5 +60,10 @@ def test_a_fault_is_one_error_with_its_reason(
     function: str, arguments: dict[str, Any], cause: str, executed: Executed, says: str
 ) -> None:
     outcome = _call(function, **arguments)
-    assert (outcome.status, outcome.cause, outcome.executed, outcome.values) == ("error", cause, executed, {})
+    assert (outcome.status, outcome.cause, outcome.executed, outcome.values) == (
+        "error",
+        cause,
+        executed,
+        {},
+    )
     assert says in outcome.text

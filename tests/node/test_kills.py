@@ -1,4 +1,5 @@
-"""Processes of a cyclic device are killed at random moments, under load: each time it is up again, and takes runs."""
+"""Processes of a cyclic device are killed at random moments, under load: each time it is up again,
+and takes runs."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ class Tally:
     kills: dict[str, int] = field(default_factory=dict)
     calls: int = 0
     links: int = 0
-    """Calls that the link to the node was lost under: on a host so busy that this process stood still for a second."""
+    """Calls that the link to the node was lost under: on a host so busy that this process stood
+    still for a second."""
     wedged: list[str] = field(default_factory=list)
 
 
@@ -98,7 +100,9 @@ async def storm(folder: Path, seed: int, kills: int) -> Tally:
                 number = -1
                 while sum(tally.kills.values()) < kills:
                     number += 1
-                    moving = asyncio.create_task(operator.call("go", to=chance.uniform(-2.0, 2.0), timeout=30.0))
+                    moving = asyncio.create_task(
+                        operator.call("go", to=chance.uniform(-2.0, 2.0), timeout=30.0)
+                    )
                     await passing(chance.uniform(0.0, 0.4))
                     killed |= await kill(operator, chance, tally)
                     await moving
@@ -107,7 +111,9 @@ async def storm(folder: Path, seed: int, kills: int) -> Tally:
                     try:
                         await operator.until(partial(up, operator, killed), RECOVERY)
                     except TimeoutError:
-                        tally.wedged.append(f"kill {number}: {(await operator.command('left', 'status')).data}")
+                        tally.wedged.append(
+                            f"kill {number}: {(await operator.command('left', 'status')).data}"
+                        )
                         break
                     done = 0
                     while done < CALLS and len(tally.wedged) + tally.links < CALLS:
@@ -117,7 +123,9 @@ async def storm(folder: Path, seed: int, kills: int) -> Tally:
                             continue
                         done += 1
                         if end.status != "success":
-                            tally.wedged.append(f"kill {number}, call {done}: {end.cause}: {end.text}")
+                            tally.wedged.append(
+                                f"kill {number}, call {done}: {end.cause}: {end.text}"
+                            )
                     tally.calls += done
     finally:
         running.stop()
@@ -151,7 +159,9 @@ async def test_petrobot_nodes_says_up_only_when_a_call_would_be_taken(tmp_path: 
             async def up_again() -> bool:
                 left = (await asyncio.to_thread(nodes_command, running.file))["left"]
                 seen.update(left.get("not_ready", {}).values())
-                return bool(left["up"]) and (await pids(operator, "left", "slide"))["driver"] != driver
+                return (
+                    bool(left["up"]) and (await pids(operator, "left", "slide"))["driver"] != driver
+                )
 
             await operator.until(up_again, RECOVERY)
             assert (await operator.call("go", to=0.0)).status == "success"
@@ -163,22 +173,40 @@ async def test_petrobot_nodes_says_up_only_when_a_call_would_be_taken(tmp_path: 
 
 def nodes_command(file: Path) -> dict[str, Any]:
     """What `petrobot nodes` says."""
-    command = [sys.executable, "-m", "coordinator", "nodes", "--services", str(file), "--json", "-"]
+    command = [
+        sys.executable,
+        "-m",
+        "petrobot.coordinator",
+        "nodes",
+        "--services",
+        str(file),
+        "--json",
+        "-",
+    ]
     said = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=RECOVERY)
     answers: dict[str, Any] = json.loads(said.stdout)
-    assert said.returncode == (0 if all(answer["up"] for answer in answers.values()) else 3), said.stderr
+    assert said.returncode == (0 if all(answer["up"] for answer in answers.values()) else 3), (
+        said.stderr
+    )
     return {name: answer for name, answer in answers.items() if name == "left"}
 
 
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
-async def test_a_keeper_that_is_killed_or_frozen_costs_no_more_than_its_worker(tmp_path: Path, how: str) -> None:
+async def test_a_keeper_that_is_killed_or_frozen_costs_no_more_than_its_worker(
+    tmp_path: Path, how: str
+) -> None:
     """The processes directly below the node: whoever looks for the node's children finds these."""
     running = Nodes(tmp_path, "left")
     try:
         async with operator_of(running.directory, "left") as operator:
             node = running.processes["left"].pid
-            workers = {*(await pids(operator, "left", "slide")).values(), *(await pids(operator, "left", "")).values()}
-            keepers = [int(one) for one in Path(f"/proc/{node}/task/{node}/children").read_text().split()]
+            workers = {
+                *(await pids(operator, "left", "slide")).values(),
+                *(await pids(operator, "left", "")).values(),
+            }
+            keepers = [
+                int(one) for one in Path(f"/proc/{node}/task/{node}/children").read_text().split()
+            ]
             assert len(keepers) == len(workers) == 3 and workers.isdisjoint(keepers)
             for keeper in keepers:
                 os.kill(keeper, getattr(signal, how))

@@ -1,4 +1,5 @@
-"""Nodes in a lock-step cell: calls, devices, streams, memory and timers; and that placement shows nowhere."""
+"""Nodes in a lock-step cell: calls, devices, streams, memory and timers; and that placement shows
+nowhere."""
 
 from __future__ import annotations
 
@@ -12,14 +13,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm.caller import Accepted, Answered, Caller, Ended, EventArrived, Notice, Progress
-from services.comm.canbus import Frame
-from services.comm.cell import Cell, Delays
-from services.comm.channels import can_body, image_body, read_can, read_images_wanted
-from services.comm.directory import Directory, DirectoryError, parse
-from services.comm.messages import Call, Command, Hello
-from services.comm.party import TICK, Envelope
-from services.lockstep_node import LockstepNode
+from petrobot.services.comm.caller import (
+    Accepted,
+    Answered,
+    Caller,
+    Ended,
+    EventArrived,
+    Notice,
+    Progress,
+)
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.cell import Cell, Delays
+from petrobot.services.comm.channels import can_body, image_body, read_can, read_images_wanted
+from petrobot.services.comm.directory import Directory, DirectoryError, parse
+from petrobot.services.comm.messages import Call, Command, Hello
+from petrobot.services.comm.party import TICK, Envelope
+from petrobot.services.lockstep_node import LockstepNode
 
 CELL = """\
 schema = 1
@@ -32,7 +41,7 @@ port = 7402
 [nodes.world]
 host = "127.0.0.1"
 port = 7400
-sim = "sim.laboratory:make_laboratory"
+sim = "petrobot.sim.laboratory:make_laboratory"
 [devices.slide]
 node = "left"
 driver = "toy_cell.drivers:Slide"
@@ -83,7 +92,8 @@ def directory(node: str = "left", **replaced: str) -> Directory:
 
 
 class World:
-    """The laboratory: answers each frame with one, sends an image every 20 ms while images are wanted."""
+    """The laboratory: answers each frame with one, sends an image every 20 ms while images are
+    wanted."""
 
     name = "world"
 
@@ -124,14 +134,18 @@ class Coordinator:
 
     name = "coordinator"
 
-    def __init__(self, places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]] = ()) -> None:
+    def __init__(
+        self, places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]] = ()
+    ) -> None:
         self.places = places
         self.script = list(script)
         self.heard: list[tuple[int, Notice]] = []
         self.tick = 0
         self.made = 0
         hello = Hello(2, 2, "coordinator", self.name, "boot", 1, places.hash)
-        self.callers = {n: Caller(n, hello, auto_ack=True) for n in places.nodes if not places.nodes[n].sim}
+        self.callers = {
+            n: Caller(n, hello, auto_ack=True) for n in places.nodes if not places.nodes[n].sim
+        }
         for caller in self.callers.values():
             caller.open(0.0)
 
@@ -162,25 +176,33 @@ class Coordinator:
         ]
 
     def ended(self, identity: str) -> Any:
-        (end,) = [n.outcome for _, n in self.heard if isinstance(n, Ended) and n.outcome.id == identity]
+        (end,) = [
+            n.outcome for _, n in self.heard if isinstance(n, Ended) and n.outcome.id == identity
+        ]
         return end
 
 
 class Bench:
     """A whole cell."""
 
-    def __init__(self, places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]] = (), **mock: Any) -> None:
+    def __init__(
+        self, places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]] = (), **mock: Any
+    ) -> None:
         self.world = World(places)
         self.coordinator = Coordinator(places, script)
         nodes = [n for n in places.nodes.values() if not n.sim]
         self.nodes = {n.name: LockstepNode(places, n.name, substitutes=mock) for n in nodes}
-        self.cell = Cell([self.coordinator, self.world, *self.nodes.values()], Delays(places.delays()))
+        self.cell = Cell(
+            [self.coordinator, self.world, *self.nodes.values()], Delays(places.delays())
+        )
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / TICK)):
             self.cell.step()
 
-    def call(self, service: str, span: float = 1.0, deadline: float | None = None, /, **arguments: Any) -> Any:
+    def call(
+        self, service: str, span: float = 1.0, deadline: float | None = None, /, **arguments: Any
+    ) -> Any:
         identity = self.coordinator.call(service, deadline, **arguments)
         self.run(span)
         return self.coordinator.ended(identity)
@@ -202,7 +224,9 @@ def test_images_come_from_the_laboratory_with_their_age() -> None:
     assert [row[1] for row in end.values["seen"]] == pytest.approx([0.003] * 3)
     assert [row[2] for row in end.values["seen"]] == [0, 12, 24]
     assert bench.world.rate == 0.0
-    assert bench.call("look", images=1).values["seen"][0][0] == 3, "an image of the earlier start came through"
+    assert bench.call("look", images=1).values["seen"][0][0] == 3, (
+        "an image of the earlier start came through"
+    )
 
 
 def test_set_points_go_from_one_device_to_another() -> None:
@@ -212,7 +236,12 @@ def test_set_points_go_from_one_device_to_another() -> None:
     assert end.values["count"] == 31 and 0.27 < end.values["position"] < 0.3
     assert bench.coordinator.ended("c1").status == "success"
     (event,) = [n.event for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
-    assert (event.name, event.source, event.run, event.data) == ("led", "lead", "c1", {"seconds": 0.6})
+    assert (event.name, event.source, event.run, event.data) == (
+        "led",
+        "lead",
+        "c1",
+        {"seconds": 0.6},
+    )
 
 
 def test_services_memory_and_child_calls() -> None:
@@ -221,7 +250,9 @@ def test_services_memory_and_child_calls() -> None:
     assert (end.values["sum"], end.values["version"]) == (6, 1)
     assert bench.call("slow_service", 1.0, seconds=0.2).seconds == pytest.approx(0.2, abs=TICK)
     assert bench.call("sum_service", a="x").cause == "exception"
-    assert bench.call("sum_service", c=1).text == "sum_service: takes no argument 'c'; it takes: a, b"
+    assert (
+        bench.call("sum_service", c=1).text == "sum_service: takes no argument 'c'; it takes: a, b"
+    )
 
 
 def test_compare_and_set_loses_no_update() -> None:
@@ -237,7 +268,9 @@ def test_watched_variables_are_told() -> None:
     bench.coordinator.callers["right"].subscribe(0.0, ["memory:sum"])
     bench.call("relay", a=4)
     events = [n.event for _, n in bench.coordinator.heard if isinstance(n, EventArrived)]
-    assert [(e.name, e.data) for e in events] == [("memory:sum", {"name": "sum", "value": 6, "version": 1})]
+    assert [(e.name, e.data) for e in events] == [
+        ("memory:sum", {"name": "sum", "value": 6, "version": 1})
+    ]
     assert events[0].number == 1
 
 
@@ -262,7 +295,9 @@ def test_timers_pulse_for_those_who_listen() -> None:
         ("delegate", {"service": "nothing"}, None, "", "yes"),
     ],
 )
-def test_limits(service: str, arguments: dict[str, Any], deadline: float | None, cause: str, executed: str) -> None:
+def test_limits(
+    service: str, arguments: dict[str, Any], deadline: float | None, cause: str, executed: str
+) -> None:
     end = Bench(directory()).call(service, 2.0, deadline, **arguments)
     assert (end.cause, end.executed) == (cause, executed)
 
@@ -283,7 +318,10 @@ def test_what_a_node_may_call(service: str, cause: str) -> None:
 def test_a_local_service_is_refused_to_another_host() -> None:
     far = directory(**{'host = "127.0.0.1"\nport = 7401': 'host = "10.0.0.9"\nport = 7401'})
     end = Bench(far).call("delegate", service="secret")
-    assert end.values["cause"] == "local_only" and "serves callers on the host of right alone" in end.values["text"]
+    assert (
+        end.values["cause"] == "local_only"
+        and "serves callers on the host of right alone" in end.values["text"]
+    )
 
 
 def test_one_run_a_device_and_cancel() -> None:
@@ -302,7 +340,9 @@ def test_feedback_and_events_reach_the_caller() -> None:
     bench = Bench(directory())
     end = bench.call("tell", name="hello")
     kinds = [type(n) for _, n in bench.coordinator.heard if not isinstance(n, Ended)]
-    assert kinds.count(Accepted) == 1 and kinds.count(Progress) == 1 and kinds.count(EventArrived) == 1
+    assert (
+        kinds.count(Accepted) == 1 and kinds.count(Progress) == 1 and kinds.count(EventArrived) == 1
+    )
     assert end.values["draw"] == Bench(directory("right")).call("tell", name="x").values["draw"]
 
 
@@ -314,17 +354,29 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
         caller.command(bench.cell.now, Command(f"hold {peer}", "hold"))
     bench.run(3.0)
     answers = {n.answer.id: n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered)}
-    assert answers["hold left"].ok and answers["hold left"].data["answers"] == {"slide": "held", "left": "held"}
-    assert not answers["hold right"].ok and answers["hold right"].data["answers"]["eye"] == "cannot hold"
+    assert answers["hold left"].ok and answers["hold left"].data["answers"] == {
+        "slide": "held",
+        "left": "held",
+    }
+    assert (
+        not answers["hold right"].ok
+        and answers["hold right"].data["answers"]["eye"] == "cannot hold"
+    )
     bench.coordinator.callers["left"].command(bench.cell.now, Command("s", "status", "slide"))
     bench.run(0.1)
-    status = next(n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered) and n.answer.id == "s")
+    status = next(
+        n.answer
+        for _, n in bench.coordinator.heard
+        if isinstance(n, Answered) and n.answer.id == "s"
+    )
     assert status.data["devices"]["slide"]["runs"] == [first]
     assert 0.15 < status.data["devices"]["slide"]["state"]["position"] < 0.25
     bench.coordinator.callers["left"].command(bench.cell.now, Command("r", "release"))
     bench.run(1.0)
     end = bench.coordinator.ended(first)
-    assert end.status == "success" and end.seconds == pytest.approx(0.5, abs=0.05), "the pause counts"
+    assert end.status == "success" and end.seconds == pytest.approx(0.5, abs=0.05), (
+        "the pause counts"
+    )
 
 
 @pytest.mark.parametrize(
@@ -360,15 +412,20 @@ def test_an_orphan_is_stopped() -> None:
 
 
 def test_a_driver_that_refuses_its_keys_is_one_fault() -> None:
-    with pytest.raises(DirectoryError, match=r"devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'"):
+    with pytest.raises(
+        DirectoryError,
+        match=r"devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'",
+    ):
         LockstepNode(directory(**{"period = 0.004\n": ""}), "left")
     with pytest.raises(DirectoryError, match="no stream 'points' leads here"):
         LockstepNode(directory(**{'to = "slide"': 'to = "eye"'}), "left")
-    with pytest.raises(DirectoryError, match="collections:ChainMap is no driver: it has no period, state"):
+    with pytest.raises(
+        DirectoryError, match="collections:ChainMap is no driver: it has no period, state"
+    ):
         LockstepNode(directory(**{"toy_cell.drivers:Slide": "collections:ChainMap"}), "left")
 
 
-# --- placement -------------------------------------------------------------------------------------------------------
+# --- placement --------------------------------------------------------------------------------
 
 CALLS: list[tuple[str, dict[str, Any]]] = [
     ("add", {"a": 1}),
@@ -385,7 +442,9 @@ CALLS: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-def trace(places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]]) -> list[tuple[Any, ...]]:
+def trace(
+    places: Directory, script: Sequence[tuple[int, str, dict[str, Any]]]
+) -> list[tuple[Any, ...]]:
     bench = Bench(places, script)
     for caller in bench.coordinator.callers.values():
         caller.subscribe(0.0, ["beat", "memory:sum", "memory:count"])
@@ -400,9 +459,19 @@ def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
         if isinstance(notice, Ended):
             o = notice.outcome
             values = {k: v for k, v in o.values.items() if k != "pid"}
-            rows.append((tick, o.id, o.status, repr(values), o.cause, o.executed, round(o.seconds, 9)))
+            rows.append(
+                (tick, o.id, o.status, repr(values), o.cause, o.executed, round(o.seconds, 9))
+            )
         elif isinstance(notice, EventArrived):
-            rows.append((tick, notice.event.source, notice.event.name, notice.event.number, repr(notice.event.data)))
+            rows.append(
+                (
+                    tick,
+                    notice.event.source,
+                    notice.event.name,
+                    notice.event.number,
+                    repr(notice.event.data),
+                )
+            )
         elif isinstance(notice, Accepted | Progress):
             rows.append((tick, notice.id, type(notice).__name__))
     return sorted(rows, key=repr)
@@ -413,10 +482,16 @@ def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
     calls=st.lists(st.tuples(st.integers(0, 60), st.sampled_from(CALLS)), min_size=2, max_size=8),
     everything_left=st.booleans(),
 )
-def test_placement_shows_nowhere(calls: list[tuple[int, tuple[str, dict[str, Any]]]], everything_left: bool) -> None:
+def test_placement_shows_nowhere(
+    calls: list[tuple[int, tuple[str, dict[str, Any]]]], everything_left: bool
+) -> None:
     script = sorted(((tick, *call) for tick, call in calls), key=lambda row: row[0])
     here = trace(directory("left"), script)
-    there = directory("left", **{'node = "right"': 'node = "left"'}) if everything_left else directory("right")
+    there = (
+        directory("left", **{'node = "right"': 'node = "left"'})
+        if everything_left
+        else directory("right")
+    )
     assert here == trace(there, script)
 
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from services import watchdog
-from services.comm.directory import ActionEntry
-from services.place import InlinePlace
-from services.runs import Begin, Ended, Told
+from petrobot.services import watchdog
+from petrobot.services.comm.directory import ActionEntry
+from petrobot.services.place import InlinePlace
+from petrobot.services.runs import Begin, Ended, Told
 from tests.node.conftest import OUTSIDE, Clock
 from tests.node.test_heard import FAULTS
 from tests.node.test_processes import PATIENCE, ROOT
@@ -30,8 +30,8 @@ class Ports:
     now = 0.0
 
     def raise_event(self, name: str, **data: Any) -> None:
-        from services.comm.messages import Event
-        from services.context import checked
+        from petrobot.services.comm.messages import Event
+        from petrobot.services.context import checked
 
         checked(Event(name, "it", 1, data))
 
@@ -71,12 +71,18 @@ class Inline:
         raise AssertionError("the run has no end")
 
 
-@pytest.mark.parametrize("breaks", [name for name in FAULTS if name not in ("surrogate", "huge", "not_plain", "state")])
-def test_what_a_driver_raises_is_its_runs_error(breaks: str, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    "breaks", [name for name in FAULTS if name not in ("surrogate", "huge", "not_plain", "state")]
+)
+def test_what_a_driver_raises_is_its_runs_error(
+    breaks: str, caplog: pytest.LogCaptureFixture
+) -> None:
     inline = Inline(breaks)
     end = inline.run(send=[{"go": True}, {"break": True}], seconds=3.0)
     assert (end.status, end.cause, end.executed) == ("error", "device_died", "unknown"), end
-    assert FAULTS[breaks] in end.text and FAULTS[breaks] in caplog.text and "Traceback" in caplog.text
+    assert (
+        FAULTS[breaks] in end.text and FAULTS[breaks] in caplog.text and "Traceback" in caplog.text
+    )
     again = inline.run(send=[], seconds=0.1)
     assert (again.cause, again.executed) == ("not_ready", "no") and FAULTS[breaks] in again.text
     inline.place.command(inline.clock.now, "c", "status")
@@ -88,21 +94,28 @@ def test_what_a_driver_raises_is_its_runs_error(breaks: str, caplog: pytest.LogC
 @pytest.mark.parametrize("verb", ["stop", "hold", "release"])
 def test_an_order_that_the_driver_fails_on(verb: str) -> None:
     inline = Inline(verb)
-    inline.place.take(0.0, Begin("r", "order", {"send": [{"go": True}, {"break": True}], "seconds": 3.0}, 5.0))
+    inline.place.take(
+        0.0, Begin("r", "order", {"send": [{"go": True}, {"break": True}], "seconds": 3.0}, 5.0)
+    )
     inline.place.advance(0.0)
     inline.place.command(0.0, "c", verb)
     reports = inline.place.reports()
-    assert [(r.cause, f"nothing is right in {verb}" in r.text) for r in reports if isinstance(r, Ended)] == [
-        ("device_died", True)
-    ]
+    assert [
+        (r.cause, f"nothing is right in {verb}" in r.text) for r in reports if isinstance(r, Ended)
+    ] == [("device_died", True)]
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.1])
-@pytest.mark.parametrize("send", [[{"odd": 1}], [{"odd": 1}, {"go": True}]], ids=["alone", "then another"])
+@pytest.mark.parametrize(
+    "send", [[{"odd": 1}], [{"odd": 1}, {"go": True}]], ids=["alone", "then another"]
+)
 def test_a_refused_command_in_lock_step(send: list[dict[str, Any]], seconds: float) -> None:
     inline = Inline("")
     end = inline.run(send=send, seconds=seconds)
-    assert (end.status, end.cause) == ("error", "command_refused") and "no odd numbers: 1" in end.text
+    assert (end.status, end.cause) == (
+        "error",
+        "command_refused",
+    ) and "no odd numbers: 1" in end.text
     assert inline.run(send=[{"go": True}], seconds=seconds).status == "success"
     looks = inline.run(send=[{"odd": 1}], seconds=0.1, look=True)
     assert looks.status == "success" and "no odd numbers" in looks.values["refused"]
@@ -137,12 +150,12 @@ args = {{ seconds = 0.01 }}
 """
 RUN = textwrap.dedent("""\
     import sys
-    from services import watchdog
+    from petrobot.services import watchdog
     watchdog.LIMIT, watchdog.LOOK, watchdog.AGAIN, watchdog.ATTEMPTS = 0.4, 0.05, 0.1, 1
-    from services.comm.directory import parse
-    from services.lockstep_node import LockstepNode
-    from services.comm.messages import Call, Hello, Outcome
-    from services.comm.party import Envelope
+    from petrobot.services.comm.directory import parse
+    from petrobot.services.lockstep_node import LockstepNode
+    from petrobot.services.comm.messages import Call, Hello, Outcome
+    from petrobot.services.comm.party import Envelope
     from pathlib import Path
     file = Path(sys.argv[1])
     node = LockstepNode(parse(file.read_text(), file), "only")
@@ -161,7 +174,8 @@ RUN = textwrap.dedent("""\
 @pytest.mark.processes
 @pytest.mark.parametrize("stubborn", [False, True])
 def test_an_action_that_does_not_come_back_is_named(tmp_path: Path, stubborn: bool) -> None:
-    """Its run ends in ERROR, or the process where it lets nobody interrupt it; node, action, run and line are said."""
+    """Its run ends in ERROR, or the process where it lets nobody interrupt it; node, action, run
+    and line are said."""
     file = tmp_path / "services.toml"
     file.write_text(HANGING.format(port=free_ports(1)[0], stubborn=str(stubborn).lower()))
     done = subprocess.run(
@@ -172,7 +186,9 @@ def test_an_action_that_does_not_come_back_is_named(tmp_path: Path, stubborn: bo
         timeout=PATIENCE,
     )
     said = done.stderr
-    assert "node only: action spin, run m/p#1, in turn_round (" in said and "actions.py:" in said, done
+    assert "node only: action spin, run m/p#1, in turn_round (" in said and "actions.py:" in said, (
+        done
+    )
     if stubborn:
         assert done.returncode == 3 and "the process ends" in said
     else:
@@ -202,7 +218,8 @@ def test_a_busy_machine_does_not_trip_the_watchdog(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("by", ["a person", "the action"])
 def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
-    """In lock step both come as KeyboardInterrupt at the same place: the one ends the command, the other the run alone."""
+    """In lock step both come as KeyboardInterrupt at the same place: the one ends the command, the
+    other the run alone."""
 
     def act(ctx: Any) -> Any:
         if by == "a person":
@@ -223,6 +240,9 @@ def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
             with pytest.raises(KeyboardInterrupt):
                 inline.run()
         else:
-            assert (inline.run().cause, inline.ends[0].text.split()[0]) == ("exception", "KeyboardInterrupt:")
+            assert (inline.run().cause, inline.ends[0].text.split()[0]) == (
+                "exception",
+                "KeyboardInterrupt:",
+            )
     finally:
         signal.signal(signal.SIGINT, before)

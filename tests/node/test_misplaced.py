@@ -1,4 +1,5 @@
-"""Thirty mistakes that a newcomer makes in the shipped services.toml: each is one line with file, key and remedy, exit code 2."""
+"""Thirty mistakes that a newcomer makes in the shipped services.toml: each is one line with file,
+key and remedy, exit code 2."""
 
 from __future__ import annotations
 
@@ -8,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import main
-from services.comm.directory import DirectoryError, load, parse
-from services.comm.directory_places import is_loopback, misplaced
+from petrobot.coordinator.cli import main
+from petrobot.services.comm.directory import DirectoryError, load, parse
+from petrobot.services.comm.directory_places import is_loopback, misplaced
 
 SHIPPED = Path(__file__).parents[2] / "services.toml"
 VISION = 'host = "127.0.0.1"\nport = 7301'
@@ -18,7 +19,11 @@ NO_KEY = "can be reached by other hosts, and there is no key; make one with `pet
 MISTAKES: list[tuple[str, str, str]] = [
     ("port = 7301", "port = 7301.0", ":20: nodes.vision.port: is 7301.0; write a port"),
     ("port = 7301", 'port = "7301"', ":20: nodes.vision.port: is '7301'; write a port"),
-    ("port = 7302", "port = 7301", ":24: nodes.motion.port: 127.0.0.1:7301 is already node 'vision''s"),
+    (
+        "port = 7302",
+        "port = 7301",
+        ":24: nodes.motion.port: 127.0.0.1:7301 is already node 'vision''s",
+    ),
     (
         "port = 7302",
         "port = 7299",
@@ -34,8 +39,16 @@ MISTAKES: list[tuple[str, str, str]] = [
         'host = "127.0.0.1:7301"\nport = 7301',
         ":19: nodes.vision.host: is '127.0.0.1:7301'; write a host name or address",
     ),
-    (VISION, 'host = "300.1.2.3"\nport = 7301', ":19: nodes.vision.host: is '300.1.2.3'; write a host name or address"),
-    (VISION, 'host = "the vision pc"\nport = 7301', ":19: nodes.vision.host: is 'the vision pc'; write a host name"),
+    (
+        VISION,
+        'host = "300.1.2.3"\nport = 7301',
+        ":19: nodes.vision.host: is '300.1.2.3'; write a host name or address",
+    ),
+    (
+        VISION,
+        'host = "the vision pc"\nport = 7301',
+        ":19: nodes.vision.host: is 'the vision pc'; write a host name",
+    ),
     (VISION, 'host = "192.168.1.5"\nport = 7301', f":19: nodes.vision.host: 192.168.1.5 {NO_KEY}"),
     (VISION, 'host = "vision-pc"\nport = 7301', f":19: nodes.vision.host: vision-pc {NO_KEY}"),
     (
@@ -43,9 +56,21 @@ MISTAKES: list[tuple[str, str, str]] = [
         'schema = 1\n[keys]\nfile = "lost.key"',
         ":10: keys.file: {folder}/lost.key is not there; make it with `petrobot keys`",
     ),
-    ("schema = 1", 'schema = 1\n[keys]\nshared = "cell.key"', ':10: keys.shared: unknown; write file = "cell.key"'),
-    ("[actions.locate_mog2]", "[actions.locate_background]", ":71: actions.locate_background: is placed twice"),
-    ('device = "camera"', 'device = "camera"\nnode = "motion"', ":69: actions.locate_background.node: is on two nodes"),
+    (
+        "schema = 1",
+        'schema = 1\n[keys]\nshared = "cell.key"',
+        ':10: keys.shared: unknown; write file = "cell.key"',
+    ),
+    (
+        "[actions.locate_mog2]",
+        "[actions.locate_background]",
+        ":71: actions.locate_background: is placed twice",
+    ),
+    (
+        'device = "camera"',
+        'device = "camera"\nnode = "motion"',
+        ":69: actions.locate_background.node: is on two nodes",
+    ),
     ('device = "camera"', "", ":65: actions.locate_background: is on no node; write device"),
     (
         'device = "camera"',
@@ -55,28 +80,34 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "vision.camera:Camera",
         "vision.camera:Kamera",
-        ":31: devices.camera.driver: 'services.vision.camera' has no 'Kamera'; did you mean 'Camera'?",
+        ":31: devices.camera.driver: 'petrobot.services.vision.camera' has no 'Kamera'; did "
+        "you mean 'Camera'?",
     ),
-    ("vision.camera:Camera", "vison.camera:Camera", ":31: devices.camera.driver: cannot find 'services.vison.camera'"),
     (
-        "services.vision.camera:Camera",
+        "vision.camera:Camera",
+        "vison.camera:Camera",
+        ":31: devices.camera.driver: cannot find 'petrobot.services.vison.camera'",
+    ),
+    (
+        "petrobot.services.vision.camera:Camera",
         "our_lab_camera:Camera",
         ":31: devices.camera.driver: no module 'our_lab_camera' on this host; install",
     ),
     (
         "motion.arm:Arm",
         "motion.arm.Arm",
-        ":38: devices.arm.driver: is 'services.motion.arm.Arm'; write an import path \"module:Class\"",
+        ":38: devices.arm.driver: is 'petrobot.services.motion.arm.Arm'; write an import "
+        'path "module:Class"',
     ),
     (
         "actions:locate_background",
         "actions:locate_backgroud",
-        ":66: actions.locate_background.run: 'services.vision.actions' has no",
+        ":66: actions.locate_background.run: 'petrobot.services.vision.actions' has no",
     ),
     (
         "laboratory:make_laboratory",
         "laboratory:make_lab",
-        ":16: nodes.laboratory.sim: 'sim.laboratory' has no 'make_lab'",
+        ":16: nodes.laboratory.sim: 'petrobot.sim.laboratory' has no 'make_lab'",
     ),
     (
         "deadline = 10.0",
@@ -86,13 +117,34 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "deadline = 12.0",
         "args = { margn = 5 }",
-        ":131: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did you mean 'margin'?",
+        ":131: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did "
+        "you mean 'margin'?",
     ),
-    ("deadline = 10.0", "args = 5", ":69: actions.locate_background.args: is 5; write a table of arguments"),
-    ('to = "arm"', 'to = "army"', ":49: streams.catch_point.to: no device is named 'army'; did you mean 'arm'?"),
-    ("period = 0.02 ", "period = 0 ", ":50: streams.catch_point.period: is 0; write a number of seconds above 0"),
-    ("period = 0.04 ", "perid = 0.04 ", ":57: timers.image_tick.perid: unknown key; did you mean 'period'?"),
-    ("[services.memory]", '[services.memory]\nscope = "host"', '.scope: is \'host\'; write one of "network", "local"'),
+    (
+        "deadline = 10.0",
+        "args = 5",
+        ":69: actions.locate_background.args: is 5; write a table of arguments",
+    ),
+    (
+        'to = "arm"',
+        'to = "army"',
+        ":49: streams.catch_point.to: no device is named 'army'; did you mean 'arm'?",
+    ),
+    (
+        "period = 0.02 ",
+        "period = 0 ",
+        ":50: streams.catch_point.period: is 0; write a number of seconds above 0",
+    ),
+    (
+        "period = 0.04 ",
+        "perid = 0.04 ",
+        ":57: timers.image_tick.perid: unknown key; did you mean 'period'?",
+    ),
+    (
+        "[services.memory]",
+        '[services.memory]\nscope = "host"',
+        '.scope: is \'host\'; write one of "network", "local"',
+    ),
     (
         'cell = "services/cell.toml"',
         'cell = "our_cell.toml"',
@@ -111,7 +163,9 @@ def told(*command: str) -> tuple[int, str]:
     return code, said.getvalue()
 
 
-@pytest.mark.parametrize(("right", "wrong", "says"), MISTAKES, ids=[f"{wrong[:40]}" for _, wrong, _ in MISTAKES])
+@pytest.mark.parametrize(
+    ("right", "wrong", "says"), MISTAKES, ids=[f"{wrong[:40]}" for _, wrong, _ in MISTAKES]
+)
 def test_one_line_says_what_is_wrong(right: str, wrong: str, says: str, tmp_path: Path) -> None:
     """`petrobot check` refuses it, names file, line, key and remedy, and shows no traceback."""
     text = SHIPPED.read_text(encoding="utf-8")
@@ -140,7 +194,9 @@ def test_the_shipped_files_name_nothing_that_is_not_here(tmp_path: Path) -> None
 
 def test_what_another_host_has_is_not_known_here() -> None:
     """Only a lock-step cell launches everything here; scripted actions need no code."""
-    text = SHIPPED.read_text(encoding="utf-8").replace("actions:locate_background", "actions:elsewhere", 1)
+    text = SHIPPED.read_text(encoding="utf-8").replace(
+        "actions:locate_background", "actions:elsewhere", 1
+    )
     away = parse(text.replace(VISION, 'host = "10.0.0.7"\nport = 7301'), SHIPPED)
     assert all("no key" in line for line in misplaced(away))
     assert any("elsewhere" in line for line in misplaced(away, everywhere=True))
@@ -152,15 +208,21 @@ def test_what_another_host_has_is_not_known_here() -> None:
 def test_names_that_only_running_the_module_tells_are_let_through(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A module that binds names under a condition, takes any keyword or is no Python source is left to the node's start."""
+    """A module that binds names under a condition, takes any keyword or is no Python source is left
+    to the node's start."""
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "conditional_lab.py").write_text("import sys\nif sys:\n    look = len\n")
     (tmp_path / "open_lab.py").write_text("async def look(ctx, **anything): ...\n")
     (tmp_path / "broken_lab.py").write_text("def look(ctx:\n")
     text = SHIPPED.read_text(encoding="utf-8")
     for module in ("conditional_lab", "open_lab", "broken_lab", "math"):
-        run = text.replace("services.vision.actions:locate_background", f"{module}:look", 1)
-        assert misplaced(parse(run.replace("deadline = 10.0", "args = { nosuch = 5 }", 1), SHIPPED)) == ()
+        run = text.replace(
+            "petrobot.services.vision.actions:locate_background", f"{module}:look", 1
+        )
+        assert (
+            misplaced(parse(run.replace("deadline = 10.0", "args = { nosuch = 5 }", 1), SHIPPED))
+            == ()
+        )
 
 
 def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None:
@@ -169,7 +231,9 @@ def test_a_file_in_another_code_is_refused_with_its_line(tmp_path: Path) -> None
     path.write_bytes(b"\xef\xbb\xbf" + SHIPPED.read_bytes())
     assert load(path).hash == load(SHIPPED).hash
     path.write_bytes(b"schema = 1\n# K\xf6ln\n")
-    with pytest.raises(DirectoryError, match=r"services.toml:2: not UTF-8 text .*save the file as UTF-8"):
+    with pytest.raises(
+        DirectoryError, match=r"services.toml:2: not UTF-8 text .*save the file as UTF-8"
+    ):
         load(path)
 
 

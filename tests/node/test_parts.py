@@ -1,4 +1,5 @@
-"""The small machines of a node: global memory, timers, outlets, set points, remote drivers, pipes, scripts."""
+"""The small machines of a node: global memory, timers, outlets, set points, remote drivers, pipes,
+scripts."""
 
 from __future__ import annotations
 
@@ -20,32 +21,37 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from services import memory as memory_module
-from services.action import Context, Result, Status, failure, provisional, success
-from services.comm.directory import ActionEntry
-from services.comm.parentage import until_ended
-from services.device_process import LINKED, DeviceLoop
-from services.memory import Memory, event_name
-from services.outlets import Outlets
-from services.pipe import Counter, NewestLink, Pipe, counter_memory, link_pair
-from services.place import InlinePlace
-from services.rehearsal import StillRunningError, rehearse
-from services.remote import CyclicDriver, DeviceCommand, RemoteDriver
-from services.runs import Answered, Begin, Ended, Hold, Sent, Stop, Told, flat, record
-from services.scripted import ScriptError, load
-from services.setpoints import SetpointReceiver
-from services.timers import Timers
+from petrobot.services import memory as memory_module
+from petrobot.services.action import Context, Result, Status, failure, provisional, success
+from petrobot.services.comm.directory import ActionEntry
+from petrobot.services.comm.parentage import until_ended
+from petrobot.services.device_process import LINKED, DeviceLoop
+from petrobot.services.memory import Memory, event_name
+from petrobot.services.outlets import Outlets
+from petrobot.services.pipe import Counter, NewestLink, Pipe, counter_memory, link_pair
+from petrobot.services.place import InlinePlace
+from petrobot.services.rehearsal import StillRunningError, rehearse
+from petrobot.services.remote import CyclicDriver, DeviceCommand, RemoteDriver
+from petrobot.services.runs import Answered, Begin, Ended, Hold, Sent, Stop, Told, flat, record
+from petrobot.services.scripted import ScriptError, load
+from petrobot.services.setpoints import SetpointReceiver
+from petrobot.services.timers import Timers
 from tests.node.conftest import Clock
 from tests.waiting import Limit
 
 PLAIN = st.recursive(
-    st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats(allow_nan=False) | st.text() | st.binary(),
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**63)
+    | st.floats(allow_nan=False)
+    | st.text()
+    | st.binary(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
     max_leaves=8,
 )
 
 
-# --- global memory ---------------------------------------------------------------------------------------------------
+# --- global memory ----------------------------------------------------------------------------
 
 
 class MemoryMachine(RuleBasedStateMachine):
@@ -72,7 +78,9 @@ class MemoryMachine(RuleBasedStateMachine):
     @rule(name=st.sampled_from("abc"), version=st.integers(0, 4), value=PLAIN)
     def compare_and_set(self, name: str, version: int, value: Any) -> None:
         current = self.model.get(name, (None, 0))
-        result = self.memory.call("memory.compare_and_set", {"name": name, "version": version, "value": value})
+        result = self.memory.call(
+            "memory.compare_and_set", {"name": name, "version": version, "value": value}
+        )
         if version == current[1]:
             self._wrote(name, value)
             assert result.status is Status.SUCCESS
@@ -83,7 +91,10 @@ class MemoryMachine(RuleBasedStateMachine):
     @rule(name=st.sampled_from("abc"))
     def get(self, name: str) -> None:
         value, version = self.model.get(name, (None, 0))
-        assert self.memory.call("memory.get", {"name": name}).values == {"value": value, "version": version}
+        assert self.memory.call("memory.get", {"name": name}).values == {
+            "value": value,
+            "version": version,
+        }
 
     @invariant()
     def every_change_is_told_once(self) -> None:
@@ -104,7 +115,12 @@ TestMemory.settings = settings(max_examples=25, stateful_step_count=25, deadline
         ("memory.get", {"name": 3}, "bad_arguments", "give a text"),
         ("memory.put", {"name": "x"}, "bad_arguments", "value"),
         ("memory.put", {"name": "x", "value": 1, "force": True}, "bad_arguments", "force"),
-        ("memory.compare_and_set", {"name": "x", "version": "1", "value": 1}, "bad_arguments", "memory.get told"),
+        (
+            "memory.compare_and_set",
+            {"name": "x", "version": "1", "value": 1},
+            "bad_arguments",
+            "memory.get told",
+        ),
         ("memory.put", {"name": "x", "value": bytes(1 << 21)}, "too_large", "the limit is 1048576"),
     ],
 )
@@ -118,14 +134,16 @@ def test_the_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory_module, "TOTAL_BYTES", 1000)
     memory = Memory(lambda *_: None)
     for name in "abc":
-        assert memory.call("memory.put", {"name": name, "value": bytes(300)}).status is Status.SUCCESS
+        assert (
+            memory.call("memory.put", {"name": name, "value": bytes(300)}).status is Status.SUCCESS
+        )
     assert memory.call("memory.put", {"name": "d", "value": 1}).cause == "memory_full"
     assert memory.call("memory.put", {"name": "a", "value": bytes(600)}).cause == "memory_full"
     assert memory.call("memory.put", {"name": "a", "value": bytes(200)}).values == {"version": 2}
     assert event_name("a") == "memory:a"
 
 
-# --- timers, outlets, set points -------------------------------------------------------------------------------------
+# --- timers, outlets, set points --------------------------------------------------------------
 
 
 @given(
@@ -140,7 +158,9 @@ def test_timers_lie_on_an_absolute_grid(period: float, steps: list[float]) -> No
         fired += len(timers.advance(now))
         due = timers.due()
         assert due is not None and now < due + 1e-5 <= now + period + 2e-5
-        assert math.isclose((due - 10.0) / period, round((due - 10.0) / period), abs_tol=1e-4), "it left its grid"
+        assert math.isclose((due - 10.0) / period, round((due - 10.0) / period), abs_tol=1e-4), (
+            "it left its grid"
+        )
     assert fired <= (now - 10.0) / period + 1e-3, "a pulse too many"
     if max(steps) < period:
         assert fired == math.floor((now - 10.0) / period + 1e-6) or math.isclose(
@@ -205,7 +225,7 @@ def test_a_set_point_ages_and_goes_stale() -> None:
     assert (point.values, point.count) == (None, 2)
 
 
-# --- remote driver ---------------------------------------------------------------------------------------------------
+# --- remote driver ----------------------------------------------------------------------------
 
 
 class Stub:
@@ -267,7 +287,7 @@ def test_commands_are_numbered_taken_in_order_and_answered_for() -> None:
         remote.send({"x": object()})
 
 
-# --- pipes -----------------------------------------------------------------------------------------------------------
+# --- pipes ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -354,7 +374,9 @@ async def test_the_end_of_a_process_is_noticed_whoever_holds_its_pipe(
     """With the kernel's notice, and where there is none (before Linux 5.3)."""
     if missing:
         monkeypatch.delattr(os, "pidfd_open")
-    process = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; exec sleep 60"], stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        ["sh", "-c", "sleep 60 & echo $!; exec sleep 60"], stdout=subprocess.PIPE
+    )
     assert process.stdout is not None
     holder = int(process.stdout.readline())
     waiting = asyncio.create_task(until_ended(process.pid))
@@ -397,13 +419,15 @@ def test_of_states_only_the_newest_counts() -> None:
     sent, limit = 0, Limit("a full line", steps=100_000)
     while driver.send([bytes(1000)]) and limit.left():
         sent += 1
-    assert (sent > 10, driver.closed) == (True, False), "a reader that stands still must not stop the writer"
+    assert (sent > 10, driver.closed) == (True, False), (
+        "a reader that stands still must not stop the writer"
+    )
     actions.close()
     assert (driver.send([0]), driver.closed) == (False, True)
     driver.close()
 
 
-# --- scripts ---------------------------------------------------------------------------------------------------------
+# --- scripts ----------------------------------------------------------------------------------
 
 
 def test_a_script_is_played_line_by_line(tmp_path: Path) -> None:
@@ -411,13 +435,20 @@ def test_a_script_is_played_line_by_line(tmp_path: Path) -> None:
     file.write_text(
         "schema = 1\n[actions.one]\nseconds = [0.2, 0.4]\nvalues = { x = 1 }\n"
         '[[actions.two]]\nstatus = "failure"\ncause = "c"\ntext = "t"\nseconds = 0.1\n'
-        'events = [{ after = 0.05, name = "half", data = { y = 2 } }, { after = 9.0, name = "never" }]\n'
+        'events = [{ after = 0.05, name = "half", data = { y = 2 } }, { after = 9.0, name = '
+        '"never" }]\n'
         "[[actions.two]]\n"
     )
     script = load(file)
     played = [rehearse(script["two"], anything=1) for _ in range(3)]
-    assert [(p.result.status, p.result.cause) for p in played] == [("failure", "c"), ("success", ""), ("failure", "c")]
-    assert [(round(t, 3), name, data) for t, name, data in played[0].events] == [(0.052, "half", {"y": 2})]
+    assert [(p.result.status, p.result.cause) for p in played] == [
+        ("failure", "c"),
+        ("success", ""),
+        ("failure", "c"),
+    ]
+    assert [(round(t, 3), name, data) for t, name, data in played[0].events] == [
+        (0.052, "half", {"y": 2})
+    ]
     times = {rehearse(script["one"], seed=seed).seconds for seed in range(8)}
     assert len(times) > 3 and all(0.2 - 1e-9 <= t <= 0.4 + 0.004 for t in times)
 
@@ -429,8 +460,14 @@ def test_a_script_is_played_line_by_line(tmp_path: Path) -> None:
         ("schema = 1\n[action.x]", "action: unknown table; did you mean 'actions'?"),
         ("schema = 1\nactions = 3", "actions: write [actions.NAME] tables"),
         ("schema = 1\n[actions.x]\nstate = 1", "actions.x: unknown key 'state'"),
-        ('schema = 1\n[actions.x]\nstatus = "good"', 'status is \'good\'; write "success", "failure" or "error"'),
-        ("schema = 1\n[actions.x]\nseconds = [2, 1]", "seconds is [2, 1]; write a number, or [shortest, longest]"),
+        (
+            'schema = 1\n[actions.x]\nstatus = "good"',
+            'status is \'good\'; write "success", "failure" or "error"',
+        ),
+        (
+            "schema = 1\n[actions.x]\nseconds = [2, 1]",
+            "seconds is [2, 1]; write a number, or [shortest, longest]",
+        ),
         ("schema = 1\n[actions.x]\nvalues = 1", "values is 1; write a table"),
         ("schema = 1\n[actions.x]\nevents = [{ name = 1 }]", "event {'name': 1}; write"),
         ("schema = 1\n[actions]\nx = 1", "actions.x: is 1; write a table with status"),
@@ -445,7 +482,7 @@ def test_bad_scripts_are_refused(tmp_path: Path, text: str, says: str) -> None:
     assert says in str(caught.value) and str(file) in str(caught.value)
 
 
-# --- rehearsals ------------------------------------------------------------------------------------------------------
+# --- rehearsals -------------------------------------------------------------------------------
 
 
 def test_a_rehearsal_tells_all_that_an_action_did() -> None:
@@ -468,9 +505,14 @@ def test_a_rehearsal_tells_all_that_an_action_did() -> None:
         world=lambda now: lamp.update(light=now > 0.5),
         n=4,
     )
-    assert played.result.values == {"sum": 5, "unknown": "unknown_service"} and 0.5 < played.seconds < 0.52
+    assert (
+        played.result.values == {"sum": 5, "unknown": "unknown_service"}
+        and 0.5 < played.seconds < 0.52
+    )
     assert [name for _, name, _ in played.calls] == ["add", "memory.put", "memory.get", "nobody"]
-    assert len(played.published) == 26 and played.progress == [(0.0, 0.5)] and len(played.events) == 1
+    assert (
+        len(played.published) == 26 and played.progress == [(0.0, 0.5)] and len(played.events) == 1
+    )
 
 
 def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
@@ -484,8 +526,12 @@ def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
         return provisional(failure("loose", "may hold", force=1.0))
 
     played = rehearse(act, run="m/pick#1")
-    assert played.result == Result(Status.FAILURE, {"force": 1.0}, "loose", "may hold", deferred=True)
-    assert [(run, status, cause) for _, run, status, cause in played.verdicts] == [("m/pick#1", "failure", "crooked")]
+    assert played.result == Result(
+        Status.FAILURE, {"force": 1.0}, "loose", "may hold", deferred=True
+    )
+    assert [(run, status, cause) for _, run, status, cause in played.verdicts] == [
+        ("m/pick#1", "failure", "crooked")
+    ]
 
 
 def test_a_script_may_be_provisional(tmp_path: Path) -> None:
@@ -507,7 +553,7 @@ def test_a_rehearsal_has_a_limit() -> None:
     assert rehearse(act, cancel_after=1.0).result.cause == "cancelled"
 
 
-# --- the process of a cyclic driver ----------------------------------------------------------------------------------
+# --- the process of a cyclic driver -----------------------------------------------------------
 
 
 class Ports:
@@ -615,7 +661,9 @@ def test_the_driver_is_stopped_before_the_process_leaves_a_dead_node() -> None:
     link.close()
 
 
-@pytest.mark.parametrize(("verb", "answer"), [("hold", "held"), ("release", "released"), ("status", "up")])
+@pytest.mark.parametrize(
+    ("verb", "answer"), [("hold", "held"), ("release", "released"), ("status", "up")]
+)
 def test_the_node_commands_the_driver_itself(verb: str, answer: str) -> None:
     process = Process(Moving())
     process.node.post(["command", "c", verb])

@@ -1,4 +1,5 @@
-"""What cannot be sent ends the run that made it, alone: no value of an action costs the connection, a worker or another run."""
+"""What cannot be sent ends the run that made it, alone: no value of an action costs the connection,
+a worker or another run."""
 
 from __future__ import annotations
 
@@ -16,14 +17,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.action import Result, Status, success
-from services.comm import messages as m
-from services.comm.codec import ProtocolError, decode, encode
-from services.comm.directory import parse
-from services.comm.notice import PeerLost
-from services.context import checked, checked_result
-from services.pipe import Pipe
-from services.runs import Ended, flat, record
+from petrobot.services.action import Result, Status, success
+from petrobot.services.comm import messages as m
+from petrobot.services.comm.codec import ProtocolError, decode, encode
+from petrobot.services.comm.directory import parse
+from petrobot.services.comm.notice import PeerLost
+from petrobot.services.context import checked, checked_result
+from petrobot.services.pipe import Pipe
+from petrobot.services.runs import Ended, flat, record
 from tests.node.conftest import Bench
 from tests.node.test_heard import OneNode
 from tests.node.test_processes import Operator, operator_of
@@ -95,7 +96,10 @@ async def ends_alone(operator: Operator, service: str, kind: str, cause: str) ->
 async def test_what_an_action_returns(operator: Operator, kind: str) -> None:
     end = await ends_alone(operator, "give", kind, "bad_result")
     if kind == "long cause":
-        assert "cause: expected at most 255 characters, found 1,234: put long words into the text" in end.text
+        assert (
+            "cause: expected at most 255 characters, found 1,234: put long words into the text"
+            in end.text
+        )
 
 
 @pytest.mark.processes
@@ -132,7 +136,9 @@ def test_many_large_records_at_once() -> None:
     while len(got) < 6 and time.monotonic() < until:
         got += node.read()
     writing.join(60.0)
-    assert [(number, data == large) for number, data in got] == [(number, True) for number in range(6)]
+    assert [(number, data == large) for number, data in got] == [
+        (number, True) for number in range(6)
+    ]
     worker.close()
     node.close()
 
@@ -147,19 +153,29 @@ def flush_all(pipe: Pipe) -> None:
 @pytest.mark.processes
 @pytest.mark.parametrize(
     ("service", "arguments"),
-    [("echo", {"value": bytes(17 << 20)}), ("echo", {"value": [[]] * 19_998}), ("s" * 256, {}), ("\ud800", {})],
+    [
+        ("echo", {"value": bytes(17 << 20)}),
+        ("echo", {"value": [[]] * 19_998}),
+        ("s" * 256, {}),
+        ("\ud800", {}),
+    ],
     ids=["large", "many containers", "long name", "half a letter"],
 )
-async def test_a_call_that_cannot_be_sent_never_leaves(operator: Operator, service: str, arguments: Any) -> None:
+async def test_a_call_that_cannot_be_sent_never_leaves(
+    operator: Operator, service: str, arguments: Any
+) -> None:
     client = operator.clients["only"]
     innocent = asyncio.create_task(operator.call("nap", None, seconds=0.1))
     end = await asyncio.wait_for(client.call(service, arguments), 30.0)
-    assert (end.status, end.executed) == ("error", "no") and end.cause in ("too_large", "unencodable"), end
+    assert (end.status, end.executed) == ("error", "no") and end.cause in (
+        "too_large",
+        "unencodable",
+    ), end
     assert (await innocent).status == "success"
     assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
 
 
-# --- the same rules at both ends -------------------------------------------------------------------------------------
+# --- the same rules at both ends --------------------------------------------------------------
 
 LEAVES = (
     st.none()
@@ -170,17 +186,33 @@ LEAVES = (
     | st.text(st.characters(categories=["Cs", "Lu"]), max_size=3)
     | st.binary(max_size=5)
     | st.sampled_from(
-        [np.float32(1.5), np.int64(3), np.bool_(True), np.str_("x"), np.zeros(2), 1j, {1}, object(), Status.ERROR]
+        [
+            np.float32(1.5),
+            np.int64(3),
+            np.bool_(True),
+            np.str_("x"),
+            np.zeros(2),
+            1j,
+            {1},
+            object(),
+            Status.ERROR,
+        ]
     )
 )
 KEYS = st.text(max_size=4) | st.booleans() | st.integers() | st.none()
 VALUES = st.recursive(
     LEAVES,
-    lambda inner: st.lists(inner, max_size=4) | st.tuples(inner, inner) | st.dictionaries(KEYS, inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.tuples(inner, inner)
+        | st.dictionaries(KEYS, inner, max_size=4)
+    ),
     max_leaves=30,
 )
 CAUSES = (
-    st.text(max_size=5) | st.integers(250, 260).map("x".__mul__) | st.sampled_from(["\ud800", None, 3, ValueError("v")])
+    st.text(max_size=5)
+    | st.integers(250, 260).map("x".__mul__)
+    | st.sampled_from(["\ud800", None, 3, ValueError("v")])
 )
 
 
@@ -195,7 +227,12 @@ def same(one: Any, other: Any) -> bool:
     return type(one) is type(other) and bool(one == other)
 
 
-@given(VALUES, CAUSES, st.sampled_from([*Status, "success", "perhaps", 3]), st.text(max_size=3) | st.just("\udc00"))
+@given(
+    VALUES,
+    CAUSES,
+    st.sampled_from([*Status, "success", "perhaps", 3]),
+    st.text(max_size=3) | st.just("\udc00"),
+)
 @settings(suppress_health_check=[HealthCheck.too_slow], max_examples=400, deadline=None)
 def test_a_result_crosses_unchanged_or_is_refused_where_it_is_made(
     value: Any, cause: Any, status: Any, text: str
@@ -234,18 +271,23 @@ def test_a_run_that_returns_anything_ends_once_and_alone(value: Any) -> None:
         await ctx.sleep(0.02)
         return success()
 
-    from services.comm.directory import ActionEntry
-    from services.runner import Runner
+    from petrobot.services.comm.directory import ActionEntry
+    from petrobot.services.runner import Runner
     from tests.node.conftest import Clock
 
     clock = Clock()
-    entries = {name: ActionEntry(name, "tests:none", "task", "here", "") for name in ("act", "innocent")}
+    entries = {
+        name: ActionEntry(name, "tests:none", "task", "here", "") for name in ("act", "innocent")
+    }
     actions = {"act": act, "innocent": innocent}
     bench = Bench(clock, None, Runner(entries, clock=clock, substitutes=actions, virtual=True))
     first, second = bench.begin("act"), bench.begin("innocent")
     bench.tick(0.1)
     assert bench.ended(second).status == "success"
-    assert (bench.ended(first).status, bench.ended(first).cause) in {("success", ""), ("error", "bad_result")}
+    assert (bench.ended(first).status, bench.ended(first).cause) in {
+        ("success", ""),
+        ("error", "bad_result"),
+    }
 
 
 NAMES = st.text(max_size=4) | st.integers(250, 260).map("x".__mul__) | st.just("\ud800")

@@ -1,4 +1,5 @@
-"""Nodes as real processes: calls, hanging and dying actions, cyclic drivers, streams, memory, and clean ends."""
+"""Nodes as real processes: calls, hanging and dying actions, cyclic drivers, streams, memory, and
+clean ends."""
 
 from __future__ import annotations
 
@@ -16,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from services.comm.caller import Caller
-from services.comm.client import Client
-from services.comm.directory import Directory, parse
-from services.comm.lockstep import Member
-from services.comm.messages import Answer, Call, Command, Hello, Outcome
-from services.comm.notice import Accepted, Answered, EventArrived, Notice
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.lockstep import Member
+from petrobot.services.comm.messages import Answer, Call, Command, Hello, Outcome
+from petrobot.services.comm.notice import Accepted, Answered, EventArrived, Notice
 from tests.node.conftest import OUTSIDE
 from tests.node.test_lockstep import CALLS, Coordinator, World, trace_of
 from tests.node.test_lockstep import CELL as LOCKSTEP
@@ -32,7 +33,8 @@ from tests.waiting import Limit
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
-"""Seconds that a condition may keep one waiting on a slow machine; nothing takes them unless it is broken."""
+"""Seconds that a condition may keep one waiting on a slow machine; nothing takes them unless it is
+broken."""
 
 CELL = """\
 schema = 1
@@ -100,7 +102,9 @@ class Operator:
 
     async def connect(self, *nodes: str) -> None:
         for node in nodes:
-            hello = Hello(2, 2, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash)
+            hello = Hello(
+                2, 2, "coordinator", "operator", f"{self.boot} {node}", 1, self.directory.hash
+            )
             caller = Caller(node, hello, auto_ack=True)
             host, port = self.directory.address(node)
             self.clients[node] = Client(host, port, caller, on_notices=self._take)
@@ -111,9 +115,13 @@ class Operator:
         self.notices += notices
         self.changed.set()
 
-    async def call(self, service: str, deadline: float | None = None, /, **arguments: Any) -> Outcome:
+    async def call(
+        self, service: str, deadline: float | None = None, /, **arguments: Any
+    ) -> Outcome:
         client = self.clients[self.directory.where(service)]
-        return await asyncio.wait_for(client.call(service, arguments, deadline=deadline, seed=3), PATIENCE)
+        return await asyncio.wait_for(
+            client.call(service, arguments, deadline=deadline, seed=3), PATIENCE
+        )
 
     async def heard(self, kind: type[Any], fits: Callable[[Any], bool] = lambda _: True) -> Any:
         async with asyncio.timeout(PATIENCE):
@@ -153,7 +161,7 @@ def select_nothing() -> None:
 def start_node(name: str, file: Path, *options: str) -> subprocess.Popen[str]:
     """Launch a node as a process."""
     return subprocess.Popen(
-        [sys.executable, "-m", "services", name, "--services", str(file), *options],
+        [sys.executable, "-m", "petrobot.services", name, "--services", str(file), *options],
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -245,7 +253,9 @@ async def test_actions_services_and_memory_across_nodes(operator: Operator) -> N
 
 
 async def test_two_nodes_share_a_variable_without_losing_an_update(operator: Operator) -> None:
-    ends = await asyncio.gather(operator.call("swap_left", times=20), operator.call("swap_right", times=20))
+    ends = await asyncio.gather(
+        operator.call("swap_left", times=20), operator.call("swap_right", times=20)
+    )
     assert [(end.status, end.text) for end in ends] == [("success", "")] * 2
     assert (await operator.call("memory.get", name="count")).values["value"] == 40
 
@@ -289,7 +299,9 @@ async def test_set_points_from_node_to_node(operator: Operator) -> None:
     assert end.values["count"] >= 3 and end.values["position"] > 0.0
 
 
-async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(operator: Operator) -> None:
+async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(
+    operator: Operator,
+) -> None:
     before = await pids(operator, "left", "")
     hanging = asyncio.create_task(operator.call("hang"))
     await operator.heard(Accepted)
@@ -320,8 +332,12 @@ async def test_a_hanging_action_that_moves_has_its_device_stopped_first(operator
     assert now["driver"] == drivers["driver"] and now["actions"] != drivers["actions"]
 
 
-@pytest.mark.parametrize(("service", "says"), [("segfault", "SIGSEGV"), ("leave", "exited with code 7")])
-async def test_a_dying_worker_is_reported_and_started_again(operator: Operator, service: str, says: str) -> None:
+@pytest.mark.parametrize(
+    ("service", "says"), [("segfault", "SIGSEGV"), ("leave", "exited with code 7")]
+)
+async def test_a_dying_worker_is_reported_and_started_again(
+    operator: Operator, service: str, says: str
+) -> None:
     end = await operator.call(service)
     assert (end.status, end.cause, end.executed) == ("error", "worker_died", "unknown")
     assert says in end.text
@@ -411,7 +427,11 @@ async def _beyond(operator: Operator, position: float) -> bool:
 async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> None:
     other = Operator(nodes.directory)
     hello = Hello(2, 2, "coordinator", "leaver", "boot", 1, nodes.directory.hash)
-    client = Client(*nodes.directory.address("left"), Caller("left", hello, auto_ack=True), on_notices=other._take)
+    client = Client(
+        *nodes.directory.address("left"),
+        Caller("left", hello, auto_ack=True),
+        on_notices=other._take,
+    )
     client.start()
     assert await client.connected(PATIENCE)
     client.caller.call(client.now(), Call("orphan", "nap", {"seconds": 60.0}))
@@ -429,7 +449,10 @@ async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> N
 async def test_sigterm_ends_a_node_and_all_its_processes(tmp_path: Path) -> None:
     running = Nodes(tmp_path, "left")
     async with operator_of(running.directory, "left") as operator:
-        children = {**await pids(operator, "left", "slide"), "general": (await pids(operator, "left", ""))["actions"]}
+        children = {
+            **await pids(operator, "left", "slide"),
+            "general": (await pids(operator, "left", ""))["actions"],
+        }
         call = Call("last", "go", {"to": 80.0})
         left = operator.clients["left"]
         left.caller.call(left.now(), call)
@@ -442,7 +465,10 @@ async def test_sigterm_ends_a_node_and_all_its_processes(tmp_path: Path) -> None
 async def test_kill_9_of_a_node_ends_its_processes(tmp_path: Path) -> None:
     running = Nodes(tmp_path, "left")
     async with operator_of(running.directory, "left") as operator:
-        children = {**await pids(operator, "left", "slide"), "general": (await pids(operator, "left", ""))["actions"]}
+        children = {
+            **await pids(operator, "left", "slide"),
+            "general": (await pids(operator, "left", ""))["actions"],
+        }
         hanging = asyncio.create_task(operator.call("hang", 30.0))
         await operator.heard(Accepted)
         running.processes["left"].kill()
@@ -473,7 +499,9 @@ def test_lock_step_in_four_processes_is_that_in_one(tmp_path: Path) -> None:
     nodes = [start_node(name, file, "--lockstep") for name in ("left", "right")]
     coordinator, world = Coordinator(places, script), World(places)
     parties: list[Any] = [coordinator, world]
-    members = [Member(p.name, [p], places.members(), directory=places.hash, patience=30.0) for p in parties]
+    members = [
+        Member(p.name, [p], places.members(), directory=places.hash, patience=30.0) for p in parties
+    ]
     threads = [threading.Thread(target=run_member, args=(member, 300)) for member in members]
     for thread in threads:
         thread.start()
@@ -494,31 +522,45 @@ def run_member(member: Member, ticks: int) -> None:
 async def test_scripted_actions(tmp_path: Path) -> None:
     script = tmp_path / "script.toml"
     script.write_text(
-        'schema = 1\n[[actions.add]]\nvalues = { sum = 7 }\n[[actions.add]]\nstatus = "error"\ncause = "tired"\n'
+        "schema = 1\n[[actions.add]]\nvalues = { sum = 7 }\n[[actions.add]]\nstatus = "
+        '"error"\ncause = "tired"\n'
     )
     running = Nodes(tmp_path, "left", mock=str(script))
     async with operator_of(running.directory, "left") as operator:
         first, second, third = [await operator.call("add", anything=1) for _ in range(3)]
-        assert first.values == third.values == {"sum": 7} and (second.status, second.cause) == ("error", "tired")
+        assert first.values == third.values == {"sum": 7} and (second.status, second.cause) == (
+            "error",
+            "tired",
+        )
     assert running.stop() == {"left": 0}
 
 
 BAD = [
     ("port = {left}\n", "", "nodes.left.port: is missing"),
-    ("toy_cell.drivers:Slide", "toy_cell.drivers:Slid", "has no callable 'Slid'; did you mean 'Slide'?"),
-    ("period = 0.004", "pace = 1", "devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'"),
+    (
+        "toy_cell.drivers:Slide",
+        "toy_cell.drivers:Slid",
+        "has no callable 'Slid'; did you mean 'Slide'?",
+    ),
+    (
+        "period = 0.004",
+        "pace = 1",
+        "devices.slide: toy_cell.drivers:Slide refuses it: is missing 'period'",
+    ),
     ('host = "127.0.0.1"\nport = {left}', 'host = "0.0.0.0"\nport = {left}', "petrobot keys"),
 ]
 
 
 @pytest.mark.parametrize(("old", "new", "says"), BAD)
-def test_a_bad_file_ends_the_node_with_one_clear_text(tmp_path: Path, old: str, new: str, says: str) -> None:
+def test_a_bad_file_ends_the_node_with_one_clear_text(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
     assert old in CELL
     file = tmp_path / "services.toml"
     left, right = free_ports(2)
     file.write_text(CELL.replace(old, new, 1).format(left=left, right=right))
     ended = subprocess.run(
-        [sys.executable, "-m", "services", "left", "--services", str(file)],
+        [sys.executable, "-m", "petrobot.services", "left", "--services", str(file)],
         env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
         capture_output=True,
         text=True,
@@ -532,7 +574,9 @@ def test_a_run_takes_wall_time_only_while_it_must(nodes: Nodes) -> None:
     before, began = _cpu(nodes), time.monotonic()
     while time.monotonic() < began + 1.0:
         select_nothing()
-    assert _cpu(nodes) - before < 0.5 * (time.monotonic() - began), "something polls although nothing is to be done"
+    assert _cpu(nodes) - before < 0.5 * (time.monotonic() - began), (
+        "something polls although nothing is to be done"
+    )
 
 
 def _cpu(nodes: Nodes) -> float:

@@ -1,4 +1,5 @@
-"""Runs of actions: how each can end, what a cancel does, who guards the device, and that every run ends exactly once."""
+"""Runs of actions: how each can end, what a cancel does, who guards the device, and that every run
+ends exactly once."""
 
 from __future__ import annotations
 
@@ -10,11 +11,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.action import Cancelled, Context, Result, error, failure, success
-from services.comm.party import TICK
-from services.context import CallFailed
-from services.runner import GRACE, STOP_LIMIT, Runner
-from services.runs import Asked, Begin, Dropped, Ended, Hold, Progressed, Raised, Sent, Stop
+from petrobot.services.action import Cancelled, Context, Result, error, failure, success
+from petrobot.services.comm.party import TICK
+from petrobot.services.context import CallFailed
+from petrobot.services.runner import GRACE, STOP_LIMIT, Runner
+from petrobot.services.runs import (
+    Asked,
+    Begin,
+    Dropped,
+    Ended,
+    Hold,
+    Progressed,
+    Raised,
+    Sent,
+    Stop,
+)
 from tests.node.conftest import Bench, Clock, Device
 
 Make = Callable[..., Bench]
@@ -80,7 +91,14 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
     (lambda ctx: error("lost"), {}, "error", "lost", "", "yes"),
     (naps, {}, "success", "", "", "yes"),
     (raises, {}, "error", "exception", "KeyError: 'missing' in raises (test_runner.py:", "yes"),
-    (raises_later, {}, "error", "exception", "ConnectionError: the bus is gone in raises_later", "yes"),
+    (
+        raises_later,
+        {},
+        "error",
+        "exception",
+        "ConnectionError: the bus is gone in raises_later",
+        "yes",
+    ),
     (
         awaits_foreign,
         {},
@@ -93,18 +111,46 @@ ENDINGS: list[tuple[Any, dict[str, Any], str, str, str, str]] = [
     (bad_wait, {}, "error", "exception", "ZeroDivisionError", "yes"),
     (leaves, {}, "error", "exception", "SystemExit: 3", "yes"),
     (cancels_itself, {}, "error", "exception", "Cancelled", "yes"),
-    (lambda ctx: 3, {}, "error", "bad_result", "returned a int; return success(), failure() or error()", "yes"),
-    (lambda ctx: success(x=object()), {}, "error", "bad_result", "result.x: a object is not plain data", "yes"),
+    (
+        lambda ctx: 3,
+        {},
+        "error",
+        "bad_result",
+        "returned a int; return success(), failure() or error()",
+        "yes",
+    ),
+    (
+        lambda ctx: success(x=object()),
+        {},
+        "error",
+        "bad_result",
+        "result.x: a object is not plain data",
+        "yes",
+    ),
     (doubled, {"z": 4}, "error", "bad_arguments", "takes no argument 'z'; it takes: x", "no"),
     (lambda ctx, *, x: success(), {}, "error", "bad_arguments", "needs the argument 'x'", "no"),
-    (doubled, {"x": object()}, "error", "bad_arguments", "arguments.x: a object is not plain data", "no"),
+    (
+        doubled,
+        {"x": object()},
+        "error",
+        "bad_arguments",
+        "arguments.x: a object is not plain data",
+        "no",
+    ),
 ]
 
 
 @pytest.mark.parametrize("device", [False, True])
 @pytest.mark.parametrize(("action", "arguments", "status", "cause", "text", "executed"), ENDINGS)
 def test_every_way_to_end(
-    bench: Make, device: bool, action: Any, arguments: dict[str, Any], status: str, cause: str, text: str, executed: str
+    bench: Make,
+    device: bool,
+    action: Any,
+    arguments: dict[str, Any],
+    status: str,
+    cause: str,
+    text: str,
+    executed: str,
 ) -> None:
     b = bench(act=action, device=device or None)
     run = b.begin("act", **arguments)
@@ -132,11 +178,15 @@ def test_a_run_begins_at_advance_and_takes_simulated_time(bench: Make) -> None:
     run = b.begin("act", seconds=0.1)
     assert b.seen == [] and b.runner.due() == float("-inf")
     b.tick(1.0)
-    assert b.ended(run).seconds == pytest.approx(0.1) and b.ended(run).values["now"] == pytest.approx(0.1)
+    assert b.ended(run).seconds == pytest.approx(0.1) and b.ended(run).values[
+        "now"
+    ] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(("virtual", "takes"), [(True, 0.05), (False, 0.0)])
-def test_declared_computing_time_passes_in_lock_step_only(bench: Make, virtual: bool, takes: float) -> None:
+def test_declared_computing_time_passes_in_lock_step_only(
+    bench: Make, virtual: bool, takes: float
+) -> None:
     b = bench(act=doubled, virtual=virtual, limits={"act": {"compute_time": 0.05}})
     run = b.begin("act")
     b.tick(1.0)
@@ -150,7 +200,7 @@ def test_cpu_time_is_that_of_the_action(bench: Make) -> None:
     assert 0.0005 < b.ended(run).cpu_seconds < 5.0
 
 
-# --- cancel and deadline ---------------------------------------------------------------------------------------------
+# --- cancel and deadline ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("why", ["cancelled", "deadline"])
@@ -181,7 +231,9 @@ def test_a_cancelled_action_cleans_up_and_its_device_comes_to_rest(bench: Make, 
 
 
 @pytest.mark.parametrize("halting", [0.1, None])
-def test_an_action_that_does_not_let_go_has_its_device_stopped(bench: Make, halting: float | None) -> None:
+def test_an_action_that_does_not_let_go_has_its_device_stopped(
+    bench: Make, halting: float | None
+) -> None:
     async def stubborn(ctx: Context) -> Result:
         ctx.device.moving = True
         while True:
@@ -233,7 +285,11 @@ def test_a_result_after_the_cancel_does_not_count(bench: Make) -> None:
     b.tick(0.1)
     b.take(Stop(run))
     b.tick()
-    assert (b.ended(run).status, b.ended(run).cause, b.ended(run).values) == ("error", "cancelled", {})
+    assert (b.ended(run).status, b.ended(run).cause, b.ended(run).values) == (
+        "error",
+        "cancelled",
+        {},
+    )
 
 
 def test_declared_computing_is_cancelled_too(bench: Make) -> None:
@@ -264,7 +320,10 @@ def test_what_starts_at_once_does_not_wait_for_a_stopping_run(bench: Make) -> No
 @settings(max_examples=60, deadline=None)
 @given(
     cancels=st.lists(st.tuples(st.integers(0, 60), st.integers(0, 5)), max_size=6),
-    begins=st.lists(st.tuples(st.integers(0, 60), st.sampled_from(["wait", "stubborn", "raise", "quick"])), max_size=6),
+    begins=st.lists(
+        st.tuples(st.integers(0, 60), st.sampled_from(["wait", "stubborn", "raise", "quick"])),
+        max_size=6,
+    ),
     halting=st.sampled_from([0.0, 0.2, None]),
 )
 def test_never_two_runs_on_a_device_and_each_ends_once(
@@ -295,7 +354,13 @@ def test_never_two_runs_on_a_device_and_each_ends_once(
     clock = Clock()
     device = Device(clock, halting)
     entries = {k: action(k) for k in ("wait", "stubborn", "raise", "quick")}
-    runner = Runner({k: _entry(k) for k in entries}, clock=clock, device=device, substitutes=entries, virtual=True)
+    runner = Runner(
+        {k: _entry(k) for k in entries},
+        clock=clock,
+        device=device,
+        substitutes=entries,
+        virtual=True,
+    )
     ended: list[str] = []
     for tick in range(60 + int((GRACE + STOP_LIMIT + 0.5) / TICK)):
         clock.now = tick * TICK
@@ -315,7 +380,7 @@ def test_never_two_runs_on_a_device_and_each_ends_once(
 
 
 def _entry(name: str) -> Any:
-    from services.comm.directory import ActionEntry
+    from petrobot.services.comm.directory import ActionEntry
 
     return ActionEntry(name, "tests:none", "task", "here", "it")
 
@@ -353,7 +418,7 @@ def test_cancel_at_any_wait_is_thrown_there_once(at: int, steps: int) -> None:
         assert end.cause == "cancelled" and thrown == reached[-1:]
 
 
-# --- calls, streams, events ------------------------------------------------------------------------------------------
+# --- calls, streams, events -------------------------------------------------------------------
 
 
 def test_calls_go_out_with_child_ids_and_come_back(bench: Make) -> None:
@@ -450,12 +515,16 @@ def test_set_points_are_paced_repeated_and_end_with_their_run(bench: Make) -> No
     first = [(t, s) for t, s in sent if s.values != (9.0,)]
     assert [t for t, _ in first] == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08, 0.1], abs=1e-9)
     assert [s.values[0] for _, s in first] == [0.0, 4.0, 4.0, 4.0, 4.0, 4.0]
-    assert [s.elapsed for _, s in first][1:] == pytest.approx([0.004 + 0.02 * k for k in range(5)], abs=1e-9)
+    assert [s.elapsed for _, s in first][1:] == pytest.approx(
+        [0.004 + 0.02 * k for k in range(5)], abs=1e-9
+    )
     last = [t for t, s in sent if s.values == (9.0,)]
     assert len(last) in (3, 4) and max(last) <= b.ended(run).seconds + 1e-9
 
 
-@pytest.mark.parametrize(("stream", "values"), [("nowhere", [1.0]), ("points", [float("nan")]), ("points", ["x"])])
+@pytest.mark.parametrize(
+    ("stream", "values"), [("nowhere", [1.0]), ("points", [float("nan")]), ("points", ["x"])]
+)
 def test_a_bad_set_point_is_the_actions_fault(bench: Make, stream: str, values: list[Any]) -> None:
     async def streams(ctx: Context) -> Result:
         ctx.publish(stream, values)
@@ -496,7 +565,7 @@ def test_random_draws_are_keyed_by_seed_run_and_purpose(bench: Make) -> None:
     assert len(set(numbers)) == 9
 
 
-# --- operator's pause ------------------------------------------------------------------------------------------------
+# --- operator's pause -------------------------------------------------------------------------
 
 
 def test_a_held_run_stands_still_and_its_times_move(bench: Make) -> None:

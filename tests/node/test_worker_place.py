@@ -1,4 +1,5 @@
-"""How a node watches its processes: who is told what, when a hanging one is killed, and that every run ends once."""
+"""How a node watches its processes: who is told what, when a hanging one is killed, and that every
+run ends once."""
 
 from __future__ import annotations
 
@@ -12,12 +13,43 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.pipe import NewestLink
-from services.remote import EMERGENCY_STOP
-from services.runner import GRACE, STOP_LIMIT
-from services.runs import Answered, Begin, Ended, Hold, Order, Raised, Stop, Told, flat, record
-from services.worker import COMMAND, FAILED, LINK_LOST, PING, PONG, READY, STREAM_AT, WANTED, Setup
-from services.worker_place import MARGIN, NEXT, NOT_READY, PAUSES, SILENT, START_LIMIT, Happening, Stage, WorkerPlace
+from petrobot.services.pipe import NewestLink
+from petrobot.services.remote import EMERGENCY_STOP
+from petrobot.services.runner import GRACE, STOP_LIMIT
+from petrobot.services.runs import (
+    Answered,
+    Begin,
+    Ended,
+    Hold,
+    Order,
+    Raised,
+    Stop,
+    Told,
+    flat,
+    record,
+)
+from petrobot.services.worker import (
+    COMMAND,
+    FAILED,
+    LINK_LOST,
+    PING,
+    PONG,
+    READY,
+    STREAM_AT,
+    WANTED,
+    Setup,
+)
+from petrobot.services.worker_place import (
+    MARGIN,
+    NEXT,
+    NOT_READY,
+    PAUSES,
+    SILENT,
+    START_LIMIT,
+    Happening,
+    Stage,
+    WorkerPlace,
+)
 from tests.node.conftest import Clock
 from tests.waiting import Limit
 
@@ -26,7 +58,11 @@ class FakeChild:
     """A child process that does what the test says."""
 
     def __init__(
-        self, setup: Setup, heard: Callable[[Any, list[Any]], None], ended: Callable[[Any], None], link: Any
+        self,
+        setup: Setup,
+        heard: Callable[[Any, list[Any]], None],
+        ended: Callable[[Any], None],
+        link: Any,
     ) -> None:
         self.setup = setup
         self.say = partial(heard, self)
@@ -93,7 +129,11 @@ class Bench:
         self.reports: list[Any] = []
         setup = Setup("services.toml", "", "node", device)
         self.place = WorkerPlace(
-            setup, clock=self.clock, changed=lambda: None, wanted=self.wanted.append, spawn=self._spawn
+            setup,
+            clock=self.clock,
+            changed=lambda: None,
+            wanted=self.wanted.append,
+            spawn=self._spawn,
         )
         self.place.start()
 
@@ -146,7 +186,10 @@ def test_a_device_without_cycle_has_one_process() -> None:
 def test_a_cyclic_device_has_two_with_a_link_between_them() -> None:
     bench = Bench(child=KeepingChild)
     driver, actions = bench.cyclic()
-    assert bench.place.streams == {"points": 4711} and set(bench.place.pids()) == {"actions", "driver"}
+    assert bench.place.streams == {"points": 4711} and set(bench.place.pids()) == {
+        "actions",
+        "driver",
+    }
     near, far = NewestLink(driver.passed[0]), NewestLink(actions.link)
     assert near.send([1]) and far.newest() == [1]
     far.close()
@@ -172,7 +215,10 @@ def test_a_run_that_does_not_end_at_its_deadline(answers: bool) -> None:
     begun = bench.clock.now
     bench.begin(deadline=1.0)
     bench.run(1.0)
-    assert actions.orders()[-1] == Stop("r", "deadline", "not over after 1 s") and actions.got[-1][0] == PING
+    assert (
+        actions.orders()[-1] == Stop("r", "deadline", "not over after 1 s")
+        and actions.got[-1][0] == PING
+    )
     if answers:
         actions.say([PONG, 1])
     bench.run(SILENT + 0.01)
@@ -204,7 +250,9 @@ def test_a_dead_worker(stops: bool) -> None:
     end = bench.ended()
     assert (end.cause, end.executed) == ("worker_died", "unknown") and "SIGTEST" in end.text
     assert ("not known to stand still" in end.text) == (not stops)
-    assert len(bench.children) == 3 and not driver.killed, "only the actions' process is started again"
+    assert len(bench.children) == 3 and not driver.killed, (
+        "only the actions' process is started again"
+    )
     bench.children[-1].ready()
     bench.begin("next")
     assert bench.children[-1].orders() == [Begin("next", "act", {}, None)]
@@ -260,7 +308,9 @@ def test_hold_reaches_device_and_runs_and_moves_deadlines() -> None:
     assert driver.got[-1] == [COMMAND, "h", "hold"]
     driver.say(flat(Told("h", "held")))
     assert actions.orders()[-1] == Hold(True)
-    assert [type(r) for r in bench.run(10.0)] == [Told], "the deadline does not pass while it is held"
+    assert [type(r) for r in bench.run(10.0)] == [Told], (
+        "the deadline does not pass while it is held"
+    )
     bench.place.command(bench.clock.now, "r", "release")
     assert actions.orders()[-1] == Hold(False)
     bench.run(0.9)
@@ -296,7 +346,8 @@ def test_closing_lets_all_children_go() -> None:
 
 
 class Storm:
-    """A place under any order of what may happen to it, with the books of its runs and of its processes."""
+    """A place under any order of what may happen to it, with the books of its runs and of its
+    processes."""
 
     def __init__(self, kind: str) -> None:
         self.bench = Bench("" if kind == "none" else "arm")
@@ -395,14 +446,39 @@ class Storm:
 
 
 ACTS = (
-    *("begin", "ready", "driver dies", "actions die", "late words", "end", "stop", "wait", "link lost"),
-    *("no memory", "garbage", "failed", "nothing begun", "hold", "release", "status", EMERGENCY_STOP, "halted"),
+    *(
+        "begin",
+        "ready",
+        "driver dies",
+        "actions die",
+        "late words",
+        "end",
+        "stop",
+        "wait",
+        "link lost",
+    ),
+    *(
+        "no memory",
+        "garbage",
+        "failed",
+        "nothing begun",
+        "hold",
+        "release",
+        "status",
+        EMERGENCY_STOP,
+        "halted",
+    ),
 )
 
 
 @settings(max_examples=300, deadline=None)
-@given(kind=st.sampled_from(["cyclic", "device", "none"]), acts=st.lists(st.sampled_from(ACTS), max_size=30))
-def test_whatever_happens_it_is_ready_again_and_every_run_ends_once(kind: str, acts: list[str]) -> None:
+@given(
+    kind=st.sampled_from(["cyclic", "device", "none"]),
+    acts=st.lists(st.sampled_from(ACTS), max_size=30),
+)
+def test_whatever_happens_it_is_ready_again_and_every_run_ends_once(
+    kind: str, acts: list[str]
+) -> None:
     storm = Storm(kind)
     for act in acts:
         storm.happen(act)
@@ -412,7 +488,9 @@ def test_whatever_happens_it_is_ready_again_and_every_run_ends_once(kind: str, a
 @pytest.mark.parametrize("kind", ["cyclic", "device", "none"])
 def test_every_order_of_deaths_and_starts_ends_well(kind: str) -> None:
     """All sequences of five of the acts that move the place from one stage to another."""
-    for acts in product(("begin", "ready", "driver dies", "actions die", "late words", "wait"), repeat=5):
+    for acts in product(
+        ("begin", "ready", "driver dies", "actions die", "late words", "wait"), repeat=5
+    ):
         storm = Storm(kind)
         for act in acts:
             storm.happen(act)
@@ -439,7 +517,9 @@ def test_a_run_that_a_dead_process_had_not_begun_waits_for_the_next_one(stopped:
     bench.children[0].begun = 1
     bench.children[0].die()
     ends = {r.id: (r.cause, r.executed) for r in bench.run(1.0) if isinstance(r, Ended)}
-    assert ends == {"begun": ("worker_died", "unknown")} | ({"not begun": ("cancelled", "no")} if stopped else {})
+    assert ends == {"begun": ("worker_died", "unknown")} | (
+        {"not begun": ("cancelled", "no")} if stopped else {}
+    )
     bench.children[1].ready()
     bench.run(0.0)
     begins = [order.id for order in bench.children[1].orders() if isinstance(order, Begin)]

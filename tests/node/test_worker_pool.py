@@ -1,4 +1,5 @@
-"""Actions without a device: each run has a worker of its own, workers are started as needed and let go, and every run ends once."""
+"""Actions without a device: each run has a worker of its own, workers are started as needed and let
+go, and every run ends once."""
 
 from __future__ import annotations
 
@@ -7,9 +8,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
-from services.worker import COMMAND, STREAM_AT, WANTED, Setup
-from services.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
+from petrobot.services.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
+from petrobot.services.worker import COMMAND, STREAM_AT, WANTED, Setup
+from petrobot.services.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
 from tests.node.conftest import Clock
 from tests.node.test_worker_place import FakeChild
 from tests.waiting import Limit
@@ -49,7 +50,11 @@ class Pool:
 
     def of(self, identity: str) -> FakeChild:
         """The worker that was given a run."""
-        (child,) = [c for c in self.children if identity in {o.id for o in c.orders() if isinstance(o, Begin)}]
+        (child,) = [
+            c
+            for c in self.children
+            if identity in {o.id for o in c.orders() if isinstance(o, Begin)}
+        ]
         return child
 
     def run(self, seconds: float = 0.0) -> list[Any]:
@@ -158,7 +163,9 @@ def test_a_command_is_answered_once_by_all_that_run() -> None:
     bench.make_ready()
     bench.begin("late")
     got = [items for items in bench.of("late").got if items[0] in (COMMAND, "begin", "hold")]
-    assert got[0][:3] in ([COMMAND, "", "hold"], flat(Hold(True))) and got[1][0] == "begin", "it begins held"
+    assert got[0][:3] in ([COMMAND, "", "hold"], flat(Hold(True))) and got[1][0] == "begin", (
+        "it begins held"
+    )
     told = bench.answer("status")
     assert told is not None and (told.answer, set(told.data["runs"])) == ("up", {"a", "b", "late"})
 
@@ -167,7 +174,9 @@ def test_a_command_is_answered_once_by_all_that_run() -> None:
 @given(
     acts=st.lists(
         st.tuples(
-            st.sampled_from(["begin", "stop", "end", "die", "ready", "hold", "release", "stop all", "wait"]),
+            st.sampled_from(
+                ["begin", "stop", "end", "die", "ready", "hold", "release", "stop all", "wait"]
+            ),
             st.integers(0, 7),
         ),
         max_size=40,

@@ -1,8 +1,10 @@
-"""`make proof`: checks every promised figure in full and writes them to docs/figures.md. Resumes where it stopped.
+"""`make proof`: checks every promised figure in full and writes them to docs/figures.md. Resumes
+where it stopped.
 
-Each result is kept in reports/proof with the state of the sources that gave it; a proof whose sources have not changed
-since is not run again. `--only NAME ...` runs some, `--fresh` forgets what is kept, `--jobs K` runs K at once (speeds
-are always measured alone), `--page` only writes the page.
+Each result is kept in reports/proof with the state of the sources that gave it; a proof whose
+sources have not changed since is not run again. `--only NAME ...` runs some, `--fresh` forgets what
+is kept, `--jobs K` runs K at once (speeds are always measured alone), `--page` only writes the
+page.
 """
 
 from __future__ import annotations
@@ -41,13 +43,19 @@ def prove(proof: Proof) -> dict[str, Any]:
     begun, sources = time.monotonic(), proof.fingerprint()
     result = proof.measure()
     minutes = round((time.monotonic() - begun) / 60, 1)
-    data = {"sources": sources, "holds": proof.holds(result), "result": dict(result), "minutes": minutes}
+    data = {
+        "sources": sources,
+        "holds": proof.holds(result),
+        "result": dict(result),
+        "minutes": minutes,
+    }
     (KEPT / f"{proof.slug}.json").write_text(json.dumps(data, indent=2), encoding="utf-8")
     return data
 
 
 def run(todo: Sequence[Proof], jobs: int) -> bool:
-    """Prove these: several at once, but those that measure speed one by one afterwards. False if one does not hold."""
+    """Prove these: several at once, but those that measure speed one by one afterwards. False if
+    one does not hold."""
     good, done, begun = True, 0, time.monotonic()
     together, alone = [p for p in todo if not p.alone], [p for p in todo if p.alone]
     for group, workers in ((together, jobs), (alone, 1)):
@@ -59,7 +67,10 @@ def run(todo: Sequence[Proof], jobs: int) -> bool:
                 good = good and data["holds"]
                 holds = "holds" if data["holds"] else "DOES NOT HOLD"
                 togo = (time.monotonic() - begun) / done * (len(todo) - done) / 60
-                print(f"[{done}/{len(todo)}, {togo:.0f} min to go] {waiting[future].name}: {holds}: {data['result']}")
+                print(
+                    f"[{done}/{len(todo)}, {togo:.0f} min to go] {waiting[future].name}: "
+                    f"{holds}: {data['result']}"
+                )
                 write_page()
     return good
 
@@ -67,16 +78,23 @@ def run(todo: Sequence[Proof], jobs: int) -> bool:
 def write_page() -> None:
     """The page with all that is kept so far."""
     everything = proofs()
-    FIGURES.write_text(figures(everything, {p.name: data for p in everything if (data := kept(p))}), encoding="utf-8")
+    FIGURES.write_text(
+        figures(everything, {p.name: data for p in everything if (data := kept(p))}),
+        encoding="utf-8",
+    )
 
 
 def main() -> int:
     """Run what is not proved yet."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", metavar="NAME", nargs="+", help="some proofs")
     parser.add_argument("--fresh", action="store_true", help="forget what is kept")
     parser.add_argument("--jobs", type=int, default=2, help="how many at once (default 2)")
-    parser.add_argument("--page", action="store_true", help="only write docs/figures.md from what is kept")
+    parser.add_argument(
+        "--page", action="store_true", help="only write docs/figures.md from what is kept"
+    )
     options = parser.parse_args()
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     KEPT.mkdir(parents=True, exist_ok=True)
@@ -85,7 +103,11 @@ def main() -> int:
         return 0
     chosen = [p for p in proofs() if options.only is None or p.name in options.only]
     found = {p.name: kept(p) for p in chosen}
-    todo = [p for p in chosen if options.fresh or (found[p.name] or {}).get("sources") != p.fingerprint()]
+    todo = [
+        p
+        for p in chosen
+        if options.fresh or (found[p.name] or {}).get("sources") != p.fingerprint()
+    ]
     old = all(data["holds"] for p in chosen if p not in todo and (data := found[p.name]))
     print(f"{len(chosen) - len(todo)} kept, {len(todo)} to measure")
     good = run(todo, options.jobs)

@@ -1,4 +1,5 @@
-"""Campaigns for proofs, and the floors of campaigns themselves: speed, flat memory, the same table when killed."""
+"""Campaigns for proofs, and the floors of campaigns themselves: speed, flat memory, the same table
+when killed."""
 
 from __future__ import annotations
 
@@ -17,8 +18,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from coordinator.campaign.rows import Row
-from coordinator.campaign.table import TABLE, read_table
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.campaign.table import TABLE, read_table
 from tests.proof.proof import ROOT
 from tests.waiting import Limit
 
@@ -27,8 +28,8 @@ FAST = 15.0
 GROWTH_MB = 5.0
 """Memory that a worker may gain between its first blocks and its last ones."""
 GROWTH = 0.05
-"""Share by which the largest memory of a later worker may be above that of the first ones: workers retire, so that what native
-libraries keep does not add up, however long a campaign goes on."""
+"""Share by which the largest memory of a later worker may be above that of the first ones: workers
+retire, so that what native libraries keep does not add up, however long a campaign goes on."""
 
 Result = dict[str, Any]
 
@@ -46,7 +47,11 @@ class Sizes:
     @property
     def given(self) -> tuple[str, ...]:
         """What every campaign is given."""
-        return (self.task, *(("--services", str(self.services)) if self.services else ()), "--quiet")
+        return (
+            self.task,
+            *(("--services", str(self.services)) if self.services else ()),
+            "--quiet",
+        )
 
     def of(self, throws: int, least: int = 20) -> int:
         """A number of throws, scaled."""
@@ -56,11 +61,16 @@ class Sizes:
 def petrobot(*arguments: str, codes: Sequence[int] = (0,)) -> None:
     """Run a command. Raises RuntimeError with its words when it fails."""
     done = subprocess.run(
-        [sys.executable, "-m", "coordinator", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-m", "petrobot.coordinator", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode not in codes:
         raise RuntimeError(
-            f"petrobot {' '.join(arguments)}: exit {done.returncode}\n{done.stdout[-1000:]}{done.stderr[-2000:]}"
+            f"petrobot {' '.join(arguments)}: exit "
+            f"{done.returncode}\n{done.stdout[-1000:]}{done.stderr[-2000:]}"
         )
 
 
@@ -85,7 +95,8 @@ def rows_of(sizes: Sizes, name: str) -> list[Row]:
 
 
 def speed(sizes: Sizes, options: argparse.Namespace) -> Result:
-    """Times real time a core, memory of the workers, and a campaign that is killed again and again."""
+    """Times real time a core, memory of the workers, and a campaign that is killed again and
+    again."""
     found = campaign(sizes, "speed", sizes.of(1000), 80, options.regimes.split(",")[0])
     peaks = largest_memory(sizes.folder / "speed" / "times.csv")
     first, later = max(peaks[: found["workers"]]), max(peaks[found["workers"] :], default=None)
@@ -110,7 +121,8 @@ def speed(sizes: Sizes, options: argparse.Namespace) -> Result:
 
 
 def memory_gained(times: Path) -> float:
-    """The largest gain of a worker from the median of its third to eighth block to that of its last six (MiB)."""
+    """The largest gain of a worker from the median of its third to eighth block to that of its last
+    six (MiB)."""
     by_worker: dict[str, list[float]] = {}
     with times.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -129,21 +141,38 @@ def largest_memory(times: Path) -> list[float]:
 
 
 def interrupted(sizes: Sizes, throws: int, regime: str) -> tuple[bool, int]:
-    """Whether a campaign that is killed several times comes to the table of one that is not; and how often it was killed."""
+    """Whether a campaign that is killed several times comes to the table of one that is not; and
+    how often it was killed."""
     chosen = ("--seed", "81", "--regime", regime, "--selector", "nikolic_fu_fast")
     given = (*sizes.given, "--runs", str(throws), *chosen)
     whole, part = sizes.folder / "whole", sizes.folder / "killed"
     for folder in (whole, part):
         shutil.rmtree(folder, ignore_errors=True)
     petrobot("campaign", *given, "--workers", str(sizes.workers), "--out", str(whole))
-    command = [sys.executable, "-m", "coordinator", "campaign", *given, "--workers", "1", "--out", str(part)]
+    command = [
+        sys.executable,
+        "-m",
+        "petrobot.coordinator",
+        "campaign",
+        *given,
+        "--workers",
+        "1",
+        "--out",
+        str(part),
+    ]
     chance, kills = random.Random(1), 0
     table = part / TABLE
     while kills < 4:
-        going = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        going = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         wanted = (table.stat().st_size if table.exists() else 0) + chance.randint(1, 20_000)
         limit = Limit("the next rows of the table", 3600.0)
-        while going.poll() is None and limit.left() and not (table.exists() and table.stat().st_size >= wanted):
+        while (
+            going.poll() is None
+            and limit.left()
+            and not (table.exists() and table.stat().st_size >= wanted)
+        ):
             time.sleep(0.02)
         if going.poll() is not None:
             break

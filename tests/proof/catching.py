@@ -1,4 +1,5 @@
-"""The catching cell's figures: throws of each regime, disturbed ones, and one seed that gives one file."""
+"""The catching cell's figures: throws of each regime, disturbed ones, and one seed that gives one
+file."""
 
 from __future__ import annotations
 
@@ -25,7 +26,13 @@ SOURCES = (
         "coordinator/mission/partners.py",
         "coordinator/mission/mission.py",
     ),
-    *("coordinator/mission/lockstep_party.py", "coordinator/tasks/catch_ball.toml", "services.toml", "services", "sim"),
+    *(
+        "coordinator/mission/lockstep_party.py",
+        "coordinator/tasks/catch_ball.toml",
+        "services.toml",
+        "services",
+        "sim",
+    ),
 )
 APART = ("services/mobile", "sim/track", "sim/rover")
 
@@ -41,10 +48,20 @@ def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
 
 
 def catching(regime: str, throws: int) -> Callable[[], Result]:
-    """Throws of a regime: caught among the reachable ones, and how far off the middle of the cup."""
+    """Throws of a regime: caught among the reachable ones, and how far off the middle of the
+    cup."""
 
     def measure() -> Result:
-        given = ("--mode", "lockstep", "--runs", str(throws), "--seed", str(SEED), "--regime", regime)
+        given = (
+            "--mode",
+            "lockstep",
+            "--runs",
+            str(throws),
+            "--seed",
+            str(SEED),
+            "--regime",
+            regime,
+        )
         return summary(run_task(f"catch_{regime}", "catch_ball", *given))
 
     return measure
@@ -68,7 +85,8 @@ def summary(result: dict[str, Any]) -> Result:
 
 
 def same_file_anywhere() -> Result:
-    """One seed, one file: in one process, in one process a node, and beside a process that takes a core."""
+    """One seed, one file: in one process, in one process a node, and beside a process that takes a
+    core."""
     given = ("catch_ball", "--mode", "lockstep", "--runs", "20", "--seed", str(SEED))
     alone = run_task("alone", *given)
     spread = run_task("spread", *given, "--processes", "0")
@@ -79,7 +97,9 @@ def same_file_anywhere() -> Result:
     finally:
         load.kill()
         load.wait()
-    speeds = {name: round(r["sim_s"] / r["wall_s"], 1) for name, r in (("one", alone), ("spread", spread))}
+    speeds = {
+        name: round(r["sim_s"] / r["wall_s"], 1) for name, r in (("one", alone), ("spread", spread))
+    }
     cycle = round(alone["sim_s"] / 20, 2)
     for result in (alone, spread, loaded, loaded_spread):
         del result["wall_s"]
@@ -101,12 +121,25 @@ def disturbances() -> list[str]:
 def proofs() -> list[Proof]:
     """Throws first, then what they rest on."""
     main = [
-        Proof(regime, CHAPTER, catching(regime, THROWS), _above(floor), f"lower bound >= {floor}", SOURCES, APART)
+        Proof(
+            regime,
+            CHAPTER,
+            catching(regime, THROWS),
+            _above(floor),
+            f"lower bound >= {floor}",
+            SOURCES,
+            APART,
+        )
         for regime, floor in FLOORS.items()
     ]
     disturbed = [
         Proof(
-            *(name, CHAPTER, catching(name, DISTURBED_THROWS), lambda r: r["throws"] == DISTURBED_THROWS),
+            *(
+                name,
+                CHAPTER,
+                catching(name, DISTURBED_THROWS),
+                lambda r: r["throws"] == DISTURBED_THROWS,
+            ),
             *("measured", SOURCES, APART),
         )
         for name in disturbances()
@@ -123,7 +156,10 @@ def proofs() -> list[Proof]:
 
 def _same(result: Result) -> bool:
     equal = result["same in a process a node"] and result["same under load"]
-    fast = result["times real time, one process"] >= 10 and result["times real time, a process a node"] >= 4
+    fast = (
+        result["times real time, one process"] >= 10
+        and result["times real time, a process a node"] >= 4
+    )
     return bool(equal and fast)
 
 

@@ -1,4 +1,5 @@
-"""How surely selectors end on the best action: the study of docs/learning.md, judged by its floor."""
+"""How surely selectors end on the best action: the study of docs/learning.md, judged by its
+floor."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ RULE = "nikolic_fu_fast"
 
 
 def study() -> Result:
-    """Shares of 1,000 seeds with p >= 0.95 on the best of 4 actions after 500 trials, for the two gaps of the floor.
+    """Shares of 1,000 seeds with p >= 0.95 on the best of 4 actions after 500 trials, for the two
+    gaps of the floor.
 
     Raises RuntimeError when the study fails.
     """
@@ -35,4 +37,8 @@ def proofs() -> list[Proof]:
     sources = ("coordinator/learning", "tests/bench/learning.py")
     holds = lambda r: min(r[f"{RULE}, {world}"] for world in ("easy", "middle")) >= SURE  # noqa: E731
     floor = f"fast variant >= {SURE} at gaps .4 and .2"
-    return [Proof("convergence of selectors", "Learning, simulated worlds", study, holds, floor, sources)]
+    return [
+        Proof(
+            "convergence of selectors", "Learning, simulated worlds", study, holds, floor, sources
+        )
+    ]

@@ -1,10 +1,14 @@
-"""Learning, speed of campaigns and forecasts on a whole cell: the floors of docs/campaigns.md and docs/forecast.md in full.
+"""Learning, speed of campaigns and forecasts on a whole cell: the floors of docs/campaigns.md and
+docs/forecast.md in full.
 
-    python -m tests.proof.learning                       # all of it (hours); resumes where it stopped
-    python -m tests.proof.learning learn --share 0.1     # a tenth of every size, judged by the same rules
-    python -m tests.proof.learning forecast --regimes A,B,C,B+dim --runs 2000
+    python -m tests.proof.learning                       # all of it (hours); resumes where it
+                                                         stopped
+    python -m tests.proof.learning learn --share 0.1     # a tenth of every size, judged by the same
+                                                         rules python -m tests.proof.learning
+                                                         forecast --regimes A,B,C,B+dim --runs 2000
 
-Every campaign has a folder of its own, so an interrupted proof goes on. Results go to `--folder`, tables to `--page`.
+Every campaign has a folder of its own, so an interrupted proof goes on. Results go to `--folder`,
+tables to `--page`.
 """
 
 from __future__ import annotations
@@ -16,13 +20,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coordinator.campaign.policies import RoundRobin, offered
-from coordinator.campaign.rows import Row
-from coordinator.cli.loading import load_directory, load_task
-from coordinator.cli.report import compared
-from coordinator.report.combinations import Judged, by_combination
-from coordinator.report.comparing import Weighting
-from coordinator.task import Task
+from petrobot.coordinator.campaign.policies import RoundRobin, offered
+from petrobot.coordinator.campaign.rows import Row
+from petrobot.coordinator.cli.loading import load_directory, load_task
+from petrobot.coordinator.cli.report import compared
+from petrobot.coordinator.report.combinations import Judged, by_combination
+from petrobot.coordinator.report.comparing import Weighting
+from petrobot.coordinator.task import Task
 from tests.proof.campaigns import FAST, Result, Sizes, campaign, petrobot, rows_of, speed
 from tests.proof.proof import ROOT, Proof
 
@@ -30,22 +34,35 @@ CLOSE = 0.02
 """Largest J beyond the best fixed combination's."""
 FINALISTS = 6
 
-# --- learning ------------------------------------------------------------------------------------------------------------
+# --- learning ---------------------------------------------------------------------------------
 
 
 def learn(sizes: Sizes, options: argparse.Namespace) -> Result:
-    """Learn from scratch, freeze, and judge on fresh throws beside the best fixed combination and the default."""
+    """Learn from scratch, freeze, and judge on fresh throws beside the best fixed combination and
+    the default."""
     task, regime = load_task(sizes.task), options.disturbed
     learned: dict[int, dict[str, str]] = {}
     for seed in range(1, options.seeds + 1):
-        found = campaign(sizes, f"learn_{seed}", sizes.of(1000, 100), seed, regime, "--selector", options.selector)
+        found = campaign(
+            sizes,
+            f"learn_{seed}",
+            sizes.of(1000, 100),
+            seed,
+            regime,
+            "--selector",
+            options.selector,
+        )
         learned[seed] = {name: known["best"] for name, known in found["policy"][regime].items()}
     rows, planned = screened(sizes, task, regime)
     weighting = Weighting.of(task, rows)
     every = by_combination(task, rows, planned, weighting)
     best = best_fixed(sizes, task, regime, every[:FINALISTS], weighting)
-    default = {p.name: p.alternatives[0] for p in task.primitive_tasks.values() if len(p.alternatives) > 1}
-    lines = [_judged(sizes, seed, actions, best, default, regime) for seed, actions in learned.items()]
+    default = {
+        p.name: p.alternatives[0] for p in task.primitive_tasks.values() if len(p.alternatives) > 1
+    }
+    lines = [
+        _judged(sizes, seed, actions, best, default, regime) for seed, actions in learned.items()
+    ]
     close = all(line["J beyond the best, upper 95 %"] <= CLOSE for line in lines)
     ahead = all(line["J beyond the default, upper 95 %"] < 0 for line in lines)
     return {
@@ -75,9 +92,11 @@ def screened(sizes: Sizes, task: Task, regime: str) -> tuple[list[Row], list[dic
 def best_fixed(
     sizes: Sizes, task: Task, regime: str, finalists: Sequence[Judged], weighting: Weighting
 ) -> dict[str, str]:
-    """The combination with the lowest J: the best few of all on more throws, none of them the judge's.
+    """The combination with the lowest J: the best few of all on more throws, none of them the
+    judge's.
 
-    The costs of the first table, in which every action was run, give the one rho of all J in this proof.
+    The costs of the first table, in which every action was run, give the one rho of all J in this
+    proof.
     """
     every: list[Row] = []
     plans: list[dict[str, str]] = []
@@ -92,7 +111,12 @@ def best_fixed(
 
 
 def judge(
-    sizes: Sizes, name: str, chosen: Mapping[str, str], regime: str, throws: int | None = None, seed: int = 60
+    sizes: Sizes,
+    name: str,
+    chosen: Mapping[str, str],
+    regime: str,
+    throws: int | None = None,
+    seed: int = 60,
 ) -> Result:
     """A fixed combination on fresh throws."""
     text = ",".join(f"{task}={action}" for task, action in chosen.items())
@@ -135,7 +159,7 @@ def _judged(
     }
 
 
-# --- forecasts -----------------------------------------------------------------------------------------------------------
+# --- forecasts --------------------------------------------------------------------------------
 
 
 def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
@@ -147,11 +171,26 @@ def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
     if not registered.exists():
         runs = str(sizes.of(options.runs))
         petrobot(
-            "forecast", sizes.task, "--estimates", str(sizes.folder / "train"), "--runs", runs, "--out", str(registered)
+            "forecast",
+            sizes.task,
+            "--estimates",
+            str(sizes.folder / "train"),
+            "--runs",
+            runs,
+            "--out",
+            str(registered),
         )
     campaign(sizes, "new", sizes.of(options.runs) * count, 71, regimes)
     page, numbers = sizes.folder / "forecast.md", sizes.folder / "agreement.json"
-    told = ("--compare", str(registered), str(sizes.folder / "new"), "--markdown", str(page), "--json", str(numbers))
+    told = (
+        "--compare",
+        str(registered),
+        str(sizes.folder / "new"),
+        "--markdown",
+        str(page),
+        "--json",
+        str(numbers),
+    )
     petrobot("forecast", *told, codes=(0, 1))
     found: Result = json.loads(numbers.read_text(encoding="utf-8"))
     right = found["agrees"] and found["equivalent"] and found["registered_before"]
@@ -159,16 +198,24 @@ def forecast(sizes: Sizes, options: argparse.Namespace) -> Result:
     return {**found, "page": page.read_text(encoding="utf-8"), "holds": holds}
 
 
-# --- page ----------------------------------------------------------------------------------------------------------------
+# --- page -------------------------------------------------------------------------------------
 
 
 def page(results: Mapping[str, Result], sizes: Sizes) -> str:
     """The tables, with the command that remakes them."""
     lines = [f"# Learning and forecasting, {sizes.task}: figures", ""]
-    lines += ["What is meant stands in [campaigns.md](campaigns.md) and [forecast.md](forecast.md).", ""]
+    lines += [
+        "What is meant stands in [campaigns.md](campaigns.md) and [forecast.md](forecast.md).",
+        "",
+    ]
     if "learn" in results:
         found = results["learn"]
-        lines += [f"## Learned, frozen, judged on fresh throws of {found['regime']}", "", f"`{found['command']}`", ""]
+        lines += [
+            f"## Learned, frozen, judged on fresh throws of {found['regime']}",
+            "",
+            f"`{found['command']}`",
+            "",
+        ]
         lines += [_told(found), ""]
         lines += [*_turned(found["rows"]), ""]
     if "speed" in results:
@@ -178,7 +225,15 @@ def page(results: Mapping[str, Result], sizes: Sizes) -> str:
     if "forecast" in results:
         found = results["forecast"]
         rejected = ", ".join(found["product_rejected"]) or "no regime"
-        lines += ["## Forecast and measurement", "", f"`{found['command']}`", "", _verdict(found), "", found["page"]]
+        lines += [
+            "## Forecast and measurement",
+            "",
+            f"`{found['command']}`",
+            "",
+            _verdict(found),
+            "",
+            found["page"],
+        ]
         lines += [f"The product rule is rejected in {rejected}.", ""]
     return "\n".join(lines)
 
@@ -190,12 +245,16 @@ def _told(found: Mapping[str, Any]) -> str:
     furthest = max(row["J beyond the best, upper 95 %"] for row in found["rows"])
     beyond = found["rows"][0]["J of the default"] - found["rows"][0]["J of the best"]
     return (
-        f"Best fixed combination, chosen on other throws: {', '.join(found['best'].values())}; the default is "
+        "Best fixed combination, chosen on other throws: "
+        f"{', '.join(found['best'].values())}; the default is "
         f"{', '.join(found['default'].values())}.\n\n"
-        f"- J at most {CLOSE} beyond the best fixed combination's: {close} (at most {furthest:.4f}).\n"
+        f"- J at most {CLOSE} beyond the best fixed combination's: {close} (at most "
+        f"{furthest:.4f}).\n"
         f"- J below the default's: {ahead} (the default's is {beyond:.4f} beyond the best's).\n"
-        f"- Who chooses without knowledge: the {found['combinations']} combinations have J from {min(all_j):.3f} to "
-        f"{max(all_j):.3f}, {sum(all_j) / len(all_j):.3f} on average (100 throws each, taking turns)."
+        f"- Who chooses without knowledge: the {found['combinations']} combinations have J "
+        f"from {min(all_j):.3f} to "
+        f"{max(all_j):.3f}, {sum(all_j) / len(all_j):.3f} on average (100 throws each, "
+        "taking turns)."
     )
 
 
@@ -206,7 +265,11 @@ def _verdict(found: Mapping[str, Any]) -> str:
 def _turned(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """A table with a column for each record."""
     names = list(rows[0])
-    head = "| " + " | ".join(["", *(str(i + 1) if len(rows) > 1 else "measured" for i in range(len(rows)))]) + " |"
+    head = (
+        "| "
+        + " | ".join(["", *(str(i + 1) if len(rows) > 1 else "measured" for i in range(len(rows)))])
+        + " |"
+    )
     return [
         head,
         "|" + "---|" * (len(rows) + 1),
@@ -240,8 +303,16 @@ def proofs() -> list[Proof]:
             f"J within {CLOSE} of the best fixed combination, below the default's",
             _learn_line,
         ),
-        "speed": ("campaign", f">= {FAST:g}x real time a core, flat memory, same table when killed", _speed_line),
-        "forecast": ("forecast", "no disagreement at 1 % after Holm, equivalent, product rejected", _forecast_line),
+        "speed": (
+            "campaign",
+            f">= {FAST:g}x real time a core, flat memory, same table when killed",
+            _speed_line,
+        ),
+        "forecast": (
+            "forecast",
+            "no disagreement at 1 % after Holm, equivalent, product rejected",
+            _forecast_line,
+        ),
     }
     return [
         Proof(
@@ -276,7 +347,9 @@ def _learn_line(found: Result) -> Result:
         "all that was promised": found["holds"],
         "regime": found["regime"],
         "learning seeds": len(found["rows"]),
-        "largest J beyond the best (upper 95 %)": max(row["J beyond the best, upper 95 %"] for row in found["rows"]),
+        "largest J beyond the best (upper 95 %)": max(
+            row["J beyond the best, upper 95 %"] for row in found["rows"]
+        ),
         "largest J beyond the default (upper 95 %)": max(
             row["J beyond the default, upper 95 %"] for row in found["rows"]
         ),
@@ -301,20 +374,50 @@ def _forecast_line(found: Result) -> Result:
 
 def parser() -> argparse.ArgumentParser:
     """The command's options."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("steps", nargs="*", metavar="STEP", help=f"of {', '.join(STEPS)} (default: all)")
-    made.add_argument("--share", type=float, default=1.0, metavar="X", help="of every number of throws (%(default)s)")
+    made = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument(
+        "steps", nargs="*", metavar="STEP", help=f"of {', '.join(STEPS)} (default: all)"
+    )
+    made.add_argument(
+        "--share",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="of every number of throws (%(default)s)",
+    )
     made.add_argument("--workers", type=int, default=2, metavar="K")
     made.add_argument("--folder", type=Path, default=FULL, metavar="FOLDER")
     made.add_argument("--task", default="catch_ball", metavar="TASK", help="(%(default)s)")
-    made.add_argument("--services", type=Path, metavar="FILE", help="its location file (the shipped one)")
-    made.add_argument("--page", type=Path, metavar="FILE", help="docs/figures-learning.md in the full proof")
-    made.add_argument("--disturbed", default="C+beating", metavar="REGIME", help="in which is learned (%(default)s)")
+    made.add_argument(
+        "--services", type=Path, metavar="FILE", help="its location file (the shipped one)"
+    )
+    made.add_argument(
+        "--page", type=Path, metavar="FILE", help="docs/figures-learning.md in the full proof"
+    )
+    made.add_argument(
+        "--disturbed",
+        default="C+beating",
+        metavar="REGIME",
+        help="in which is learned (%(default)s)",
+    )
     made.add_argument("--selector", default="nikolic_fu_fast", metavar="NAME")
-    made.add_argument("--seeds", type=int, default=5, metavar="N", help="learning seeds (%(default)s)")
-    made.add_argument("--regimes", default="A,B,C,C+beating", metavar="A,B", help="that are forecast (%(default)s)")
-    made.add_argument("--training", type=int, default=2000, metavar="N", help="throws a regime (%(default)s)")
-    made.add_argument("--runs", type=int, default=1000, metavar="N", help="new throws a regime (%(default)s)")
+    made.add_argument(
+        "--seeds", type=int, default=5, metavar="N", help="learning seeds (%(default)s)"
+    )
+    made.add_argument(
+        "--regimes",
+        default="A,B,C,C+beating",
+        metavar="A,B",
+        help="that are forecast (%(default)s)",
+    )
+    made.add_argument(
+        "--training", type=int, default=2000, metavar="N", help="throws a regime (%(default)s)"
+    )
+    made.add_argument(
+        "--runs", type=int, default=1000, metavar="N", help="new throws a regime (%(default)s)"
+    )
     return made
 
 
@@ -330,12 +433,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in options.steps or STEPS:
         print(f"{name} ...", flush=True)
         results[name] = STEPS[name](sizes, options) | {"command": _command(argv or sys.argv[1:])}
-        (sizes.folder / f"{name}.json").write_text(json.dumps(results[name], indent=2), encoding="utf-8")
+        (sizes.folder / f"{name}.json").write_text(
+            json.dumps(results[name], indent=2), encoding="utf-8"
+        )
         print(f"{name}: {'holds' if results[name]['holds'] else 'DOES NOT HOLD'}", flush=True)
     full = sizes.share == 1 and options.task == "catch_ball"
-    written = options.page or (ROOT / "docs" / "figures-learning.md" if full else sizes.folder / "figures.md")
+    written = options.page or (
+        ROOT / "docs" / "figures-learning.md" if full else sizes.folder / "figures.md"
+    )
     kept = {
-        n: json.loads(path.read_text(encoding="utf-8")) for n in STEPS if (path := sizes.folder / f"{n}.json").exists()
+        n: json.loads(path.read_text(encoding="utf-8"))
+        for n in STEPS
+        if (path := sizes.folder / f"{n}.json").exists()
     }
     written.write_text(page(kept, sizes), encoding="utf-8")
     print(f"tables: {written}")

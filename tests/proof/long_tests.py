@@ -16,4 +16,14 @@ def marked_proof() -> Result:
 
 def proofs() -> list[Proof]:
     """One for the lot."""
-    return [Proof("long tests", "Tests", marked_proof, lambda r: r["exit"] == 0, "all pass", SOURCES, ("tests/proof",))]
+    return [
+        Proof(
+            "long tests",
+            "Tests",
+            marked_proof,
+            lambda r: r["exit"] == 0,
+            "all pass",
+            SOURCES,
+            ("tests/proof",),
+        )
+    ]

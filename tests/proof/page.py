@@ -20,12 +20,17 @@ def figures(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) 
     chapters = list(dict.fromkeys(proof.chapter for proof in proofs))
     parts = [HEAD]
     for chapter in chapters:
-        parts += [f"\n## {chapter}\n", *_table([p for p in proofs if p.chapter == chapter], measured)]
+        parts += [
+            f"\n## {chapter}\n",
+            *_table([p for p in proofs if p.chapter == chapter], measured),
+        ]
     return "\n".join(parts) + "\n"
 
 
 def _table(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    columns = list(dict.fromkeys(key for p in proofs for key in measured.get(p.name, {}).get("result", {})))
+    columns = list(
+        dict.fromkeys(key for p in proofs for key in measured.get(p.name, {}).get("result", {}))
+    )
     lines = [_row("", *columns, "floor", "holds", "sources"), _row(*["---"] * (len(columns) + 4))]
     for proof in proofs:
         data = measured.get(proof.name)

@@ -1,4 +1,5 @@
-"""What a proof is: a figure, how it is measured, when it holds, and the sources that it depends on."""
+"""What a proof is: a figure, how it is measured, when it holds, and the sources that it depends
+on."""
 
 from __future__ import annotations
 
@@ -22,8 +23,9 @@ Result = Mapping[str, Any]
 class Proof:
     """One figure.
 
-    `chapter` is its table in docs/figures.md. `sources` are the folders and files whose change makes it stale, without
-    those in `apart`. `alone` is true where other work on the machine would falsify it (speeds).
+    `chapter` is its table in docs/figures.md. `sources` are the folders and files whose change
+    makes it stale, without those in `apart`. `alone` is true where other work on the machine would
+    falsify it (speeds).
     """
 
     name: str
@@ -58,7 +60,9 @@ def _files(base: Path) -> list[Path]:
 
 def command(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a module of this environment from the project's folder; what it prints is kept."""
-    return subprocess.run([sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-m", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
 
 
 def run_task(name: str, *arguments: str) -> dict[str, Any]:
@@ -69,6 +73,8 @@ def run_task(name: str, *arguments: str) -> dict[str, Any]:
     path = KEPT / f"{name}.run.json"
     done = command("coordinator", "run", *arguments, "--quiet", "--json", str(path))
     if done.returncode not in (0, 1):
-        raise RuntimeError(f"petrobot run {' '.join(arguments)}: exit {done.returncode}\n{done.stderr[-2000:]}")
+        raise RuntimeError(
+            f"petrobot run {' '.join(arguments)}: exit {done.returncode}\n{done.stderr[-2000:]}"
+        )
     result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return result

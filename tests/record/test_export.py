@@ -11,17 +11,19 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import main
-from coordinator.cli.replaying import recorded
-from coordinator.engine import Fired, RunRecorded
-from coordinator.record.mcap_export import messages
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.engine import Fired, RunRecorded
+from petrobot.coordinator.record.mcap_export import messages
 
 JOURNAL = Path(__file__).parent / "golden" / "catch_ball-missed-and-recovered.journal"
 
 
 def counts() -> Counter[str]:
     """Instructions of the journal by kind."""
-    return Counter(type(i).__name__ for step in recorded(str(JOURNAL)).steps() for i in step.instructions)
+    return Counter(
+        type(i).__name__ for step in recorded(str(JOURNAL)).steps() for i in step.instructions
+    )
 
 
 def test_json_lines_hold_everything(tmp_path: Path) -> None:
@@ -52,7 +54,8 @@ def test_xes_has_an_event_for_each_firing_and_both_ends_of_each_run(tmp_path: Pa
 
 
 def test_messages_of_an_mcap_file() -> None:
-    """In order of time: each firing, both ends of each run, and the marking after each stimulus, by name of place."""
+    """In order of time: each firing, both ends of each run, and the marking after each stimulus, by
+    name of place."""
     found = recorded(str(JOURNAL))
     steps = list(found.steps())
     given = list(messages(found.journal, found.engine.compiled.net, steps))
@@ -69,15 +72,20 @@ def test_messages_of_an_mcap_file() -> None:
     )
     last = [body for name, _, body in given if name == "marking"][-1]
     assert last["tokens"]["arm_free"] == 1 and last["tokens"]["runs"] == 0
-    causes = {body["cause"] for name, _, body in given if name == "run" and body["phase"] == "ended"}
+    causes = {
+        body["cause"] for name, _, body in given if name == "run" and body["phase"] == "ended"
+    }
     assert {"missed", "drive_fault"} <= causes
     assert any(isinstance(i, Fired | RunRecorded) for i in steps[-1].instructions)
 
 
 @pytest.mark.skipif(
-    importlib.util.find_spec("mcap") is None, reason="the package mcap is not installed (petrobot[mcap])"
+    importlib.util.find_spec("mcap") is None,
+    reason="the package mcap is not installed (petrobot[mcap])",
 )
-def test_an_mcap_file_is_read_back_by_its_own_library(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_mcap_file_is_read_back_by_its_own_library(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "run.mcap"
     assert main(["log", str(JOURNAL), "--mcap", str(path)]) == 0
     reading = importlib.import_module("mcap.reader")
@@ -95,7 +103,11 @@ def test_an_mcap_file_is_read_back_by_its_own_library(tmp_path: Path, capsys: py
     assert f"{len(wrote)} messages" in capsys.readouterr().out
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mcap") is not None, reason="the package mcap is installed")
-def test_without_the_package_the_remedy_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.skipif(
+    importlib.util.find_spec("mcap") is not None, reason="the package mcap is installed"
+)
+def test_without_the_package_the_remedy_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["log", str(JOURNAL), "--mcap", str(tmp_path / "run.mcap")]) == 2
     assert "pip install 'petrobot[mcap]'" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""Golden journals: runs of shipped tasks as an earlier version recorded them, derived again marking by marking."""
+"""Golden journals: runs of shipped tasks as an earlier version recorded them, derived again marking
+by marking."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli.replaying import recorded
-from coordinator.engine import Engine, Finished, Fired, State
-from coordinator.record.journal import read_journal
-from coordinator.record.recording import ReplayError, replay
+from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.engine import Engine, Finished, Fired, State
+from petrobot.coordinator.record.journal import read_journal
+from petrobot.coordinator.record.recording import ReplayError, replay
 from tests.record.golden.make import STORIES, make
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -30,14 +31,21 @@ def test_every_marking_and_instruction_is_derived_again(name: str) -> None:
     steps = list(found.steps())
     assert len(steps) == sum(r.kind == "stimulus" for r in found.journal.records) > 10
     (finished,) = [i for i in steps[-1].instructions if isinstance(i, Finished)]
-    started = sum(isinstance(i, Fired) and i.transition == "start" for step in steps for i in step.instructions)
+    started = sum(
+        isinstance(i, Fired) and i.transition == "start"
+        for step in steps
+        for i in step.instructions
+    )
     assert (finished.status.value, started) == ENDS[name]
 
 
 @pytest.mark.parametrize("name", sorted(STORIES))
 def test_the_story_of_a_golden_journal_is_still_the_same(name: str, tmp_path: Path) -> None:
-    """Made again now, it has the same markings in the same order: execution in lock step has not changed either."""
-    golden, now = (read_journal(folder / f"{name}.journal") for folder in (GOLDEN, make(name, tmp_path).parent))
+    """Made again now, it has the same markings in the same order: execution in lock step has not
+    changed either."""
+    golden, now = (
+        read_journal(folder / f"{name}.journal") for folder in (GOLDEN, make(name, tmp_path).parent)
+    )
 
     def markings(journal_records: object) -> list[object]:
         return [r.data["marking"] for r in journal_records if r.kind == "stimulus"]  # type: ignore[attr-defined]
@@ -49,8 +57,8 @@ def test_a_changed_task_is_noticed_at_the_record_where_it_matters() -> None:
     """The golden journal of one story does not pass for a task with another priority of events."""
     found = recorded(str(GOLDEN / "catch_ball-undisturbed.journal"))
     changed = found.journal.header["task"].replace('out = ["return_home"]', 'out = ["recover_arm"]')
-    from coordinator.launch import with_runs
-    from coordinator.taskfile import loads
+    from petrobot.coordinator.launch import with_runs
+    from petrobot.coordinator.taskfile import loads
 
     task, _ = with_runs(loads(changed, "changed"), found.journal.header["runs"])
     seen: list[State] = []

@@ -1,4 +1,5 @@
-"""The journal's file: what was synced is read back, a torn tail is dropped and counted, damage is refused."""
+"""The journal's file: what was synced is read back, a torn tail is dropped and counted, damage is
+refused."""
 
 from __future__ import annotations
 
@@ -18,17 +19,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.record.journal import MAGIC, JournalError, JournalWriter, read_journal
-from services.comm.codec import LIMITS, encode
-from services.comm.messages import Outcome
+from petrobot.coordinator.record.journal import MAGIC, JournalError, JournalWriter, read_journal
+from petrobot.services.comm.codec import LIMITS, encode
+from petrobot.services.comm.messages import Outcome
 
 PLAIN = st.recursive(
-    st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.floats(allow_nan=False) | st.text(max_size=20),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**60), 2**60)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=20),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 RECORDS = st.lists(
-    st.tuples(st.text(min_size=1, max_size=8), st.dictionaries(st.text(max_size=5), PLAIN, max_size=3)), max_size=6
+    st.tuples(
+        st.text(min_size=1, max_size=8), st.dictionaries(st.text(max_size=5), PLAIN, max_size=3)
+    ),
+    max_size=6,
 )
 
 
@@ -104,7 +114,9 @@ def test_a_flipped_last_record_counts_as_torn(tmp_path: Path) -> None:
     assert [r.kind for r in journal.records] == ["a"] and journal.torn_bytes > 0
 
 
-@pytest.mark.parametrize("content", [b"", b"hello world, no journal", MAGIC, MAGIC + b"\x10\x00\x00\x00"])
+@pytest.mark.parametrize(
+    "content", [b"", b"hello world, no journal", MAGIC, MAGIC + b"\x10\x00\x00\x00"]
+)
 def test_what_is_no_journal_is_refused(tmp_path: Path, content: bytes) -> None:
     """A foreign, an empty and a beheaded file."""
     path = tmp_path / "x.journal"
@@ -132,7 +144,8 @@ def test_a_journal_has_one_writer_at_a_time(tmp_path: Path) -> None:
 
 
 def test_a_missing_record_is_refused(tmp_path: Path) -> None:
-    """Every record is whole, but one has gone: what follows it would be derived from a marking that never was."""
+    """Every record is whole, but one has gone: what follows it would be derived from a marking that
+    never was."""
     path = written(tmp_path, [("one", {}), ("two", {}), ("three", {})])
     raw, header = path.read_bytes(), len(written(tmp_path / "empty", []).read_bytes())
     first = header + 8 + struct.unpack_from("<I", raw, header)[0]
@@ -141,8 +154,11 @@ def test_a_missing_record_is_refused(tmp_path: Path) -> None:
         read_journal(path)
 
 
-def test_what_is_synced_has_been_handed_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The system is asked to make it durable each time, and the folder once, so that the file's name survives as well."""
+def test_what_is_synced_has_been_handed_to_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system is asked to make it durable each time, and the folder once, so that the file's
+    name survives as well."""
     asked: list[tuple[bool, int]] = []
 
     def noted(real: Callable[[int], None]) -> Callable[[int], None]:
@@ -169,14 +185,16 @@ def test_what_is_synced_has_been_handed_to_the_disk(tmp_path: Path, monkeypatch:
 def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:
     """A file stands where the folder should be."""
     (tmp_path / "runs").write_text("")
-    with pytest.raises(JournalError, match=r"runs/a/run\.journal: Not a directory; give --journal a folder"):
+    with pytest.raises(
+        JournalError, match=r"runs/a/run\.journal: Not a directory; give --journal a folder"
+    ):
         JournalWriter(tmp_path / "runs" / "a" / "run.journal", {})
 
 
 KILLED = """
 import sys
 from pathlib import Path
-from coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.journal import JournalWriter
 writer = JournalWriter(Path(sys.argv[1]), {})
 number = 0
 while True:
@@ -190,7 +208,9 @@ while True:
 def test_kill_9_loses_nothing_that_was_synced(tmp_path: Path) -> None:
     """Whatever the process said was synced is there after kill -9."""
     path = tmp_path / "run.journal"
-    process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     last = 0
     for line in process.stdout:
@@ -209,6 +229,14 @@ def test_the_largest_result_that_a_node_can_send_finds_room(tmp_path: Path) -> N
     largest = LIMITS[Outcome.KIND]
     values = {"x": bytes(largest - 200)}
     assert largest - 200 < len(encode(Outcome("mission/work#1", "success", values))) <= largest
-    ended = {"type": "RunEnded", "run": "work#1", "status": "success", "values": values, "text": "t" * 2_000}
-    journal = read_journal(written(tmp_path, [("stimulus", {"time": 1.0, "stimulus": ended, "check": 7})]))
+    ended = {
+        "type": "RunEnded",
+        "run": "work#1",
+        "status": "success",
+        "values": values,
+        "text": "t" * 2_000,
+    }
+    journal = read_journal(
+        written(tmp_path, [("stimulus", {"time": 1.0, "stimulus": ended, "check": 7})])
+    )
     assert journal.records[0].data["stimulus"] == ended

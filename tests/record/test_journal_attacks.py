@@ -1,4 +1,5 @@
-"""The journal under attack: cut at every byte, damaged, of another version, on a disk that is full or may not be written."""
+"""The journal under attack: cut at every byte, damaged, of another version, on a disk that is full
+or may not be written."""
 
 from __future__ import annotations
 
@@ -10,13 +11,19 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli import CommandError
-from coordinator.cli.replaying import recorded
-from coordinator.engine import Begin, Engine
-from coordinator.launch import resumed_mission
-from coordinator.record.journal import MAGIC, PREFIX, JournalError, JournalWriter, read_journal
-from coordinator.record.recording import JournalStore, ReplayError
-from services.comm import messages as m
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.engine import Begin, Engine
+from petrobot.coordinator.launch import resumed_mission
+from petrobot.coordinator.record.journal import (
+    MAGIC,
+    PREFIX,
+    JournalError,
+    JournalWriter,
+    read_journal,
+)
+from petrobot.coordinator.record.recording import JournalStore, ReplayError
+from petrobot.services.comm import messages as m
 from tests.mission.toy_arm import WORK, Bench
 from tests.waiting import Limit
 
@@ -40,7 +47,8 @@ def bounds(raw: bytes) -> list[int]:
 
 
 def test_cut_at_every_byte_it_holds_what_was_whole_and_says_what_was_not(tmp_path: Path) -> None:
-    """From the last ten records, byte by byte, and inside the header: never a guess, never more than the torn record lost."""
+    """From the last ten records, byte by byte, and inside the header: never a guess, never more
+    than the torn record lost."""
     raw = GOLDEN.read_bytes()
     ends = bounds(raw)
     header, first = ends[0], ends[-11]
@@ -67,12 +75,15 @@ def test_every_cut_between_records_is_derived_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bit", [0, 7, 31])
 def test_a_bit_of_a_length_is_damage_and_not_a_torn_tail(tmp_path: Path, bit: int) -> None:
-    """A length that points behind the end must not pass for a crash: all behind it would be cut off with the next append."""
+    """A length that points behind the end must not pass for a crash: all behind it would be cut off
+    with the next append."""
     raw = bytearray(GOLDEN.read_bytes())
     begin = bounds(bytes(raw))[4]
     raw[begin + bit // 8] ^= 1 << bit % 8
     path = copy(tmp_path, bytes(raw))
-    with pytest.raises(JournalError, match=r"record 5 at byte \d+ is damaged: record \d+ behind it is whole"):
+    with pytest.raises(
+        JournalError, match=r"record 5 at byte \d+ is damaged: record \d+ behind it is whole"
+    ):
         JournalWriter(path)
     assert path.read_bytes() == raw, "nothing is mended by guess"
 
@@ -87,7 +98,10 @@ def test_a_tail_of_zeros_is_torn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("magic", "says"),
     [
-        (b"PETROJ2\n", "a journal of format 2, and this petrobot reads format 1; use a newer petrobot"),
+        (
+            b"PETROJ2\n",
+            "a journal of format 2, and this petrobot reads format 1; use a newer petrobot",
+        ),
         (b"PETROJ0\n", "format 0, .*use the petrobot that wrote it"),
         (b"SQLite f", "no journal of a mission run"),
     ],
@@ -118,12 +132,15 @@ def test_a_header_that_says_too_little_is_named(tmp_path: Path) -> None:
 
 
 def test_a_resume_that_cannot_be_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
-    """A stimulus that only a newer petrobot knows, another task: refused before anything is written or cut."""
+    """A stimulus that only a newer petrobot knows, another task: refused before anything is written
+    or cut."""
     raw = GOLDEN.read_bytes()
     path = copy(tmp_path, raw[: bounds(raw)[-1] - 3])
     found = recorded(str(path))
     writer = JournalWriter(path)
-    writer.append("stimulus", {"t": 1.0, "stimulus": {"kind": "Teleport"}, "marking": [], "instructions": 0})
+    writer.append(
+        "stimulus", {"t": 1.0, "stimulus": {"kind": "Teleport"}, "marking": [], "instructions": 0}
+    )
     writer.close()
     before = path.read_bytes()
     with pytest.raises(JournalError, match="holds no stimulus: 'Teleport' is none of"):
@@ -136,15 +153,20 @@ def test_a_resume_that_cannot_be_leaves_the_journal_as_it_was(tmp_path: Path) ->
     assert path.read_bytes() == raw
 
 
-def test_a_journal_that_may_not_be_written_is_said_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_journal_that_may_not_be_written_is_said_to_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Read-only file system: one error with the path, no traceback."""
     path = copy(tmp_path, GOLDEN.read_bytes())
 
     def refused(*given: Any, **more: Any) -> int:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
-    monkeypatch.setattr("coordinator.record.journal.os.open", refused)
-    with pytest.raises(JournalError, match=r"run\.journal: Read-only file system; it can be gone on with only where"):
+    monkeypatch.setattr("petrobot.coordinator.record.journal.os.open", refused)
+    with pytest.raises(
+        JournalError,
+        match=r"run\.journal: Read-only file system; it can be gone on with only where",
+    ):
         JournalWriter(path)
 
 
@@ -167,13 +189,16 @@ class SmallDisk:
 def test_what_a_full_disk_has_taken_in_part_is_gone_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    """Every place at which a write can stop: once there is room again, each record stands in the file once and whole."""
+    """Every place at which a write can stop: once there is room again, each record stands in the
+    file once and whole."""
     writer = JournalWriter(tmp_path / "run.journal", {})
     disk = SmallDisk(room)
-    monkeypatch.setattr("coordinator.record.journal.os.write", disk)
+    monkeypatch.setattr("petrobot.coordinator.record.journal.os.write", disk)
     for number in range(3):
         writer.append("n", {"n": number})
-    with pytest.raises(JournalError, match=r"No space left on device; nothing was sent on the strength of it"):
+    with pytest.raises(
+        JournalError, match=r"No space left on device; nothing was sent on the strength of it"
+    ):
         writer.sync()
     assert writer.pending
     disk.room = 10_000
@@ -183,11 +208,12 @@ def test_what_a_full_disk_has_taken_in_part_is_gone_on_with(
 
 
 def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Bench, Callable[[], None]]:
-    """An arm at work under a coordinator whose disk is full from now on, and what gives it room again."""
+    """An arm at work under a coordinator whose disk is full from now on, and what gives it room
+    again."""
     writer = JournalWriter(folder / "run.journal", {"mission": "m"})
     bench = Bench(store=JournalStore(writer, 0.0)).begin()
     disk = SmallDisk(5)
-    monkeypatch.setattr("coordinator.record.journal.os.write", disk)
+    monkeypatch.setattr("petrobot.coordinator.record.journal.os.write", disk)
 
     def room() -> None:
         disk.room = 10_000
@@ -195,8 +221,11 @@ def full(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Bench, Callable
     return bench, room
 
 
-def test_with_a_full_disk_nothing_leaves_that_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run's end cannot be journaled: tidy is not called, the end is not acknowledged, so that its node keeps it."""
+def test_with_a_full_disk_nothing_leaves_that_is_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run's end cannot be journaled: tidy is not called, the end is not acknowledged, so that
+    its node keeps it."""
     bench, _ = full(tmp_path, monkeypatch)
     with pytest.raises(JournalError, match="No space left"):
         bench.say(1.0, m.Outcome(WORK, "success"))
@@ -205,4 +234,7 @@ def test_with_a_full_disk_nothing_leaves_that_is_not_kept(tmp_path: Path, monkey
         bench.executor.stimulate(1.1, Begin())
     assert bench.sent(m.Call, m.ResultAck) == []
     journal = read_journal(tmp_path / "run.journal")
-    assert [r.data["stimulus"]["kind"] for r in journal.records if r.kind == "stimulus"] == ["Begin", "RunStarted"]
+    assert [r.data["stimulus"]["kind"] for r in journal.records if r.kind == "stimulus"] == [
+        "Begin",
+        "RunStarted",
+    ]

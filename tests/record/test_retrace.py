@@ -1,4 +1,5 @@
-"""A run in lock step whose whole cell died with its coordinator: made again from its seed, compared, and written on."""
+"""A run in lock step whose whole cell died with its coordinator: made again from its seed,
+compared, and written on."""
 
 from __future__ import annotations
 
@@ -8,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli import main
-from coordinator.record.journal import JournalWriter, read_journal
-from coordinator.record.recording import ReplayError, RetracingStore
-from coordinator.record.runfolder import JOURNAL, RESULT
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.coordinator.record.recording import ReplayError, RetracingStore
+from petrobot.coordinator.record.runfolder import JOURNAL, RESULT
 from tests.record.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
@@ -63,7 +64,9 @@ def test_the_resumed_run_is_the_undisturbed_one(recorded_run: Path, records: int
     assert main(["replay", str(recorded_run)]) == 0
 
 
-def test_files_that_changed_since_are_noticed(recorded_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_that_changed_since_are_noticed(
+    recorded_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Another script gives another run: it is not written over the one that was."""
     kill_at(recorded_run, 20)
     (recorded_run.parents[1] / "mock.toml").write_text(SCRIPT.replace("0.1", "0.2"))
@@ -77,14 +80,20 @@ def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
     path = tmp_path / "run.journal"
     writer = JournalWriter(path, {"mode": "lockstep"})
     writer.append("stage", {"stage": "scored", "values": {"cpu_s": 1.0}})
-    writer.append("stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.25}})
+    writer.append(
+        "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.25}}
+    )
     writer.close()
     store = RetracingStore(JournalWriter(path), read_journal(path))
     store.stage("scored", {"cpu_s": 2.0})
-    store._write("stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.5}})
+    store._write(
+        "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.5}}
+    )
     compared = store.safe
     store.stage("other", {})
-    assert (compared, store.safe) == (True, False), "what is there is compared, what comes after it is written"
+    assert (compared, store.safe) == (True, False), (
+        "what is there is compared, what comes after it is written"
+    )
     store.writer.close()
     again = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ReplayError, match="record 1 was stage"):

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli import main
-from coordinator.record.journal import JournalWriter
-from coordinator.record.runfolder import JOURNAL, RESULT, NoRunError, journal_of, retain
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.runfolder import JOURNAL, RESULT, NoRunError, journal_of, retain
 
 SERVICES = """
 schema = 1
@@ -18,15 +18,15 @@ schema = 1
 host = "127.0.0.1"
 port = 7399
 [actions.left_fetch]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "fetch"
 node = "robot"
 [actions.right_carry]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "carry"
 node = "robot"
 [actions.right_tidy]
-run = "services.action:success"
+run = "petrobot.services.action:success"
 task = "tidy"
 node = "robot"
 [timers.bell]
@@ -69,8 +69,11 @@ def test_a_run_is_found_by_id_folder_journal_or_as_the_last(tmp_path: Path, name
         journal_of("other", tmp_path)
 
 
-def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`petrobot run --journal FOLDER --keep 2`, four times; without `--journal` a lock-step run leaves nothing behind."""
+def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`petrobot run --journal FOLDER --keep 2`, four times; without `--journal` a lock-step run
+    leaves nothing behind."""
     for name, text in (("services.toml", SERVICES), ("mock.toml", SCRIPT)):
         (tmp_path / name).write_text(text)
     task = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
@@ -92,7 +95,8 @@ def test_run_keeps_as_many_as_it_is_told_in_lock_step_too(tmp_path: Path, capsys
 def test_resume_of_a_run_that_had_ended_says_how(
     status: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A supervisor resumes whatever went away: it is told how the run ended, and 2 when the journal is damaged."""
+    """A supervisor resumes whatever went away: it is told how the run ended, and 2 when the journal
+    is damaged."""
     golden = Path(__file__).with_name("golden") / "catch_ball-undisturbed.journal"
     run = tmp_path / "run"
     run.mkdir()

@@ -1,4 +1,5 @@
-"""Files that are written whole: after a power cut the old one or the new one, with its name, its folder and its mode."""
+"""Files that are written whole: after a power cut the old one or the new one, with its name, its
+folder and its mode."""
 
 from __future__ import annotations
 
@@ -9,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.record.journal import JournalWriter, read_journal
-from services.comm.latch import Latch
-from services.comm.security import new_key, read_key, write_key
-from services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.record.journal import JournalWriter, read_journal
+from petrobot.services.comm.latch import Latch
+from petrobot.services.comm.security import new_key, read_key, write_key
+from petrobot.services.comm.whole_file import make_folder, write_whole
 from tests.power_cut import power_cut
 
 
@@ -109,7 +110,9 @@ def test_modes_links_and_pipes_stay_what_they_are(tmp_path: Path) -> None:
     write_whole(file, "1", mode=0o640)
     link.symlink_to(file)
     write_whole(link, "2")
-    assert link.is_symlink() and file.read_text() == "2" and stat.S_IMODE(file.stat().st_mode) == 0o640
+    assert (
+        link.is_symlink() and file.read_text() == "2" and stat.S_IMODE(file.stat().st_mode) == 0o640
+    )
     os.mkfifo(pipe)
     read: list[str] = []
     reader = threading.Thread(target=lambda: read.append(pipe.read_text()), daemon=True)

@@ -1,10 +1,10 @@
 """What users have on disk still reads: files written by the program as it was at commit 1eefa30.
 
 The files lie in `written_at_1eefa30/`. They were made by the commands of their names: `run` in lock
-step with learning (`lockstep`, `lab.estimates`), in real time (`realtime`), of the rover (`rover`), and
-of six balls (`killed`: its journal is cut off in the middle, its result is that of the whole run);
-`campaign` of 60 trials, and `forecast --out` from
-it, and a campaign of another seed to compare them with (`later`). They are never made again.
+step with learning (`lockstep`, `lab.estimates`), in real time (`realtime`), of the rover (`rover`),
+and of six balls (`killed`: its journal is cut off in the middle, its result is that of the whole
+run); `campaign` of 60 trials, and `forecast --out` from it, and a campaign of another seed to
+compare them with (`later`). They are never made again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.cli import main
+from petrobot.coordinator.cli import main
 
 FILES = Path(__file__).parent / "written_at_1eefa30"
 
@@ -27,7 +27,9 @@ def given(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("name", ["lockstep", "realtime", "rover", "killed"])
-def test_a_journal_replays_without_a_difference(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_journal_replays_without_a_difference(
+    name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert main(["replay", str(FILES / "runs" / name)]) == 0
     assert "all derived again as they were" in capfd.readouterr().out
 
@@ -36,7 +38,10 @@ def test_a_killed_run_resumes_to_the_end_that_it_had_without_the_kill(tmp_path: 
     folder = tmp_path / "killed"
     folder.mkdir()
     shutil.copy(FILES / "runs" / "killed" / "run.journal", folder)
-    assert main(["resume", str(folder), "--quiet", "--no-page", "--json", str(tmp_path / "end.json")]) == 0
+    assert (
+        main(["resume", str(folder), "--quiet", "--no-page", "--json", str(tmp_path / "end.json")])
+        == 0
+    )
     end, whole = given(tmp_path / "end.json"), given(FILES / "runs" / "killed" / "result.json")
     assert {key: end[key] for key in whole if key not in ("wall_s", "journal")} == {
         key: value for key, value in whole.items() if key not in ("wall_s", "journal")
@@ -58,7 +63,9 @@ def test_an_estimates_file_is_shown_and_learned_into(tmp_path: Path) -> None:
 def _trials(shown: Any) -> dict[str, int]:
     """How many runs of each primitive task with alternatives the estimates were made from."""
     tasks = ("locate_ball", "track_ball", "move_to_point")
-    return {name: sum(a["runs"] for a in shown["primitive_tasks"][name]["actions"]) for name in tasks}
+    return {
+        name: sum(a["runs"] for a in shown["primitive_tasks"][name]["actions"]) for name in tasks
+    }
 
 
 def test_a_registered_forecast_is_compared_with_a_campaign_that_ran_later(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.report import charts, colours, raster
-from coordinator.report.charts import Chart, Scale, limits
+from petrobot.coordinator.report import charts, colours, raster
+from petrobot.coordinator.report.charts import Chart, Scale, limits
 
 NUMBERS = st.floats(-1e6, 1e6, allow_nan=False)
 
@@ -55,7 +55,11 @@ def test_scale_by_hand() -> None:
 
 @pytest.mark.parametrize(
     ("values", "zero", "expected"),
-    [([], False, (-0.04, 1.04)), ([3.0], True, (0.0, 3.12)), ([math.nan, 1.0, 2.0], False, (0.96, 2.04))],
+    [
+        ([], False, (-0.04, 1.04)),
+        ([3.0], True, (0.0, 3.12)),
+        ([math.nan, 1.0, 2.0], False, (0.96, 2.04)),
+    ],
 )
 def test_limits(values: list[float], zero: bool, expected: tuple[float, float]) -> None:
     """Room on both sides, from zero on if asked."""
@@ -72,7 +76,9 @@ def test_histogram_counts_every_value_once() -> None:
 
 def test_intervals_name_rows_and_series() -> None:
     """A row for each name, a mark for each estimate with its tip."""
-    svg = charts.intervals("R", "R", [("act", "A", 0.2, 0.5, 0.7), ("act", "B", 0.1, 0.2, 0.3)], unit=True)
+    svg = charts.intervals(
+        "R", "R", [("act", "A", 0.2, 0.5, 0.7), ("act", "B", 0.1, 0.2, 0.3)], unit=True
+    )
     texts = [e.text for e in elements(svg) if e.tag.endswith("text")]
     assert {"act", "A", "B"} <= set(texts)
     assert "act A: 0.5 [0.2, 0.7]" in svg
@@ -82,10 +88,20 @@ def test_a_long_legend_breaks() -> None:
     """Names never leave the picture."""
     chart = Chart("t", "x", "y", (0.0, 1.0), (0.0, 1.0))
     chart.names([f"a rather long name, number {i}" for i in range(8)])
-    places = [float(m.group(1)) for m in re.finditer(r'<g transform="translate\(([\d.]+) ', chart.svg())]
+    places = [
+        float(m.group(1)) for m in re.finditer(r'<g transform="translate\(([\d.]+) ', chart.svg())
+    ]
     assert max(places) + 34 + charts.LETTER * 28 <= 640 + 34
     assert (
-        len(set(re.findall(r'translate\([\d.]+ ([\d.-]+)\)"><circle|translate\([\d.]+ ([\d.-]+)\)', chart.svg()))) > 1
+        len(
+            set(
+                re.findall(
+                    r'translate\([\d.]+ ([\d.-]+)\)"><circle|translate\([\d.]+ ([\d.-]+)\)',
+                    chart.svg(),
+                )
+            )
+        )
+        > 1
     )
 
 
@@ -97,12 +113,17 @@ def test_shapes_differ_by_more_than_colour() -> None:
 
 
 def test_a_picture_of_its_own_has_the_days_colours() -> None:
-    """No variable of the page is left in a file that stands alone; what is no colour of ours is left as it is."""
+    """No variable of the page is left in a file that stands alone; what is no colour of ours is
+    left as it is."""
     svg = charts.points("t", "x", "y", {str(i): [((float(i), 1.0), "tip")] for i in range(9)})
-    assert {f"var(--{name})" for name in colours.SERIES} <= set(re.findall(r"var\(--[a-z0-9-]+\)", svg))
+    assert {f"var(--{name})" for name in colours.SERIES} <= set(
+        re.findall(r"var\(--[a-z0-9-]+\)", svg)
+    )
     alone = colours.standalone(svg)
     assert "var(" not in alone
-    assert all(colours.LIGHT[name] in alone for name in (*colours.SERIES, "ink", "soft", "line", "paper"))
+    assert all(
+        colours.LIGHT[name] in alone for name in (*colours.SERIES, "ink", "soft", "line", "paper")
+    )
     assert (
         colours.standalone("<svg fill='var(--mine)'/>")
         == "<svg xmlns=\"http://www.w3.org/2000/svg\" fill='var(--mine)'/>"
@@ -124,12 +145,14 @@ def contrast(one: str, other: str) -> float:
 
 @pytest.mark.parametrize("scheme", [colours.LIGHT, colours.DARK], ids=["day", "night"])
 def test_words_and_marks_stand_out(scheme: dict[str, str]) -> None:
-    """WCAG 2.2 level AA on paper and panel: 4.5 for words; night's marks 3, day's as Okabe and Ito chose them."""
+    """WCAG 2.2 level AA on paper and panel: 4.5 for words; night's marks 3, day's as Okabe and Ito
+    chose them."""
     for ground in (scheme["paper"], scheme["panel"]):
         assert all(contrast(scheme[name], ground) >= 4.5 for name in ("ink", "soft"))
         if scheme is colours.DARK:
             assert all(
-                contrast(scheme[name], ground) >= 3.0 for name in (*colours.SERIES, "success", "failure", "error")
+                contrast(scheme[name], ground) >= 3.0
+                for name in (*colours.SERIES, "success", "failure", "error")
             )
     assert colours.LIGHT.keys() == colours.DARK.keys()
 
@@ -137,9 +160,14 @@ def test_words_and_marks_stand_out(scheme: dict[str, str]) -> None:
 def test_a_picture_becomes_a_png_with_its_words() -> None:
     """Twice the size, on white, and the title is drawn: the bytes are decoded again."""
     image = cv2.imdecode(
-        np.frombuffer(raster.png(colours.standalone(charts.lines("Title", "x", "y", {}))), np.uint8), 1
+        np.frombuffer(
+            raster.png(colours.standalone(charts.lines("Title", "x", "y", {}))), np.uint8
+        ),
+        1,
     )
-    bare = cv2.imdecode(np.frombuffer(raster.png(colours.standalone(charts.lines("", "x", "y", {}))), np.uint8), 1)
+    bare = cv2.imdecode(
+        np.frombuffer(raster.png(colours.standalone(charts.lines("", "x", "y", {}))), np.uint8), 1
+    )
     assert image is not None and bare is not None and image.shape == (640, 1280, 3)
     assert image[0, 0].tolist() == [255, 255, 255] and image.min() < 60
     rows, columns = np.nonzero(np.any(image != bare, axis=2))
@@ -170,7 +198,8 @@ def test_a_missing_font_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 
 def test_words_are_drawn_with_the_shipped_font_alone() -> None:
-    """The font is the published one, to the byte, and no font of the host is used, whichever a picture names."""
+    """The font is the published one, to the byte, and no font of the host is used, whichever a
+    picture names."""
     assert hashlib.sha256(raster.FONT.read_bytes()).hexdigest() == (
         "3fdf69cabf06049ea70a00b5919340e2ce1e6d02b0cc3c4b44fb6801bd1e0d22"
     )
@@ -178,5 +207,8 @@ def test_words_are_drawn_with_the_shipped_font_alone() -> None:
         '<svg xmlns="http://www.w3.org/2000/svg" width="90" height="20">'
         '<text y="15" font-family="{}">W&#246;rter: &#961; &#8804; 1</text></svg>'
     )
-    named, others = raster.png(picture.format("DejaVu Sans")), ("Liberation Serif", "monospace", "system-ui")
+    named, others = (
+        raster.png(picture.format("DejaVu Sans")),
+        ("Liberation Serif", "monospace", "system-ui"),
+    )
     assert all(raster.png(picture.format(family)) == named for family in others)

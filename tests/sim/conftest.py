@@ -1,4 +1,5 @@
-"""A laboratory on the bench: a small CANopen master of the tests' own that moves the arm, and a clairvoyant catcher."""
+"""A laboratory on the bench: a small CANopen master of the tests' own that moves the arm, and a
+clairvoyant catcher."""
 
 from __future__ import annotations
 
@@ -13,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.canbus import Frame
-from services.comm.canopen import NmtCommand, Type, map_pdo, nmt, sdo_write_request
-from services.comm.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
-from sim.laboratory import Laboratory
-from sim.puma_model import ArmModel
-from sim.site import Site, read_site
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import NmtCommand, Type, map_pdo, nmt, sdo_write_request
+from petrobot.services.comm.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
+from petrobot.sim.laboratory import Laboratory
+from petrobot.sim.puma_model import ArmModel
+from petrobot.sim.site import Site, read_site
 from tests.sim.laboratory_bench import LaboratoryBench
 
 REPOSITORY = Path(__file__).parents[2]
@@ -39,7 +40,8 @@ def arm(site: Site) -> ArmModel:
 
 
 class Master:
-    """Sets six drives up over SDO, enables them, and leads them along straight joint paths at most of the joint limits."""
+    """Sets six drives up over SDO, enables them, and leads them along straight joint paths at most
+    of the joint limits."""
 
     def __init__(self, model: ArmModel, pose: Sequence[float], share: float = 0.9) -> None:
         self._speed, self._acceleration = share * model.speed, share * model.acceleration
@@ -69,7 +71,10 @@ class Master:
             writes.append((Object.MODE, 0, Type.INTEGER8.pack(Mode.CYCLIC_SYNCHRONOUS_POSITION)))
             groups.append([sdo_write_request(node, *write) for write in writes])
         u32, u16 = Type.UNSIGNED32.pack, Type.UNSIGNED16.pack
-        inputs = [sdo_write_request(7, 0x1800, 1, u32(0x187)), sdo_write_request(7, 0x1800, 5, u16(100))]
+        inputs = [
+            sdo_write_request(7, 0x1800, 1, u32(0x187)),
+            sdo_write_request(7, 0x1800, 5, u16(100)),
+        ]
         return [*groups, inputs, [nmt(NmtCommand.START)]]
 
     def frames(self, now: float) -> list[Frame]:
@@ -79,12 +84,15 @@ class Master:
         if self._path is not None:
             self.target = self._path(now - self._began)
         if all(word & 0x08 for word in self.status):
-            self._word = 0x00 if self._word == 0x80 else 0x80  # a fault is reset by the bit's rising edge
+            self._word = (
+                0x00 if self._word == 0x80 else 0x80
+            )  # a fault is reset by the bit's rising edge
         else:
             self._word = {0x00: 0x06, 0x80: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
         pack = RECEIVED[0].type.pack, RECEIVED[1].type.pack
         frames = [
-            Frame(0x200 + node, pack[0](self._word) + pack[1](to_units(self.target[node - 1]))) for node in range(1, 7)
+            Frame(0x200 + node, pack[0](self._word) + pack[1](to_units(self.target[node - 1])))
+            for node in range(1, 7)
         ]
         return [*frames, Frame(0x080, b"")]
 
@@ -110,7 +118,10 @@ class Master:
         """Lead the arm to `goal` from where it is led now; gives the seconds that takes."""
         begin, way = self.target.copy(), np.array(goal, dtype=float) - self.target
         size = np.abs(way).clip(1e-9)
-        speed, acceleration = float((self._speed / size).min()), float((self._acceleration / size).min())
+        speed, acceleration = (
+            float((self._speed / size).min()),
+            float((self._acceleration / size).min()),
+        )
         ramp = min(speed / acceleration, 1.0 / math.sqrt(acceleration))
         duration = 1.0 / (acceleration * ramp) + ramp
 
@@ -146,7 +157,8 @@ class Bench(LaboratoryBench):
         self.wait(self.master.move(self.now, goal) + 0.1)
 
     def catch_one(self) -> dict[str, Any]:
-        """One whole cycle of a clairvoyant catcher: it is told where the oracle would catch. Gives the throw's row."""
+        """One whole cycle of a clairvoyant catcher: it is told where the oracle would catch. Gives
+        the throw's row."""
         lab = self.lab
         count = len(lab.referee.score(self.now)["throws"])
         assert self.run(lambda: lab.world.course is not None, 3.0)
@@ -188,7 +200,11 @@ def cell_master(site: Site) -> Callable[[], Master]:
 
 def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[str]:
     """Digests of the score, of all images and of the arm's end position after a throw."""
-    made = Bench(read_site(CELL_FILE), seed=77 if prepared_before else seed, regime="A" if prepared_before else regime)
+    made = Bench(
+        read_site(CELL_FILE),
+        seed=77 if prepared_before else seed,
+        regime="A" if prepared_before else regime,
+    )
     made.call("laboratory_prepare", seed=seed, regime=regime)
     made.enable()
     made.want_images(5.0)
@@ -198,7 +214,11 @@ def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[s
         pixels.update(repr((arrived, body["age"], body["sequence"])).encode())
         pixels.update(body["pixels"].tobytes())
     made.lab.close()
-    told = json.dumps(made.lab.referee.score(made.now)) + json.dumps(rows) + repr(made.master.position.tolist())
+    told = (
+        json.dumps(made.lab.referee.score(made.now))
+        + json.dumps(rows)
+        + repr(made.master.position.tolist())
+    )
     return [hashlib.sha256(told.encode()).hexdigest(), pixels.hexdigest()]
 
 

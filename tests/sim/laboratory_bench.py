@@ -1,14 +1,15 @@
-"""A laboratory on the bench: stepped tick by tick with the master of its bus and a caller; envelopes take one tick each way."""
+"""A laboratory on the bench: stepped tick by tick with the master of its bus and a caller;
+envelopes take one tick each way."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from services.comm.canbus import Frame
-from services.comm.channels import can_body, images_wanted, read_can
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.party import TICK, Envelope, Party
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.channels import can_body, images_wanted, read_can
+from petrobot.services.comm.messages import Call, Hello, Outcome
+from petrobot.services.comm.party import TICK, Envelope, Party
 
 
 class BusMaster(Protocol):
@@ -30,7 +31,8 @@ class BusMaster(Protocol):
 
 
 class LaboratoryBench:
-    """The laboratory's envelopes, its answers and images by the tick. `bus`: the device that the master speaks for."""
+    """The laboratory's envelopes, its answers and images by the tick. `bus`: the device that the
+    master speaks for."""
 
     cycle = 1
     """Ticks between two cycles of the master."""

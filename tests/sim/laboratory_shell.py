@@ -1,4 +1,5 @@
-"""A laboratory on the wall clock in tests: free ports, callers, `python -m sim` as a process, a party that looks at its score."""
+"""A laboratory on the wall clock in tests: free ports, callers, `python -m petrobot.sim` as a
+process, a party that looks at its score."""
 
 from __future__ import annotations
 
@@ -13,14 +14,14 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from services.comm.caller import Caller
-from services.comm.cell import Delays
-from services.comm.client import Client
-from services.comm.directory import Directory, load
-from services.comm.lockstep import Member
-from services.comm.messages import Call, Hello, Outcome
-from services.comm.party import Envelope
-from sim.realtime import LaboratoryShell
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.cell import Delays
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import Directory, load
+from petrobot.services.comm.lockstep import Member
+from petrobot.services.comm.messages import Call, Hello, Outcome
+from petrobot.services.comm.party import Envelope
+from petrobot.sim.realtime import LaboratoryShell
 
 REPOSITORY = Path(__file__).parents[2]
 NUMBERS = itertools.count(1)
@@ -46,7 +47,8 @@ async def running(file: Path) -> AsyncIterator[LaboratoryShell]:
 
 
 async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outcome:
-    """Call a service, under a name of its own: a caller of one name and boot numbers its calls from 1."""
+    """Call a service, under a name of its own: a caller of one name and boot numbers its calls from
+    1."""
     caller = Caller("laboratory", Hello(2, 99, "client", f"test {next(NUMBERS)}", "boot"))
     client = Client(*address, caller, on_notices=lambda now, notices: None)
     client.start()
@@ -58,16 +60,22 @@ async def call(address: tuple[str, int], service: str, **arguments: Any) -> Outc
 
 
 def program(*arguments: str) -> subprocess.Popen[str]:
-    """`python -m sim` with these arguments."""
+    """`python -m petrobot.sim` with these arguments."""
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    command = [sys.executable, "-m", "sim", *arguments]
+    command = [sys.executable, "-m", "petrobot.sim", *arguments]
     return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=REPOSITORY
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        cwd=REPOSITORY,
     )
 
 
 class Looker:
-    """A party that makes some calls, ends the cell when all are answered, and keeps what the last one, the score, says."""
+    """A party that makes some calls, ends the cell when all are answered, and keeps what the last
+    one, the score, says."""
 
     name = "coordinator"
 
@@ -91,10 +99,16 @@ class Looker:
 
 
 def score_as_member(directory: Directory, calls: Sequence[Call]) -> dict[str, Any]:
-    """Be the coordinator of a lock-step cell whose laboratory is a process; gives the answer to the last call."""
+    """Be the coordinator of a lock-step cell whose laboratory is a process; gives the answer to the
+    last call."""
     looker = Looker(calls)
     member = Member(
-        "coordinator", [looker], directory.members(), delays=Delays({}), directory=directory.hash, patience=PATIENCE
+        "coordinator",
+        [looker],
+        directory.members(),
+        delays=Delays({}),
+        directory=directory.hash,
+        patience=PATIENCE,
     )
     member.open()
     member.run(lambda: bool(looker.score), 1000)

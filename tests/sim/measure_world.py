@@ -1,7 +1,9 @@
-"""Measures what the laboratory costs: `python tests/sim/measure_world.py [REGIME ...]`; no test, figures for people.
+"""Measures what the laboratory costs: `python tests/sim/measure_world.py [REGIME ...]`; no test,
+figures for people.
 
-CPU milliseconds for a simulated second over whole cycles (wait, throw, catch, empty, home), by part, without images and
-with 50 images a second; beside it the machine's speed in this moment, as the time of a fixed piece of Python.
+CPU milliseconds for a simulated second over whole cycles (wait, throw, catch, empty, home), by
+part, without images and with 50 images a second; beside it the machine's speed in this moment, as
+the time of a fixed piece of Python.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ def measure(regime: str, rate: float, parts: bool) -> None:
     """One line of figures."""
     from conftest import CELL_FILE, Bench  # type: ignore[import-not-found]
 
-    from sim.site import read_site
+    from petrobot.sim.site import read_site
 
     bench, meter = Bench(read_site(CELL_FILE), seed=1, regime=regime), Meter()
     lab = bench.lab
@@ -78,14 +80,18 @@ def measure(regime: str, rate: float, parts: bool) -> None:
         begun, simulated, before = time.process_time(), bench.now, dict(meter.seconds)
         outcomes[bench.catch_one()["outcome"]] += 1
         simulated = bench.now - simulated
-        spent = {name: 1000 * (s - before.get(name, 0.0)) / simulated for name, s in meter.seconds.items()}
+        spent = {
+            name: 1000 * (s - before.get(name, 0.0)) / simulated
+            for name, s in meter.seconds.items()
+        }
         cycles.append((1000 * (time.process_time() - begun) / simulated, simulated, spent))
     lab.close()
     # other programs on the machine slow all of a cycle down: the least disturbed one tells most
     cost, simulated, spent = min(cycles, key=lambda cycle: cycle[0])
     told = ", ".join(f"{name} {value:.1f}" for name, value in spent.items())
     print(
-        f"{regime}, {rate:g} images/s: cycle {simulated:.2f} s, {cost:.1f} ms CPU/s ({1000 / cost:.1f}x real time with a "
+        f"{regime}, {rate:g} images/s: cycle {simulated:.2f} s, {cost:.1f} ms CPU/s "
+        f"({1000 / cost:.1f}x real time with a "
         f"test master; median {sorted(c[0] for c in cycles)[CYCLES // 2]:.1f}), {dict(outcomes)}"
         + (f"\n    of it (ms/s): {told}" if told else "")
     )

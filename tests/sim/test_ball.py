@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sim.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.ball import BallModel, BallState, TableMotion, fly
 
 MODEL = BallModel(radius=0.02, mass=0.0027, inertia_factor=2.0 / 3.0, gravity=9.81, friction=0.2)
 RESISTANCE = 0.006
@@ -16,7 +16,11 @@ RESISTANCE = 0.006
 speeds = st.floats(-3.0, 3.0)
 spins = st.floats(-150.0, 150.0)
 starts = st.builds(
-    lambda vx, vy, wx, wy: BallState((2.0, 0.1, 0.62), (vx, vy, 0.0), (wx, wy, 3.0)), speeds, speeds, spins, spins
+    lambda vx, vy, wx, wy: BallState((2.0, 0.1, 0.62), (vx, vy, 0.0), (wx, wy, 3.0)),
+    speeds,
+    speeds,
+    spins,
+    spins,
 )
 
 
@@ -28,12 +32,15 @@ def rolling(speed: float, share: float = 1.0) -> TableMotion:
 def test_a_rolling_ball_loses_59_mm_per_second_each_second() -> None:
     motion = rolling(1.5)
     assert motion.rolls_after == 0.0
-    assert motion.state(0.0).velocity[0] - motion.state(1.0).velocity[0] == pytest.approx(0.0589, abs=5e-5)
+    assert motion.state(0.0).velocity[0] - motion.state(1.0).velocity[0] == pytest.approx(
+        0.0589, abs=5e-5
+    )
 
 
 @pytest.mark.parametrize(("share", "settles"), [(0.0, 0.6), (0.7, 0.88), (1.0, 1.0)])
 def test_what_speed_a_sliding_ball_settles_at(share: float, settles: float) -> None:
-    """A hollow ball without spin rolls at 3/5 of its speed: angular momentum about the contact point is kept."""
+    """A hollow ball without spin rolls at 3/5 of its speed: angular momentum about the contact
+    point is kept."""
     motion = rolling(2.0, share)
     assert motion.state(motion.rolls_after).velocity[0] == pytest.approx(settles * 2.0)
 
@@ -44,10 +51,14 @@ def test_angular_momentum_about_the_contact_line_is_kept_while_sliding(start: Ba
     inertia = MODEL.inertia_factor * MODEL.radius
 
     def momentum(state: BallState) -> tuple[float, float]:
-        return state.velocity[0] + inertia * state.spin[1], state.velocity[1] - inertia * state.spin[0]
+        return state.velocity[0] + inertia * state.spin[1], state.velocity[
+            1
+        ] - inertia * state.spin[0]
 
     for share in (0.25, 0.5, 0.999):
-        assert momentum(motion.state(share * motion.rolls_after)) == pytest.approx(momentum(start), abs=1e-9)
+        assert momentum(motion.state(share * motion.rolls_after)) == pytest.approx(
+            momentum(start), abs=1e-9
+        )
 
 
 @given(start=starts)
@@ -78,7 +89,9 @@ def test_a_ball_never_gains_energy(start: BallState, moment: float) -> None:
 
 
 @given(start=starts, aim=st.floats(-2.0, 4.0), axis=st.integers(0, 1))
-def test_the_first_crossing_is_one_and_is_the_first(start: BallState, aim: float, axis: int) -> None:
+def test_the_first_crossing_is_one_and_is_the_first(
+    start: BallState, aim: float, axis: int
+) -> None:
     motion = TableMotion(MODEL, start, RESISTANCE)
     crossing = motion.first_crossing(axis, aim)
     side = math.copysign(1.0, start.position[axis] - aim)

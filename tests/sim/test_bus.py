@@ -1,4 +1,5 @@
-"""A whole cycle of the master's taken at once gives the frames that the same taken one by one give, also while drives rest."""
+"""A whole cycle of the master's taken at once gives the frames that the same taken one by one give,
+also while drives rest."""
 
 from __future__ import annotations
 
@@ -8,13 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from services.comm import canopen
-from services.comm.canbus import Frame
-from services.comm.canopen import NmtCommand, NmtState
-from services.comm.cia402 import RECEIVED, Command, to_units
-from sim.drives import DriveBus
-from sim.puma import ArmPlant
-from sim.site import Site
+from petrobot.services.comm import canopen
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import NmtCommand, NmtState
+from petrobot.services.comm.cia402 import RECEIVED, Command, to_units
+from petrobot.sim.drives import DriveBus
+from petrobot.sim.puma import ArmPlant
+from petrobot.sim.site import Site
 
 CYCLE, STEP = 0.004, 0.002
 RPDO = canopen.pdo_struct(RECEIVED)
@@ -74,7 +75,9 @@ def _extra(deed: str) -> tuple[Frame, ...]:
     return (canopen.sdo_read_request(3, 0x6064, 0),) if deed == "read" else ()
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.lists(st.tuples(DEEDS, st.integers(1, 25)), min_size=1, max_size=8))
 def test_a_cycle_at_once_is_the_cycle_frame_by_frame(
     twins: Callable[[], tuple[Twin, Twin]], deeds: list[tuple[tuple[str, float], int]]
@@ -90,7 +93,10 @@ def test_a_cycle_at_once_is_the_cycle_frame_by_frame(
         for cycle in range(cycles):
             says = words[tick] if tick < len(words) else word
             targets = [to_units(angle + goal) for angle in one.home]
-            drives = tuple(Frame(canopen.RPDO1_BASE + 1 + k, RPDO.pack(says, at)) for k, at in enumerate(targets))
+            drives = tuple(
+                Frame(canopen.RPDO1_BASE + 1 + k, RPDO.pack(says, at))
+                for k, at in enumerate(targets)
+            )
             frames = (*(_extra(deed) if cycle == 0 else ()), *drives, canopen.SYNC)
             now, tick = tick * CYCLE, tick + 1
             assert one.cycle(now, frames, True) == other.cycle(now, frames, False)

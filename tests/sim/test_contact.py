@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.ball import BallModel, BallState, TableMotion, fly
-from sim.contact import ContactSpace, quaternion, twist
-from sim.puma_model import Frame3
-from sim.site import Site
-from sim.truth import Vector, rotation_from_vector
+from petrobot.sim.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.contact import ContactSpace, quaternion, twist
+from petrobot.sim.puma_model import Frame3
+from petrobot.sim.site import Site
+from petrobot.sim.truth import Vector, rotation_from_vector
 
 UPRIGHT = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.0, 0.4))
 FAR = UPRIGHT._replace(origin=(-2.0, 0.0, 0.5))
@@ -41,11 +41,14 @@ def space(site: Site, model: BallModel) -> Iterator[ContactSpace]:
 
 def make_space(site: Site, model: BallModel, restitution: float) -> ContactSpace:
     truth = site.truth("A")
-    return ContactSpace(model, truth.table, replace(truth.cup, restitution=restitution), 0.003, truth.settings)
+    return ContactSpace(
+        model, truth.table, replace(truth.cup, restitution=restitution), 0.003, truth.settings
+    )
 
 
 def drop(space: ContactSpace, height: float, cup_speed: float) -> list[tuple[float, float]]:
-    """Approach and rebound speeds (m/s, to the cup) of a ball that falls on the bottom of a cup that rises or sinks."""
+    """Approach and rebound speeds (m/s, to the cup) of a ball that falls on the bottom of a cup
+    that rises or sinks."""
     bottom = UPRIGHT.origin[2] - 0.07
     space.put_ball(BallState((0.3, 0.0, bottom + 0.02 + height), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     impacts, speed, cup = [], 0.0, UPRIGHT
@@ -75,8 +78,11 @@ def test_restitution_is_what_was_asked_for(
 
 @pytest.mark.parametrize("angle", [0.0, math.pi / 8, 1.9, math.pi])
 def test_the_cup_has_its_size(space: ContactSpace, angle: float) -> None:
-    """A ball at rest lies 20 mm over the bottom; in a cup on its side, 20 mm from the wall's inner face."""
-    lying = rotation_from_vector(np.array([0.0, math.pi / 2, 0.0])) @ rotation_from_vector(np.array([0.0, 0.0, angle]))
+    """A ball at rest lies 20 mm over the bottom; in a cup on its side, 20 mm from the wall's inner
+    face."""
+    lying = rotation_from_vector(np.array([0.0, math.pi / 2, 0.0])) @ rotation_from_vector(
+        np.array([0.0, 0.0, angle])
+    )
     for turn, places in ((np.eye(3), (0.0, -0.05)), (lying, (0.02, None))):
         cup = frame(turn, np.array([0.0, 0.0, 0.5]))
         inside = np.array(cup.origin) - 0.035 * turn[:, 2]
@@ -94,9 +100,12 @@ def test_the_cup_has_its_size(space: ContactSpace, angle: float) -> None:
 def test_sliding_on_the_table_agrees_with_the_closed_form(
     site: Site, space: ContactSpace, model: BallModel, share: float
 ) -> None:
-    """Two independent ways to the same motion: Bullet's contact solver, and the closed form without rolling resistance."""
+    """Two independent ways to the same motion: Bullet's contact solver, and the closed form without
+    rolling resistance."""
     top = site.truth("A").table.top
-    start = BallState((1.6, 0.1, top + 0.02), (-1.2, 0.3, 0.0), model.spin_of_rolling(-1.2, 0.3, share))
+    start = BallState(
+        (1.6, 0.1, top + 0.02), (-1.2, 0.3, 0.0), model.spin_of_rolling(-1.2, 0.3, share)
+    )
     motion = TableMotion(model, start, 0.0)
     space.put_ball(start)
     for k in range(1, 401):
@@ -114,17 +123,23 @@ def test_flight_agrees_with_the_closed_form(space: ContactSpace) -> None:
         state = space.step(FAR, FAR)
     exact = fly(start, 0.2, 9.81)
     assert state.velocity == pytest.approx(exact.velocity, abs=1e-9)
-    assert state.position == pytest.approx(exact.position, abs=0.0011)  # semi-implicit Euler: g t dt / 2
+    assert state.position == pytest.approx(
+        exact.position, abs=0.0011
+    )  # semi-implicit Euler: g t dt / 2
 
 
 def test_a_ball_rides_in_a_cup_that_turns_and_rises(space: ContactSpace) -> None:
-    """Contact velocities must be those of the moving cup: else the ball would be left behind or thrown out."""
+    """Contact velocities must be those of the moving cup: else the ball would be left behind or
+    thrown out."""
     space.put_ball(BallState((0.3, 0.0, 0.351), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     cup = UPRIGHT
     for k in range(1, 801):
         before, t = cup, k * space.dt
         tilt = rotation_from_vector(np.array([0.0, 0.4 * math.sin(2.0 * t), 0.0]))
-        cup = frame(tilt, np.array([0.3 + 0.1 * math.sin(3.0 * t), 0.0, 0.4 + 0.1 * (1.0 - math.cos(3.0 * t))]))
+        cup = frame(
+            tilt,
+            np.array([0.3 + 0.1 * math.sin(3.0 * t), 0.0, 0.4 + 0.1 * (1.0 - math.cos(3.0 * t))]),
+        )
         ball = space.step(before, cup)
         local = cup.rotation().T @ (np.array(ball.position) - cup.origin)
         assert math.hypot(local[0], local[1]) < 0.025 and -0.056 < local[2] < -0.03
@@ -142,7 +157,8 @@ def side(cup: Frame3, ball: BallState) -> str:
 
 
 def shoot(space: ContactSpace, rng: np.random.Generator) -> set[tuple[str, str]]:
-    """A ball shot at a cup that moves and turns, from anywhere or into the mouth; gives the changes of place that were seen."""
+    """A ball shot at a cup that moves and turns, from anywhere or into the mouth; gives the changes
+    of place that were seen."""
     velocity, spin = rng.uniform(-1.0, 1.0, 3), rng.uniform(-2.0, 2.0, 3)
     turn, place = rotation_from_vector(rng.uniform(-1.2, 1.2, 3)), np.array([0.0, 0.0, 0.5])
     middle = place - 0.035 * turn[:, 2]
@@ -150,7 +166,11 @@ def shoot(space: ContactSpace, rng: np.random.Generator) -> set[tuple[str, str]]
     way /= np.linalg.norm(way)
     speed = rng.uniform(0.5, 3.5)
     aim = middle + rng.uniform(-0.03, 0.03, 3)
-    space.put_ball(BallState(tuple((aim - 0.12 * way).tolist()), tuple((speed * way).tolist()), (0.0, 0.0, 0.0)))
+    space.put_ball(
+        BallState(
+            tuple((aim - 0.12 * way).tolist()), tuple((speed * way).tolist()), (0.0, 0.0, 0.0)
+        )
+    )
     cup, seen, last = frame(turn, place), set(), ""
     for k in range(1, 181):
         before, t = cup, k * space.dt
@@ -164,7 +184,8 @@ def shoot(space: ContactSpace, rng: np.random.Generator) -> set[tuple[str, str]]
 
 @pytest.mark.parametrize("seed", range(60))
 def test_nothing_passes_a_wall_or_the_bottom(space: ContactSpace, seed: int) -> None:
-    """In and out of the cup only by its mouth, at up to 5 m/s to a cup that moves at 1.7 m/s and turns at 3.5 rad/s."""
+    """In and out of the cup only by its mouth, at up to 5 m/s to a cup that moves at 1.7 m/s and
+    turns at 3.5 rad/s."""
     rng = np.random.default_rng(seed)
     changes = set().union(*(shoot(space, rng) for _ in range(4)))
     assert not changes & {("in", "out"), ("out", "in")}
@@ -190,7 +211,9 @@ rotations = st.lists(st.floats(-math.pi, math.pi), min_size=3, max_size=3).map(
 def test_quaternion_is_the_rotations(rotation: Vector) -> None:
     found = quaternion(frame(rotation, np.zeros(3)))
     assert math.hypot(*found) == pytest.approx(1.0)
-    assert np.array(pybullet.getMatrixFromQuaternion(found)).reshape(3, 3) == pytest.approx(rotation, abs=1e-6)
+    assert np.array(pybullet.getMatrixFromQuaternion(found)).reshape(3, 3) == pytest.approx(
+        rotation, abs=1e-6
+    )
 
 
 @given(rotations, st.lists(st.floats(-5.0, 5.0), min_size=6, max_size=6))

@@ -1,4 +1,5 @@
-"""A drive's quick way through a cycle against the base class's steps: the same frames, whatever the master does."""
+"""A drive's quick way through a cycle against the base class's steps: the same frames, whatever the
+master does."""
 
 from __future__ import annotations
 
@@ -8,18 +9,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm import canopen
-from services.comm.canbus import Frame
-from services.comm.canopen import NmtCommand, NmtState, SdoClient, Transfer, Type
-from services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, to_units
-from sim import drives
-from sim.drives import Drive, DriveBus
-from sim.servo import DriveRating
+from petrobot.services.comm import canopen
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import NmtCommand, NmtState, SdoClient, Transfer, Type
+from petrobot.services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, to_units
+from petrobot.sim import drives
+from petrobot.sim.drives import Drive, DriveBus
+from petrobot.sim.servo import DriveRating
 from tests.waiting import Limit
 
 CYCLE = 0.004
 RPDO = canopen.pdo_struct(RECEIVED)
-READ = ((Object.STATUSWORD, Type.UNSIGNED16), (Object.POSITION, Type.INTEGER32), (Object.VELOCITY, Type.INTEGER32))
+READ = (
+    (Object.STATUSWORD, Type.UNSIGNED16),
+    (Object.POSITION, Type.INTEGER32),
+    (Object.VELOCITY, Type.INTEGER32),
+)
 
 
 class Joints:
@@ -87,9 +92,12 @@ class Bench:
         assert not client.failure
 
     def cycle(self, word: int, odd: int | None, asks: bool) -> None:
-        """A cycle with this controlword (the `odd` drive gets another one); perhaps somebody reads objects behind it."""
+        """A cycle with this controlword (the `odd` drive gets another one); perhaps somebody reads
+        objects behind it."""
         frames = [
-            Frame(canopen.RPDO1_BASE + 1 + k, RPDO.pack(0x6 if k == odd else word, to_units(target)))
+            Frame(
+                canopen.RPDO1_BASE + 1 + k, RPDO.pack(0x6 if k == odd else word, to_units(target))
+            )
             for k, target in enumerate(self.targets)
         ]
         self.bus.receive_cycle(self.now, [*frames, canopen.SYNC])
@@ -116,12 +124,16 @@ class Bench:
         elif what == "silence":
             self.now += 0.003 * number
         elif what == "asynchronous":
-            self.transfer(1 + number % 6, Transfer(Object.TPDO1, 2, Type.UNSIGNED8, 255 if number % 2 else 1))
+            self.transfer(
+                1 + number % 6, Transfer(Object.TPDO1, 2, Type.UNSIGNED8, 255 if number % 2 else 1)
+            )
 
 
 WORDS = [Command.SHUTDOWN.word, Command.SWITCH_ON.word, Command.ENABLE_OPERATION.word]
 happenings = st.tuples(
-    st.sampled_from(["aim"] * 6 + ["trip", "power", "slow", "stop", "silence", "asynchronous", "order", "rest"]),
+    st.sampled_from(
+        ["aim"] * 6 + ["trip", "power", "slow", "stop", "silence", "asynchronous", "order", "rest"]
+    ),
     st.integers(0, 20),
     st.booleans(),
 )

@@ -1,4 +1,5 @@
-"""Kernels against the laws they stand for, and, where numba is there, compiled against as they stand: the same to the bit."""
+"""Kernels against the laws they stand for, and, where numba is there, compiled against as they
+stand: the same to the bit."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.comm import compiled
-from services.comm.compiled import COMPILED, SWITCH, packed
-from sim import arm_motion, cup_motion
-from sim.arm_motion import (
+from petrobot.services.comm import compiled
+from petrobot.services.comm.compiled import COMPILED, SWITCH, packed
+from petrobot.sim import arm_motion, cup_motion
+from petrobot.sim.arm_motion import (
     Matrix,
     Six,
     accelerated,
@@ -28,8 +29,8 @@ from sim.arm_motion import (
     stepped,
     stepped_packed,
 )
-from sim.cup_motion import Triple, carried, numbers_of
-from sim.puma_model import ArmModel
+from petrobot.sim.cup_motion import Triple, carried, numbers_of
+from petrobot.sim.puma_model import ArmModel
 
 ZERO: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 TALL: Six = (1e9, 1e9, 1e9, 1e9, 1e9, 1e9)
@@ -74,7 +75,9 @@ def test_a_motor_keeps_its_limits(tau: float, speed: float, given_torque: float)
 
 
 @settings(max_examples=60, deadline=None)
-@given(qd=sixes(-2.0, 2.0), drive=sixes(-90.0, 90.0), bias=sixes(-40.0, 40.0), seed=st.integers(0, 99))
+@given(
+    qd=sixes(-2.0, 2.0), drive=sixes(-90.0, 90.0), bias=sixes(-40.0, 40.0), seed=st.integers(0, 99)
+)
 def test_without_friction_the_law_is_newtons(qd: Six, drive: Six, bias: Six, seed: int) -> None:
     inverse = inverse_of(seed)
     friction, speed = accelerated(0.002, qd, drive, bias, inverse, ZERO, ZERO, ZERO)
@@ -86,7 +89,8 @@ def test_without_friction_the_law_is_newtons(qd: Six, drive: Six, bias: Six, see
 @settings(max_examples=60, deadline=None)
 @given(qd=sixes(-2.0, 2.0), hold=sixes(0.0, 30.0), gains=sixes(0.01, 2.0))
 def test_dry_friction_brings_uncoupled_joints_to_rest(qd: Six, hold: Six, gains: Six) -> None:
-    """Joints that do not feel each other lose `hold` times their gain a second, and then stand: they never turn round."""
+    """Joints that do not feel each other lose `hold` times their gain a second, and then stand:
+    they never turn round."""
     dt, friction, speed = 0.002, ZERO, qd
     inverse: Any = tuple(map(tuple, np.diag(gains).tolist()))
     for step in range(1, 30):
@@ -103,7 +107,9 @@ def test_no_joint_leaves_its_range(q: Six, speed: Six) -> None:
     angles, speeds = moved(0.002, q, speed, low, high)
     for before, v, angle, after in zip(q, speed, angles, speeds, strict=True):
         assert -1.0 <= angle <= 1.0
-        assert (angle, after) == ((before + 0.002 * v, v) if -1.0 <= before + 0.002 * v <= 1.0 else (angle, 0.0))
+        assert (angle, after) == (
+            (before + 0.002 * v, v) if -1.0 <= before + 0.002 * v <= 1.0 else (angle, 0.0)
+        )
 
 
 def test_an_arm_that_friction_holds_stands_still() -> None:
@@ -165,27 +171,47 @@ def test_numbers_that_come_packed_give_the_same_bits(
     q: Six, qd: Six, tau: Six, bias: Six, friction: Six, hold: Six, seed: int
 ) -> None:
     limit, greatest, inverse = (90.0,) * 6, (2.0,) * 6, inverse_of(seed)
-    rest = limit, greatest, (1.5, 1.6, 1.7, 1.8, 1.9, 2.0), hold, (9.0,) * 6, (-2.5,) * 6, (2.5,) * 6
+    rest = (
+        limit,
+        greatest,
+        (1.5, 1.6, 1.7, 1.8, 1.9, 2.0),
+        hold,
+        (9.0,) * 6,
+        (-2.5,) * 6,
+        (2.5,) * 6,
+    )
     numbers = packed(stepped_packed, [number for group in rest for number in group])
     rows = packed(stepped_packed, [number for row in inverse for number in row])
     plainly = stepped(0.002, q, qd, tau, bias, inverse, friction, *rest)
     assert bits(*stepped_packed(0.002, q, qd, tau, bias, friction, rows, numbers)) == bits(*plainly)
-    assert held_packed(tau, qd, bias, numbers) == held(motors(tau, limit, qd, greatest), bias, (9.0,) * 6)
+    assert held_packed(tau, qd, bias, numbers) == held(
+        motors(tau, limit, qd, greatest), bias, (9.0,) * 6
+    )
 
 
 TRIPLE = st.tuples(*[st.floats(-1.0, 1.0, allow_subnormal=False)] * 3)
 
 
 @settings(max_examples=100, deadline=None)
-@given(q=sixes(-3.2, 3.2), zero=sixes(-0.01, 0.01), axes=st.tuples(TRIPLE, TRIPLE, TRIPLE), origin=TRIPLE)
+@given(
+    q=sixes(-3.2, 3.2),
+    zero=sixes(-0.01, 0.01),
+    axes=st.tuples(TRIPLE, TRIPLE, TRIPLE),
+    origin=TRIPLE,
+)
 def test_what_the_flange_carries_is_where_the_arms_frames_put_it_to_the_bit(
     arm: ArmModel, q: Six, zero: Six, axes: tuple[Triple, Triple, Triple], origin: Triple
 ) -> None:
     numbers = numbers_of(arm, zero, axes, origin)
     flange = arm.flange_frame([angle + off for angle, off in zip(q, zero, strict=True)])
-    turned = [tuple(a - b for a, b in zip(flange.point(axis), flange.origin, strict=True)) for axis in axes]
+    turned = [
+        tuple(a - b for a, b in zip(flange.point(axis), flange.origin, strict=True))
+        for axis in axes
+    ]
     assert bits(*carried(q, numbers)) == bits(*turned, flange.point(origin))
-    assert bits(*compiled.plain(cup_motion.carried)(q, tuple(numbers))) == bits(*turned, flange.point(origin))
+    assert bits(*compiled.plain(cup_motion.carried)(q, tuple(numbers))) == bits(
+        *turned, flange.point(origin)
+    )
 
 
 def test_numbers_are_packed_for_compiled_kernels_alone() -> None:
@@ -197,9 +223,17 @@ def test_numbers_are_packed_for_compiled_kernels_alone() -> None:
 
 @pytest.mark.processes
 def test_numba_can_be_left_out() -> None:
-    """The switch in the environment: kernels run as they stand, whether numba is installed or not."""
-    code = "import sys; import sim.arm_motion as m; print(type(m.stepped).__name__, 'numba' in sys.modules)"
+    """The switch in the environment: kernels run as they stand, whether numba is installed or
+    not."""
+    code = (
+        "import sys; import petrobot.sim.arm_motion as m; print(type(m.stepped).__name__, "
+        "'numba' in sys.modules)"
+    )
     found = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, SWITCH: "0"}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        env={**os.environ, SWITCH: "0"},
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert found.stdout.split() == ["function", "False"]

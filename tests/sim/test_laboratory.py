@@ -1,4 +1,5 @@
-"""The laboratory as a party: whole cycles, bus, camera, faults, services; and that it is deterministic to the bit."""
+"""The laboratory as a party: whole cycles, bus, camera, faults, services; and that it is
+deterministic to the bit."""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.channels import images_wanted
-from services.comm.messages import Executed
-from services.comm.party import TICK
-from sim.course import Outcome
-from sim.exposures import Exposures
-from sim.site import Site
-from sim.thrower import draw_throw
+from petrobot.services.comm.channels import images_wanted
+from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.party import TICK
+from petrobot.sim.course import Outcome
+from petrobot.sim.exposures import Exposures
+from petrobot.sim.site import Site
+from petrobot.sim.thrower import draw_throw
 
 REPOSITORY = Path(__file__).parents[2]
 Bench = Any
@@ -28,14 +29,22 @@ Digests = Callable[..., list[str]]
 
 
 @pytest.mark.parametrize("regime", ["A", "B", "C"])
-def test_the_oracles_poses_do_catch_in_the_whole_cell(bench: Benches, site: Site, regime: str) -> None:
-    """Drives, arm, cup and ball together: whoever knows the oracle's pose catches what it calls reachable."""
+def test_the_oracles_poses_do_catch_in_the_whole_cell(
+    bench: Benches, site: Site, regime: str
+) -> None:
+    """Drives, arm, cup and ball together: whoever knows the oracle's pose catches what it calls
+    reachable."""
     here = bench(seed=11, regime=regime)
     here.enable()
     here.want_images(0.001)
     for n in range(1, 3):
         row = here.catch_one()
-        assert row["n"] == n and row["reachable"] and row["outcome"] == "caught" and row["miss_mm"] < 3.0
+        assert (
+            row["n"] == n
+            and row["reachable"]
+            and row["outcome"] == "caught"
+            and row["miss_mm"] < 3.0
+        )
         assert row["speed"] == draw_throw(11, n, site.cell, site.truth(regime)).speed
     assert here.master.emergencies == []
 
@@ -77,9 +86,9 @@ def test_images_come_at_their_rate_with_their_true_age(bench: Benches) -> None:
     arrivals = [now for now, _ in here.images]
     assert np.diff(arrivals) == pytest.approx(0.02)
     exposed = [now - body["age"] for now, body in here.images]
-    assert np.diff(exposed) == pytest.approx(0.02) and [b["sequence"] for _, b in here.images] == list(
-        range(len(exposed))
-    )
+    assert np.diff(exposed) == pytest.approx(0.02) and [
+        b["sequence"] for _, b in here.images
+    ] == list(range(len(exposed)))
     assert {round(body["age"], 6) for _, body in here.images} == {0.008}
     pixels = here.images[0][1]["pixels"]
     assert pixels.shape == (480, 640) and pixels.dtype == np.uint8 and pixels.std() > 10.0
@@ -123,7 +132,9 @@ def fault(here: Bench, kind: str, **arguments: object) -> None:
     assert here.call("laboratory_fault", kind=kind, **arguments).status == "success"
 
 
-@pytest.mark.parametrize(("kind", "share"), [("dead_camera", None), ("drop_images", 1.0), ("drop_images", 0.5)])
+@pytest.mark.parametrize(
+    ("kind", "share"), [("dead_camera", None), ("drop_images", 1.0), ("drop_images", 0.5)]
+)
 def test_images_fail_for_a_while(bench: Benches, kind: str, share: float | None) -> None:
     here = bench(seed=1)
     here.want_images(50.0)
@@ -212,7 +223,9 @@ def test_arm_power_falls_and_comes_back(bench: Benches) -> None:
         ({}, "no fault is called ''"),
     ],
 )
-def test_a_fault_that_cannot_be_is_refused(bench: Benches, arguments: dict[str, object], says: str) -> None:
+def test_a_fault_that_cannot_be_is_refused(
+    bench: Benches, arguments: dict[str, object], says: str
+) -> None:
     outcome = bench().call("laboratory_fault", **arguments)
     assert outcome.status == "error" and outcome.cause == "bad_arguments" and says in outcome.text
     assert outcome.executed is Executed.NO
@@ -236,7 +249,10 @@ def test_prepare_begins_a_new_experiment(bench: Benches) -> None:
     score = here.call("laboratory_score").values
     assert (score["seed"], score["regime"], score["over"], score["caught"]) == (5, "C+dim", 1, 1)
     course = score["courses"][0]
-    assert 0.0 < course["exit_after"] < course["caught_after"] < course["ended_after"] and course["margin"] > 0.0
+    assert (
+        0.0 < course["exit_after"] < course["caught_after"] < course["ended_after"]
+        and course["margin"] > 0.0
+    )
     assert abs(course["exit_y"]) < 0.31 and 1.5 < course["exit_speed"] < 2.5
 
 
@@ -264,7 +280,9 @@ def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
         ({"throws": 1.5}, "throws is 1.5"),
     ],
 )
-def test_a_preparation_that_cannot_be_is_refused(bench: Benches, arguments: dict[str, object], says: str) -> None:
+def test_a_preparation_that_cannot_be_is_refused(
+    bench: Benches, arguments: dict[str, object], says: str
+) -> None:
     outcome = bench().call("laboratory_prepare", **arguments)
     assert outcome.status == "error" and says in outcome.text
 
@@ -274,11 +292,14 @@ def test_a_preparation_that_cannot_be_is_refused(bench: Benches, arguments: dict
 
 @pytest.mark.processes
 def test_the_same_seed_gives_the_same_bits_here_and_in_a_fresh_process(digests: Digests) -> None:
-    """Frames, pixels and score; also when the laboratory had been prepared for another run before."""
+    """Frames, pixels and score; also when the laboratory had been prepared for another run
+    before."""
     here = digests(3, "B+drift")
     program = [sys.executable, str(Path(__file__).with_name("conftest.py")), "3", "B+drift"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONHASHSEED": "4711"}
-    there = subprocess.run(program, capture_output=True, text=True, check=True, timeout=120, env=environment)
+    there = subprocess.run(
+        program, capture_output=True, text=True, check=True, timeout=120, env=environment
+    )
     assert there.stdout.split()[-3:] == here
     assert digests(3, "B+drift", prepared_before=True) == here
     assert digests(4, "B+drift") != here

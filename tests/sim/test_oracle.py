@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.oracle import Oracle, Verdict
-from sim.site import CupMount, Site
-from sim.thrower import draw_throw
-from sim.truth import Truth
+from petrobot.sim.oracle import Oracle, Verdict
+from petrobot.sim.site import CupMount, Site
+from petrobot.sim.thrower import draw_throw
+from petrobot.sim.truth import Truth
 
 THROWS = 60
 
@@ -23,15 +23,19 @@ def verdicts(site: Site, regime: str, throws: int = THROWS) -> list[Verdict]:
     return [oracle.judge(draw_throw(1, n, site.cell, truth), home) for n in range(1, throws + 1)]
 
 
-@pytest.mark.parametrize(("regime", "least"), [("A", 0.98), ("B", 0.98), ("C", 0.95), ("A+arm50", 0.98)])
-def test_nearly_every_ball_of_the_regimes_can_be_reached(site: Site, regime: str, least: float) -> None:
+@pytest.mark.parametrize(
+    ("regime", "least"), [("A", 0.98), ("B", 0.98), ("C", 0.95), ("A+arm50", 0.98)]
+)
+def test_nearly_every_ball_of_the_regimes_can_be_reached(
+    site: Site, regime: str, least: float
+) -> None:
     assert np.mean([v.reachable for v in verdicts(site, regime)]) >= least
 
 
 @pytest.mark.parametrize("regime", ["A", "C"])
 def test_its_poses_hold_the_cup_where_the_ball_will_be(site: Site, regime: str) -> None:
     """By the mount's and the arm's own forward kinematics, the ball's course by its closed form."""
-    from sim.ball import BallModel, TableMotion, fly
+    from petrobot.sim.ball import BallModel, TableMotion, fly
 
     truth = site.truth(regime)
     oracle, mount = Oracle(site.arm, truth, site.cell), CupMount(site.arm, truth)
@@ -48,13 +52,16 @@ def test_its_poses_hold_the_cup_where_the_ball_will_be(site: Site, regime: str) 
         assert cup.origin == pytest.approx(ball.position, abs=2e-3)
         slant = np.array(ball.velocity) @ cup.z / np.linalg.norm(ball.velocity)
         assert slant < -np.cos(truth.settings["oracle"]["greatest_slant"] + 0.01)
-        assert (site.arm.lower - 1e-3 <= verdict.pose).all() and (verdict.pose <= site.arm.upper + 1e-3).all()
+        assert (site.arm.lower - 1e-3 <= verdict.pose).all() and (
+            verdict.pose <= site.arm.upper + 1e-3
+        ).all()
 
 
 @settings(max_examples=30, deadline=None)
 @given(way=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
 def test_travel_time_is_that_of_the_slowest_joint(site: Site, way: list[float]) -> None:
-    """Integrated numerically: full acceleration, cruise at the limit, full braking covers at least the way."""
+    """Integrated numerically: full acceleration, cruise at the limit, full braking covers at least
+    the way."""
     oracle = Oracle(site.arm, site.truth("A"), site.cell)
     total = float(oracle.travel_time(np.array(way)))
     covered = []
@@ -67,34 +74,51 @@ def test_travel_time_is_that_of_the_slowest_joint(site: Site, way: list[float]) 
 
 
 def test_a_slower_arm_has_less_time_left(site: Site) -> None:
-    margins = [[v.margin for v in verdicts(site, regime, 20)] for regime in ("B", "B+arm50", "B+arm30")]
+    margins = [
+        [v.margin for v in verdicts(site, regime, 20)] for regime in ("B", "B+arm50", "B+arm30")
+    ]
     assert all(a > b > c for a, b, c in zip(*margins, strict=True))
 
 
 def test_an_arm_without_time_reaches_nothing(site: Site) -> None:
     truth = replace(site.truth("C"), arm_speed=0.02)
     oracle = Oracle(site.arm, truth, site.cell)
-    far = np.clip(site.arm.poses["home"] + [1.2, 0.4, 0.0, 1.0, 0.0, 0.0], site.arm.lower, site.arm.upper)
-    assert not any(oracle.judge(draw_throw(1, n, site.cell, truth), far.tolist()).reachable for n in range(1, 21))
+    far = np.clip(
+        site.arm.poses["home"] + [1.2, 0.4, 0.0, 1.0, 0.0, 0.0], site.arm.lower, site.arm.upper
+    )
+    assert not any(
+        oracle.judge(draw_throw(1, n, site.cell, truth), far.tolist()).reachable
+        for n in range(1, 21)
+    )
 
 
 def test_a_ball_that_never_leaves_the_near_edge_is_out_of_reach(site: Site) -> None:
     truth = site.truth("A")
     throw = draw_throw(1, 1, site.cell, truth)
     slow = throw.start._replace(velocity=(-0.05, 0.0, 0.0), spin=(0.0, -2.5, 0.0))
-    verdict = Oracle(site.arm, truth, site.cell).judge(replace(throw, start=slow), site.arm.poses["home"].tolist())
+    verdict = Oracle(site.arm, truth, site.cell).judge(
+        replace(throw, start=slow), site.arm.poses["home"].tolist()
+    )
     assert not verdict.reachable and verdict.pose is None
 
 
 def best_by_closed_form(site: Site, truth: Truth, oracle: Oracle, n: int) -> float:
-    """Best margin over finely sampled moments, tilts and turns of the cup, with motion's closed-form inverse kinematics."""
-    from services.motion.kinematics import Puma
-    from services.motion.model import nominal_arm
-    from sim.ball import BallModel, TableMotion
+    """Best margin over finely sampled moments, tilts and turns of the cup, with motion's
+    closed-form inverse kinematics."""
+    from petrobot.services.motion.kinematics import Puma
+    from petrobot.services.motion.model import nominal_arm
+    from petrobot.sim.ball import BallModel, TableMotion
 
-    oracle._rules = {**oracle._rules, "tilt_shares": np.linspace(0.0, 1.0, 11), "interval": 0.015, "first": 0.02}
+    oracle._rules = {
+        **oracle._rules,
+        "tilt_shares": np.linspace(0.0, 1.0, 11),
+        "interval": 0.015,
+        "first": 0.02,
+    }
     throw, home = draw_throw(6, n, site.cell, truth), site.arm.poses["home"]
-    motion = TableMotion(BallModel.of(site.cell["ball"], 0.2), throw.start, throw.rolling_resistance)
+    motion = TableMotion(
+        BallModel.of(site.cell["ball"], 0.2), throw.start, throw.rolling_resistance
+    )
     leaves = motion.first_crossing(0, truth.table.near_edge)
     state = motion.state(leaves)
     fall, mouths, axes = oracle._places(np.array(state.position), np.array(state.velocity))
@@ -108,7 +132,11 @@ def best_by_closed_form(site: Site, truth: Truth, oracle: Oracle, n: int) -> flo
         first = np.cos(turn) * across + np.sin(turn) * np.cross(axes, across)
         rotation = np.stack([axes, first, np.cross(axes, first)], axis=-1) @ flange.T
         pose = np.zeros((len(axes), 4, 4))
-        pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = rotation, mouths - rotation @ truth.cup.mouth, 1.0
+        pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = (
+            rotation,
+            mouths - rotation @ truth.cup.mouth,
+            1.0,
+        )
         q = Puma.of(nominal_arm()).inverse(pose, near=home) - truth.joint_zero
         margins = leaves + fall[:, None] - oracle.travel_time(q - home)
         if np.isfinite(margins).any():
@@ -118,7 +146,8 @@ def best_by_closed_form(site: Site, truth: Truth, oracle: Oracle, n: int) -> flo
 
 @pytest.mark.parametrize("regime", ["A", "C+arm30"])
 def test_verdicts_agree_with_closed_form_kinematics(site: Site, regime: str) -> None:
-    """The numerical search finds (nearly) what exhaustive closed-form sampling finds, and no more."""
+    """The numerical search finds (nearly) what exhaustive closed-form sampling finds, and no
+    more."""
     truth = site.truth(regime)
     agreed = 0
     for n in range(1, 9):

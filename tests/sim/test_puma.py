@@ -1,4 +1,5 @@
-"""The arm against published values, against PyBullet, against mechanics that PyBullet has no part in."""
+"""The arm against published values, against PyBullet, against mechanics that PyBullet has no part
+in."""
 
 from __future__ import annotations
 
@@ -11,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.puma import ArmPlant, RigidBody
-from sim.puma_model import ArmModel, Link
-from sim.puma_urdf import urdf
-from sim.servo import JointServo
-from sim.site import Site
-from sim.truth import Vector
+from petrobot.sim.puma import ArmPlant, RigidBody
+from petrobot.sim.puma_model import ArmModel, Link
+from petrobot.sim.puma_urdf import urdf
+from petrobot.sim.servo import JointServo
+from petrobot.sim.site import Site
+from petrobot.sim.truth import Vector
 
 GRAVITY = 9.81
 ANGLES = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6)
@@ -37,7 +38,8 @@ def potential_energy(arm: ArmModel, q: Sequence[float]) -> float:
     """From masses and heights alone (J)."""
     frames = arm.frames(q)
     return sum(
-        GRAVITY * link.mass * frame.point(link.centre)[2] for link, frame in zip(arm.links, frames[1:], strict=True)
+        GRAVITY * link.mass * frame.point(link.centre)[2]
+        for link, frame in zip(arm.links, frames[1:], strict=True)
     )
 
 
@@ -45,15 +47,19 @@ def without_friction(arm: ArmModel) -> ArmModel:
     return replace(arm, viscous=np.zeros(6), coulomb=np.zeros(6))
 
 
-# The Robotics Toolbox's documentation prints these for its Puma560 (kinematics without the pedestal).
+# The Robotics Toolbox's documentation prints these for its Puma560 (kinematics without the
+# pedestal).
 QZ = [0.0] * 6
 QN = [0.0, math.pi / 4, math.pi, 0.0, math.pi / 4, 0.0]
 
 
 @pytest.mark.parametrize(
-    ("q", "torques"), [(QZ, [0, 37.4837, 0.2489, 0, 0, 0]), (QN, [0, 31.6399, 6.0351, 0, 0.0283, 0])]
+    ("q", "torques"),
+    [(QZ, [0, 37.4837, 0.2489, 0, 0, 0]), (QN, [0, 31.6399, 6.0351, 0, 0.0283, 0])],
 )
-def test_gravity_is_the_published_one(body: RigidBody, q: list[float], torques: list[float]) -> None:
+def test_gravity_is_the_published_one(
+    body: RigidBody, q: list[float], torques: list[float]
+) -> None:
     assert body.bias(q, [0.0] * 6) == pytest.approx(torques, abs=1e-4)
 
 
@@ -67,7 +73,8 @@ def test_mass_matrix_is_the_published_one(arm: ArmModel, body: RigidBody) -> Non
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.1941],
     ]
     mass = body.mass_matrix(QN) + np.diag(arm.rotor)
-    # link 3's published tensor is no real body's; mending it moves the inertia about joint 1 by 0.004 kg m^2
+    # link 3's published tensor is no real body's; mending it moves the inertia about joint 1 by
+    # 0.004 kg m^2
     assert mass == pytest.approx(np.array(published), abs=4.1e-3)
     assert mass[1:, 1:] == pytest.approx(np.array(published)[1:, 1:], abs=1e-3)
 
@@ -78,17 +85,23 @@ def test_zero_pose_is_the_published_one(arm: ArmModel) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(shares=ANGLES)
-def test_forward_kinematics_agrees_with_bullet(arm: ArmModel, body: RigidBody, shares: list[float]) -> None:
+def test_forward_kinematics_agrees_with_bullet(
+    arm: ArmModel, body: RigidBody, shares: list[float]
+) -> None:
     q = angles(arm, shares)
     flange = arm.flange_frame(q)
-    origin, rotation = body.link_frame(q, 5)  # frame 6 coincides with its URDF link: d6, a6 and alpha6 are zero
+    origin, rotation = body.link_frame(
+        q, 5
+    )  # frame 6 coincides with its URDF link: d6, a6 and alpha6 are zero
     assert flange.origin == pytest.approx(origin, abs=1e-6)
     assert flange.rotation() == pytest.approx(rotation, abs=2e-6)
 
 
 @settings(max_examples=40, deadline=None)
 @given(shares=ANGLES)
-def test_gravity_is_the_gradient_of_the_potential_energy(arm: ArmModel, body: RigidBody, shares: list[float]) -> None:
+def test_gravity_is_the_gradient_of_the_potential_energy(
+    arm: ArmModel, body: RigidBody, shares: list[float]
+) -> None:
     q, step = angles(arm, shares), 1e-5
     gradient = []
     for joint in range(6):
@@ -101,18 +114,28 @@ def test_gravity_is_the_gradient_of_the_potential_energy(arm: ArmModel, body: Ri
 
 @settings(max_examples=40, deadline=None)
 @given(shares=ANGLES)
-def test_mass_matrix_is_symmetric_and_positive(arm: ArmModel, body: RigidBody, shares: list[float]) -> None:
+def test_mass_matrix_is_symmetric_and_positive(
+    arm: ArmModel, body: RigidBody, shares: list[float]
+) -> None:
     mass = body.mass_matrix(angles(arm, shares))
     assert mass == pytest.approx(mass.T, abs=1e-12)
     assert np.linalg.eigvalsh(mass + np.diag(arm.rotor)).min() > 0.1
 
 
 def test_every_published_tensor_reaches_bullet(arm: ArmModel, body: RigidBody) -> None:
-    """Bullet silently zeroes an impossible tensor: moments of inertia about each joint must count."""
-    links = tuple(Link(n.mass, n.centre, (2 * n.inertia[0], 2 * n.inertia[1], 2 * n.inertia[2])) for n in arm.links)
-    difference = RigidBody(replace(arm, links=links), GRAVITY).mass_matrix(QN) - body.mass_matrix(QN)
+    """Bullet silently zeroes an impossible tensor: moments of inertia about each joint must
+    count."""
+    links = tuple(
+        Link(n.mass, n.centre, (2 * n.inertia[0], 2 * n.inertia[1], 2 * n.inertia[2]))
+        for n in arm.links
+    )
+    difference = RigidBody(replace(arm, links=links), GRAVITY).mass_matrix(QN) - body.mass_matrix(
+        QN
+    )
     assert difference[0, 0] > 0.35  # link 1's own 0.35 alone
-    assert difference[2, 2] == pytest.approx(arm.links[2].inertia[1] + 1.3e-3 + 0.4e-3 + 0.15e-3, abs=6e-4)
+    assert difference[2, 2] == pytest.approx(
+        arm.links[2].inertia[1] + 1.3e-3 + 0.4e-3 + 0.15e-3, abs=6e-4
+    )
 
 
 def test_urdf_names_all_six_joints(arm: ArmModel) -> None:
@@ -162,7 +185,9 @@ def test_brakes_hold_and_stop_the_arm(arm: ArmModel) -> None:
     assert plant.still and fallen - plant.q[1] < 0.05
 
 
-@pytest.mark.parametrize(("torque", "moves"), [(20.0, False), (-20.0, False), (32.0, True), (-32.0, True)])
+@pytest.mark.parametrize(
+    ("torque", "moves"), [(20.0, False), (-20.0, False), (32.0, True), (-32.0, True)]
+)
 def test_dry_friction_holds_up_to_its_limit(arm: ArmModel, torque: float, moves: bool) -> None:
     """Joint 1 feels no gravity; its dry friction is 62.6 x 0.415 = 26 N m."""
     plant = released(arm, arm.poses["home"].tolist(), range(1))
@@ -217,10 +242,13 @@ def test_step_size_hardly_matters(arm: ArmModel) -> None:
 
 
 def _follow(site: Site, dt: float) -> Vector:
-    """Joint angles (n, 6) every 4 ms of an arm whose drives follow a sweep of all joints to and fro, in steps of `dt` s."""
+    """Joint angles (n, 6) every 4 ms of an arm whose drives follow a sweep of all joints to and
+    fro, in steps of `dt` s."""
     arm, home = site.arm, site.arm.poses["home"]
     plant = ArmPlant(arm, GRAVITY, home.tolist())
-    servos = [JointServo(rating, angle) for rating, angle in zip(site.drives, home.tolist(), strict=True)]
+    servos = [
+        JointServo(rating, angle) for rating, angle in zip(site.drives, home.tolist(), strict=True)
+    ]
     for joint in range(6):
         plant.release(joint)
     path = []
@@ -229,14 +257,18 @@ def _follow(site: Site, dt: float) -> Vector:
         for servo, angle in zip(servos, home.tolist(), strict=True):
             servo.aim(angle + sweep)
         for _ in range(round(0.004 / dt)):
-            plant.step(dt, [s.torque(q, qd, dt) for s, q, qd in zip(servos, plant.q, plant.qd, strict=True)])
+            plant.step(
+                dt,
+                [s.torque(q, qd, dt) for s, q, qd in zip(servos, plant.q, plant.qd, strict=True)],
+            )
         path.append(plant.q)
     plant.close()
     return np.array(path)
 
 
 def test_steps_of_2_ms_lead_the_arm_the_same_way_as_those_of_1_ms(site: Site) -> None:
-    """No less so than steps of 1 ms and of a quarter of that: what is left is the integration, not a lag."""
+    """No less so than steps of 1 ms and of a quarter of that: what is left is the integration, not
+    a lag."""
     coarse, usual, fine = (_follow(site, dt) for dt in (0.002, 0.001, 0.00025))
     assert np.abs(usual - usual[0]).max() > 0.15
     assert np.abs(usual - fine).max() < 1e-3

@@ -12,19 +12,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.caller import Caller
-from services.comm.camera import StreamImages
-from services.comm.can_ports import StreamPort
-from services.comm.client import Client
-from services.comm.directory import load
-from services.comm.messages import Answer, Call, Command, Hello, Outcome
-from services.comm.notice import Answered, Notice
-from services.comm.party import TICK
-from sim.laboratory import Laboratory
-from sim.realtime import LaboratoryShell, bus_channel, camera_address
-from sim.truth import LaboratoryError
+from petrobot.services.comm.caller import Caller
+from petrobot.services.comm.camera import StreamImages
+from petrobot.services.comm.can_ports import StreamPort
+from petrobot.services.comm.client import Client
+from petrobot.services.comm.directory import load
+from petrobot.services.comm.messages import Answer, Call, Command, Hello, Outcome
+from petrobot.services.comm.notice import Answered, Notice
+from petrobot.services.comm.party import TICK
+from petrobot.sim.laboratory import Laboratory
+from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
+from petrobot.sim.truth import LaboratoryError
 from tests.ports import free_ports
-from tests.sim.laboratory_shell import PATIENCE, REPOSITORY, call, program, running, score_as_member, until
+from tests.sim.laboratory_shell import (
+    PATIENCE,
+    REPOSITORY,
+    call,
+    program,
+    running,
+    score_as_member,
+    until,
+)
 
 
 def services_file(folder: Path, extra: str = "") -> Path:
@@ -34,7 +42,7 @@ schema = 1
 [nodes.laboratory]
 host = "127.0.0.1"
 port = {node}
-sim = "sim.laboratory:make_laboratory"
+sim = "petrobot.sim.laboratory:make_laboratory"
 [nodes.robot]
 host = "127.0.0.1"
 port = {coordinator}
@@ -82,7 +90,9 @@ async def test_world_keeps_pace_with_the_clock(shell: LaboratoryShell) -> None:
     assert took - (lab.now - world) < 0.3
 
 
-async def test_drives_answer_on_the_bus(shell: LaboratoryShell, cell_master: Callable[[], Any]) -> None:
+async def test_drives_answer_on_the_bus(
+    shell: LaboratoryShell, cell_master: Callable[[], Any]
+) -> None:
     port = StreamPort(bus_channel(shell._directory))
     master = cell_master()
     lab = shell.laboratory
@@ -126,9 +136,15 @@ async def test_images_come_with_their_age_and_stop_when_asked(shell: LaboratoryS
 
 
 async def test_services_are_answered(shell: LaboratoryShell) -> None:
-    assert (await ask(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)).status == "success"
+    assert (
+        await ask(shell, "laboratory_prepare", seed=7, regime="B+miscalibrated", runs=3)
+    ).status == "success"
     score = await ask(shell, "laboratory_score")
-    assert (score.values["seed"], score.values["regime"], score.values["throws"]) == (7, "B+miscalibrated", [])
+    assert (score.values["seed"], score.values["regime"], score.values["throws"]) == (
+        7,
+        "B+miscalibrated",
+        [],
+    )
     assert (await ask(shell, "laboratory_fault", kind="slow_arm", factor=0.5)).status == "success"
     refused = await ask(shell, "laboratory_prepare", regime="Q")
     assert refused.status == "error" and "must begin with" in refused.text
@@ -149,7 +165,9 @@ async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
     client.flush()
     await until(lambda: bool(answered))
     await client.close()
-    assert answered == [Answer("asking/status", True, {"answers": {}, "devices": {}, "emergency": []})]
+    assert answered == [
+        Answer("asking/status", True, {"answers": {}, "devices": {}, "emergency": []})
+    ]
 
 
 async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
@@ -170,10 +188,15 @@ async def test_a_fault_of_the_world_ends_the_shell(tmp_path: Path) -> None:
     ("extra", "says"),
     [
         (
-            '[devices.other]\nnode = "robot"\ndriver = "no:Where"\ninterface = "petrobot_stream"\nchannel = "tcp://x:1"',
+            '[devices.other]\nnode = "robot"\ndriver = "no:Where"\ninterface = '
+            '"petrobot_stream"\nchannel = "tcp://x:1"',
             "bus",
         ),
-        ('[devices.other]\nnode = "robot"\ndriver = "no:Where"\nsource = "sim"\naddress = "127.0.0.1:1"', "cameras"),
+        (
+            '[devices.other]\nnode = "robot"\ndriver = "no:Where"\nsource = "sim"\naddress = '
+            '"127.0.0.1:1"',
+            "cameras",
+        ),
     ],
 )
 def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says: str) -> None:
@@ -187,19 +210,29 @@ def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("taken", ["node", "bus", "camera"])
-def test_an_address_that_is_taken_is_told_by_file_address_and_remedy(tmp_path: Path, taken: str) -> None:
+def test_an_address_that_is_taken_is_told_by_file_address_and_remedy(
+    tmp_path: Path, taken: str
+) -> None:
     """A second laboratory would meet all three."""
     file = services_file(tmp_path)
     directory = load(file)
     camera = camera_address(directory)
     assert camera is not None
     bus = bus_channel(directory)
-    port = {"node": directory.nodes["laboratory"].port, "bus": int(bus.rpartition(":")[2]), "camera": camera[1]}[taken]
+    port = {
+        "node": directory.nodes["laboratory"].port,
+        "bus": int(bus.rpartition(":")[2]),
+        "camera": camera[1],
+    }[taken]
     with socket.create_server(("127.0.0.1", port)):
         process = program("--services", str(file))
         _, said = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2
-    assert f"python -m sim: {file}: " in said and str(port) in said and "or give another port" in said
+    assert (
+        f"python -m petrobot.sim: {file}: " in said
+        and str(port) in said
+        and "or give another port" in said
+    )
 
 
 @pytest.mark.processes
@@ -239,12 +272,15 @@ def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
         (None, "name the file with --services"),
         ("schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\n", "write sim ="),
         (
-            "schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\nsim = 'sim.laboratory:make_laboratory'\n",
+            "schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\nsim = "
+            "'petrobot.sim.laboratory:make_laboratory'\n",
             "[parameters] cell is missing",
         ),
     ],
 )
-def test_a_bad_location_file_is_one_clear_error(tmp_path: Path, text: str | None, says: str) -> None:
+def test_a_bad_location_file_is_one_clear_error(
+    tmp_path: Path, text: str | None, says: str
+) -> None:
     file = tmp_path / "services.toml"
     if text is not None:
         file.write_text(text)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.exposures import camera_of
-from sim.puma_model import read_arm
-from sim.site import Site, read_site
-from sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
+from petrobot.sim.exposures import camera_of
+from petrobot.sim.puma_model import read_arm
+from petrobot.sim.site import Site, read_site
+from petrobot.sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
 
 SETTINGS = read_toml(LABORATORY_FILE)
 
@@ -41,7 +41,9 @@ def changed(one: Truth, other: Truth) -> set[str]:
         ("C", {"speed"}),
     ],
 )
-def test_a_disturbance_changes_what_it_names_and_nothing_else(site: Site, name: str, differs: set[str]) -> None:
+def test_a_disturbance_changes_what_it_names_and_nothing_else(
+    site: Site, name: str, differs: set[str]
+) -> None:
     assert changed(site.truth("A"), site.truth(name)) == differs
 
 
@@ -76,11 +78,15 @@ def test_the_true_cell_is_near_the_nominal_one_but_not_it(site: Site) -> None:
 def test_light_drifts_around_its_level(site: Site) -> None:
     truth = site.truth("A+drift")
     levels = [truth.light(0.1 * k) for k in range(80)]
-    assert max(levels) == pytest.approx(1.35, abs=0.01) and min(levels) == pytest.approx(0.65, abs=0.01)
+    assert max(levels) == pytest.approx(1.35, abs=0.01) and min(levels) == pytest.approx(
+        0.65, abs=0.01
+    )
     assert {site.truth("A").light(t) for t in (0.0, 1.0, 5.0)} == {1.0}
 
 
-def test_the_file_says_how_even_the_light_is_and_the_camera_shows_it(site: Site, tmp_path: Path) -> None:
+def test_the_file_says_how_even_the_light_is_and_the_camera_shows_it(
+    site: Site, tmp_path: Path
+) -> None:
     nominal = site.truth("A")
     assert nominal.light_gradient == (-0.50, 0.10) and nominal.vignetting == 0.20
     text = LABORATORY_FILE.read_text(encoding="utf-8")
@@ -88,7 +94,10 @@ def test_the_file_says_how_even_the_light_is_and_the_camera_shows_it(site: Site,
     file.write_text(text.replace("light_gradient = [-0.50, 0.10]", "light_gradient = [0.0, 0.0]"))
     even = read_truth(site.cell, "A", file)
     assert changed(nominal, even) == {"light_gradient"}
-    bright, dim = (camera_of(site.cell, truth, np.random.default_rng(0)).illumination for truth in (even, nominal))
+    bright, dim = (
+        camera_of(site.cell, truth, np.random.default_rng(0)).illumination
+        for truth in (even, nominal)
+    )
     assert float(bright[240, 630]) == pytest.approx(float(bright[240, 9]), abs=1e-3)
     assert float(dim[240, 630]) < 0.7 * float(dim[240, 9])
 

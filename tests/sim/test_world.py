@@ -1,4 +1,5 @@
-"""The ball's world with a cup that a magic hand holds: catches, misses, edges, the light barrier."""
+"""The ball's world with a cup that a magic hand holds: catches, misses, edges, the light
+barrier."""
 
 from __future__ import annotations
 
@@ -9,13 +10,13 @@ from functools import partial
 
 import pytest
 
-from services.comm.party import TICK
-from sim.ball import BallState, TableMotion, fly
-from sim.course import Course, Outcome
-from sim.puma_model import Frame3
-from sim.site import Site
-from sim.thrower import Throw, draw_throw
-from sim.world import Where, World
+from petrobot.services.comm.party import TICK
+from petrobot.sim.ball import BallState, TableMotion, fly
+from petrobot.sim.course import Course, Outcome
+from petrobot.sim.puma_model import Frame3
+from petrobot.sim.site import Site
+from petrobot.sim.thrower import Throw, draw_throw
+from petrobot.sim.world import Where, World
 
 AWAY = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, 0.0, 0.3))
 
@@ -43,7 +44,8 @@ class Hand:
         return self.world.release(self.now, replace(thrown, **changes))  # type: ignore[arg-type]
 
     def where_it_will_be(self, throw: Throw, fall: float) -> tuple[float, BallState]:
-        """Seconds after release, and the ball's state, when it has fallen so far (m) below the table's level."""
+        """Seconds after release, and the ball's state, when it has fallen so far (m) below the
+        table's level."""
         motion = TableMotion(self.world.model, throw.start, throw.rolling_resistance)
         leaves = motion.first_crossing(0, self.truth.table.near_edge)
         took = math.sqrt(2.0 * fall / 9.81)
@@ -66,7 +68,8 @@ class Hand:
         assert until()
 
     def hold_under(self, course: Course, aside: float = 0.0, lean: float = 0.5) -> Frame3:
-        """The cup where the ball comes, `aside` (m) of it along y, leaning by a share of the ball's slant."""
+        """The cup where the ball comes, `aside` (m) of it along y, leaning by a share of the ball's
+        slant."""
         _, state = self.where_it_will_be(course.throw, 0.10)
         (x, y, z), (vx, _, vz) = state.position, state.velocity
         return leaned(lean * math.atan2(-vx, -vz), (x, y + aside, z))
@@ -94,7 +97,9 @@ def hand(site: Site) -> Iterator[Callable[[str], Hand]]:
 
 
 @pytest.mark.parametrize("regime", "ABC")
-def test_a_cup_in_the_right_place_catches_every_ball(hand: Callable[[str], Hand], regime: str) -> None:
+def test_a_cup_in_the_right_place_catches_every_ball(
+    hand: Callable[[str], Hand], regime: str
+) -> None:
     here = hand(regime)
     for n in range(1, 13):
         course = here.throw(n)
@@ -109,7 +114,9 @@ def test_a_cup_in_the_right_place_catches_every_ball(hand: Callable[[str], Hand]
 
 
 @pytest.mark.parametrize("aside", [0.07, -0.12])
-def test_a_miss_is_measured_in_the_plane_of_the_mouth(hand: Callable[[str], Hand], aside: float) -> None:
+def test_a_miss_is_measured_in_the_plane_of_the_mouth(
+    hand: Callable[[str], Hand], aside: float
+) -> None:
     here = hand("A")
     course = here.throw(3)
     cup = here.hold_under(course, aside)
@@ -138,7 +145,9 @@ def test_restitution_decides_whether_fast_balls_stay_in(
 ) -> None:
     here = hand("C")
     here.world.close()
-    here.world = World(here.site.cell, replace(here.truth, cup=replace(here.truth.cup, restitution=restitution)))
+    here.world = World(
+        here.site.cell, replace(here.truth, cup=replace(here.truth.cup, restitution=restitution))
+    )
     outcomes = []
     for n in range(1, 16):
         course = here.throw(n)
@@ -164,7 +173,9 @@ def test_a_ball_that_is_jerked_out_of_the_cup_was_dropped(hand: Callable[[str], 
     assert course.outcome is Outcome.DROPPED
 
 
-def test_a_turned_cup_loses_its_ball_to_the_floor_and_it_stays_caught(hand: Callable[[str], Hand]) -> None:
+def test_a_turned_cup_loses_its_ball_to_the_floor_and_it_stays_caught(
+    hand: Callable[[str], Hand],
+) -> None:
     here = hand("A")
     course = here.throw(2)
     cup = here.hold_under(course)
@@ -188,7 +199,9 @@ def test_the_barrier_waits_its_delay(hand: Callable[[str], Hand]) -> None:
 def test_a_slow_ball_tips_over_the_edge_and_falls_near_it(hand: Callable[[str], Hand]) -> None:
     here = hand("A")
     slow = BallState(
-        (0.8, 0.0, here.truth.table.top + 0.02), (-0.25, 0.0, 0.0), here.world.model.spin_of_rolling(-0.25, 0.0)
+        (0.8, 0.0, here.truth.table.top + 0.02),
+        (-0.25, 0.0, 0.0),
+        here.world.model.spin_of_rolling(-0.25, 0.0),
     )
     course = here.throw(1, start=slow, rolling_resistance=0.006)
     lowest: list[tuple[float, float, float]] = []

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest_asyncio
 
-from coordinator.hmi.store import TaskStore
-from coordinator.operator.station import Station
-from services.comm.directory import Directory, parse
-from services.node import GENERAL, Node
-from services.place import InlinePlace
-from services.scripted import load
+from petrobot.coordinator.hmi.store import TaskStore
+from petrobot.coordinator.operator.station import Station
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.node import GENERAL, Node
+from petrobot.services.place import InlinePlace
+from petrobot.services.scripted import load
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
 from tests.waiting import beat
@@ -110,7 +110,9 @@ out = ["arm_free"]
 """
 
 
-def toy_node(directory: Directory, name: str, script: Mapping[str, Callable[..., Any]]) -> NodeInLoop:
+def toy_node(
+    directory: Directory, name: str, script: Mapping[str, Callable[..., Any]]
+) -> NodeInLoop:
     """A node, in this loop."""
     clock = asyncio.get_running_loop().time
     place = InlinePlace(directory.actions, clock=clock, substitutes=script)
@@ -127,7 +129,9 @@ class Cell:
         (folder / "script.toml").write_text(script, encoding="utf-8")
         scripted = load(folder / "script.toml")
         self.directory = parse(path.read_text(encoding="utf-8"), path)
-        self.nodes = {name: toy_node(self.directory, name, scripted) for name in self.directory.nodes}
+        self.nodes = {
+            name: toy_node(self.directory, name, scripted) for name in self.directory.nodes
+        }
         self.tasks = TaskStore(folder / "tasks")
         self.tasks.save_text("moving", None, TASK)
         self.runs = folder / "runs"

@@ -1,4 +1,5 @@
-"""Simulated runs that set out from a point of a recorded one: from the beginning it is the run itself, from anywhere it ends."""
+"""Simulated runs that set out from a point of a recorded one: from the beginning it is the run
+itself, from anywhere it ends."""
 
 from __future__ import annotations
 
@@ -11,17 +12,23 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator.cli import main
-from coordinator.engine import Engine, Phase
-from coordinator.launch import Setting, lockstep_cell, lockstep_id
-from coordinator.operator.departure import ENDS, DepartureError, departed_store, departing, departure
-from coordinator.record.journal import Journal, read_journal
-from coordinator.record.recording import JournalStore, replay
-from coordinator.record.runfolder import JOURNAL
-from coordinator.task import Task
-from coordinator.taskfile import load
-from services.comm.directory import Directory, parse
-from services.scripted import load as script_of
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.engine import Engine, Phase
+from petrobot.coordinator.launch import Setting, lockstep_cell, lockstep_id
+from petrobot.coordinator.operator.departure import (
+    ENDS,
+    DepartureError,
+    departed_store,
+    departing,
+    departure,
+)
+from petrobot.coordinator.record.journal import Journal, read_journal
+from petrobot.coordinator.record.recording import JournalStore, replay
+from petrobot.coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.taskfile import load
+from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.scripted import load as script_of
 from tests.record.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
@@ -34,8 +41,29 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("departure")
     for name, text in (("services.toml", SERVICES), ("mock.toml", SCRIPT)):
         (folder / name).write_text(text)
-    given = ["run", str(TASK), "--mode", "lockstep", "--quiet", "--seed", "3", "--journal", str(folder / "runs")]
-    assert main([*given, "--services", str(folder / "services.toml"), "--mock", str(folder / "mock.toml")]) == 0
+    given = [
+        "run",
+        str(TASK),
+        "--mode",
+        "lockstep",
+        "--quiet",
+        "--seed",
+        "3",
+        "--journal",
+        str(folder / "runs"),
+    ]
+    assert (
+        main(
+            [
+                *given,
+                "--services",
+                str(folder / "services.toml"),
+                "--mock",
+                str(folder / "mock.toml"),
+            ]
+        )
+        == 0
+    )
     return folder
 
 
@@ -50,7 +78,9 @@ def parts(cell: Path) -> tuple[Journal, Task, Directory, Engine]:
     return read_journal(the_run(cell) / JOURNAL), task, directory, Engine(task)
 
 
-def simulate(cell: Path, directory: Directory, setting: Setting, store: JournalStore) -> dict[str, Any]:
+def simulate(
+    cell: Path, directory: Directory, setting: Setting, store: JournalStore
+) -> dict[str, Any]:
     """Run to the end in this process."""
     lab, party = lockstep_cell(directory, setting, script_of(cell / "mock.toml"), None, store)
     assert lab.run(lambda: party.over, TICKS), "it has no end"
@@ -66,7 +96,9 @@ def plain(journal: Journal) -> list[tuple[str, Any]]:
     return [(record.kind, record.data) for record in journal.records]
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(seed=st.integers(0, 2**31))
 def test_from_the_beginning_with_the_same_seed_it_is_the_run_itself(cell: Path, seed: int) -> None:
     """Record by record, for any seed."""
@@ -86,10 +118,20 @@ def test_from_the_beginning_with_the_same_seed_it_is_the_run_itself(cell: Path, 
 
 
 def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
-    """`petrobot run --from RUN` makes the recorded run again, in a folder of its own that says where it comes from."""
+    """`petrobot run --from RUN` makes the recorded run again, in a folder of its own that says
+    where it comes from."""
     then = the_run(cell)
     out = cell / "again.json"
-    given = ["run", "--from", str(then), "--quiet", "--journal", str(cell / "again"), "--json", str(out)]
+    given = [
+        "run",
+        "--from",
+        str(then),
+        "--quiet",
+        "--journal",
+        str(cell / "again"),
+        "--json",
+        str(out),
+    ]
     assert main(given) == 0
     [folder] = (cell / "again").iterdir()
     again = read_journal(folder / JOURNAL)
@@ -97,19 +139,28 @@ def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
     assert again.header["from"] == {"run": then.name, "record": 0, "time": 0.0, "going": {}}
     before, now = json.loads((then / "result.json").read_text()), json.loads(out.read_text())
     assert now.pop("from") == {"run": then.name, "record": 0, "going": {}}
-    assert {k: v for k, v in now.items() if k != "wall_s"} == {k: v for k, v in before.items() if k != "wall_s"}
+    assert {k: v for k, v in now.items() if k != "wall_s"} == {
+        k: v for k, v in before.items() if k != "wall_s"
+    }
     assert main(["replay", str(folder)]) == 0
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data())
 def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> None:
-    """Whatever becomes of the runs that went on; the first marking is that of the record, and replay derives it all again."""
+    """Whatever becomes of the runs that went on; the first marking is that of the record, and
+    replay derives it all again."""
     journal, task, directory, engine = parts(cell)
     last = journal.records[-1].number
     record = data.draw(st.integers(0, last - 1), label="record")
     steps = [step for step in replay(journal, engine) if step.number <= record]
-    live = sorted({r.place for r in steps[-1].state.runs() if r.phase is not Phase.DONE}) if steps else []
+    live = (
+        sorted({r.place for r in steps[-1].state.runs() if r.phase is not Phase.DONE})
+        if steps
+        else []
+    )
     going = {place: data.draw(st.sampled_from(ENDS), label=place) for place in live}
     seed = data.draw(st.integers(0, 99), label="seed")
     try:
@@ -150,7 +201,9 @@ def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> N
         (["shuttle", "--going", "again"], "goes with --from"),
     ],
 )
-def test_what_cannot_be_is_refused(cell: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_refused(
+    cell: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exit code 2 and one clear word, and no folder is left behind."""
     folder = cell / "refused"
     given = [text.format(run=the_run(cell)) for text in more]
@@ -162,7 +215,9 @@ def test_what_cannot_be_is_refused(cell: Path, more: list[str], word: str, capsy
 def test_a_killed_departed_run_is_made_again(cell: Path) -> None:
     """`petrobot resume` knows where it had set out."""
     then, kept = the_run(cell), cell / "killed"
-    record = next(r.number for r in read_journal(then / JOURNAL).records if "RunEnded" in str(r.data))
+    record = next(
+        r.number for r in read_journal(then / JOURNAL).records if "RunEnded" in str(r.data)
+    )
     assert main(["run", "--from", f"{then}:{record}", "--quiet", "--journal", str(kept)]) == 0
     [folder] = kept.iterdir()
     before = plain(read_journal(folder / JOURNAL))
@@ -175,7 +230,7 @@ def test_a_killed_departed_run_is_made_again(cell: Path) -> None:
 
 
 def _write(path: Path, whole: Journal, records: int) -> None:
-    from coordinator.record.journal import JournalWriter
+    from petrobot.coordinator.record.journal import JournalWriter
 
     given: Mapping[str, Any] = dict(whole.header)
     writer = JournalWriter(path, given)

@@ -1,5 +1,6 @@
-"""An operator's client written from docs/operator-protocol.md and RFC 6455 alone, on plain sockets, follows and steers a real
-`petrobot serve` through a simulated catch, and ends with the state that the coordinator has.
+"""An operator's client written from docs/operator-protocol.md and RFC 6455 alone, on plain sockets,
+follows and steers a real `petrobot serve` through a simulated catch, and ends with the state that
+the coordinator has.
 """
 
 from __future__ import annotations
@@ -49,8 +50,19 @@ class Operator:
         self._rest = b""
         self._socket = socket.create_connection((host, port), timeout=PATIENCE)
         key = base64.b64encode(os.urandom(16)).decode()
-        lines = ["GET /api/live HTTP/1.1", f"Host: {host}:{port}", "Upgrade: websocket", "Connection: Upgrade"]
-        lines += [f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Version: 13", f"Authorization: Bearer {token}", "", ""]
+        lines = [
+            "GET /api/live HTTP/1.1",
+            f"Host: {host}:{port}",
+            "Upgrade: websocket",
+            "Connection: Upgrade",
+        ]
+        lines += [
+            f"Sec-WebSocket-Key: {key}",
+            "Sec-WebSocket-Version: 13",
+            f"Authorization: Bearer {token}",
+            "",
+            "",
+        ]
         self._socket.sendall("\r\n".join(lines).encode())
         limit = Limit("the end of the head")
         while b"\r\n\r\n" not in self._rest and limit.left():
@@ -77,8 +89,14 @@ class Operator:
 
     def _send(self, code: int, body: bytes) -> None:
         mask = os.urandom(4)
-        size = bytes([0x80 | len(body)]) if len(body) < 126 else bytes([0x80 | 126]) + struct.pack(">H", len(body))
-        self._socket.sendall(bytes([0x80 | code]) + size + mask + bytes(b ^ mask[i % 4] for i, b in enumerate(body)))
+        size = (
+            bytes([0x80 | len(body)])
+            if len(body) < 126
+            else bytes([0x80 | 126]) + struct.pack(">H", len(body))
+        )
+        self._socket.sendall(
+            bytes([0x80 | code]) + size + mask + bytes(b ^ mask[i % 4] for i, b in enumerate(body))
+        )
 
     def _hear_text(self) -> str:
         whole, limit = b"", Limit("a whole message")
@@ -103,7 +121,9 @@ class Operator:
         message = json.loads(self._hear_text())
         kind = str(message["type"])
         if kind == "snapshot":
-            self.state = {key: value for key, value in message.items() if key not in ("type", "protocol")}
+            self.state = {
+                key: value for key, value in message.items() if key not in ("type", "protocol")
+            }
         elif kind == "delta":
             assert message["first"] == self.state["sequence"] + 1
             self.state |= {"sequence": message["last"], "time": message["time"]}
@@ -124,7 +144,9 @@ class Operator:
         elif kind == "run_started":
             state["runs"][change["run"]["id"]] = change["run"]
         elif kind == "run_progress" and change["id"] in state["runs"]:
-            state["runs"][change["id"]] |= {k: v for k, v in change.items() if k not in ("kind", "id")}
+            state["runs"][change["id"]] |= {
+                k: v for k, v in change.items() if k not in ("kind", "id")
+            }
         elif kind == "run_ended":
             run = state["runs"].pop(change["id"])
             ended = {key: change[key] for key in ("status", "ended", "reason")}
@@ -135,7 +157,9 @@ class Operator:
             state[ENTRIES[kind]][change["name"]] = change[kind]
         elif kind == "setpoint":
             stream = state["setpoints"].setdefault(change["stream"], {"samples": []})
-            stream |= change.get("setpoint", {}) | {"samples": [*stream["samples"], *change["samples"]][-300:]}
+            stream |= change.get("setpoint", {}) | {
+                "samples": [*stream["samples"], *change["samples"]][-300:]
+            }
         elif kind in WHOLE:
             state[kind] = change[kind]
 
@@ -176,7 +200,7 @@ def operator(tmp_path: Path) -> Iterator[Operator]:
     command = [
         sys.executable,
         "-m",
-        "coordinator",
+        "petrobot.coordinator",
         "serve",
         "--journal",
         str(tmp_path / "runs"),
@@ -198,8 +222,11 @@ def operator(tmp_path: Path) -> Iterator[Operator]:
 
 
 @pytest.mark.processes
-def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(operator: Operator) -> None:
-    """Controls, a start, a breakpoint, tokens in control places alone; every change applied as the page says it."""
+def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(
+    operator: Operator,
+) -> None:
+    """Controls, a start, a breakpoint, tokens in control places alone; every change applied as the
+    page says it."""
     assert operator.order("pause")["code"] == "not_holder"
     assert operator.order("take_controls")["ok"]
     assert operator.order("load", task="catch_ball")["ok"]
@@ -217,7 +244,18 @@ def test_a_foreign_operator_steers_a_catch_and_sees_what_the_coordinator_sees(op
 
     told, now = operator.resynced()
     limit = Limit("a quiet moment")
-    while told["sequence"] != now["sequence"] and limit.left():  # what happened meanwhile came with the snapshot
+    while (
+        told["sequence"] != now["sequence"] and limit.left()
+    ):  # what happened meanwhile came with the snapshot
         told, now = operator.resynced()
     assert told == now
-    assert {"fired", "marking", "run_started", "run_ended", "device", "image", "setpoint", "paused"} <= operator.kinds
+    assert {
+        "fired",
+        "marking",
+        "run_started",
+        "run_ended",
+        "device",
+        "image",
+        "setpoint",
+        "paused",
+    } <= operator.kinds

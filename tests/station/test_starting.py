@@ -1,4 +1,5 @@
-"""What an operator may ask for at a start: read or refused; lock-step runs and runs from a point, shown live and steered."""
+"""What an operator may ask for at a start: read or refused; lock-step runs and runs from a point,
+shown live and steered."""
 
 from __future__ import annotations
 
@@ -13,25 +14,31 @@ import pytest_asyncio
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator.cli import main
-from coordinator.hmi.journals import opened
-from coordinator.hmi.store import TaskStore
-from coordinator.operator import station
-from coordinator.operator.emergency import CLEAR, STOP
-from coordinator.operator.simulated_run import SimulatedRun
-from coordinator.operator.start_order import StartOrder, read_depart, read_start, start_form
-from coordinator.operator.station import Station
-from coordinator.record.journal import read_journal
-from coordinator.record.runfolder import JOURNAL, RESULT
-from coordinator.taskfile import loads
-from services.comm.directory import parse
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.hmi.journals import opened
+from petrobot.coordinator.hmi.store import TaskStore
+from petrobot.coordinator.operator import station
+from petrobot.coordinator.operator.emergency import CLEAR, STOP
+from petrobot.coordinator.operator.simulated_run import SimulatedRun
+from petrobot.coordinator.operator.start_order import (
+    StartOrder,
+    read_depart,
+    read_start,
+    start_form,
+)
+from petrobot.coordinator.operator.station import Station
+from petrobot.coordinator.record.journal import read_journal
+from petrobot.coordinator.record.runfolder import JOURNAL, RESULT
+from petrobot.coordinator.taskfile import loads
+from petrobot.services.comm.directory import parse
 from tests.station.conftest import SCRIPT, SERVICES, TASK, Cell
 from tests.waiting import beat
 
 pytestmark = pytest.mark.processes
 
 REMARKED = TASK.replace(
-    "speed = 0.5", 'speed = 0.5 # m/s\nquiet = false\nbatch = "A" # which\ncount = 3\nregime = "calm"'
+    "speed = 0.5",
+    'speed = 0.5 # m/s\nquiet = false\nbatch = "A" # which\ncount = 3\nregime = "calm"',
 )
 MOVING = loads(REMARKED, "moving.toml")
 
@@ -49,11 +56,15 @@ class Simulated(Cell):
         self.tasks = TaskStore(folder / "tasks")
         self.tasks.save_text("moving", None, TASK)
         self.runs = folder / "runs"
-        self.station = Station(self.directory, self.tasks, self.runs, folder / "script.toml", folder / "estimates")
+        self.station = Station(
+            self.directory, self.tasks, self.runs, folder / "script.toml", folder / "estimates"
+        )
 
     async def simulate(self, **data: Any) -> tuple[str, Mapping[str, Any]]:
         """Start in lock step and wait for the end; the run's folder and result."""
-        answer = await self.say("start", **{"task": "moving", "mode": "lockstep", "pace": 0, **data})
+        answer = await self.say(
+            "start", **{"task": "moving", "mode": "lockstep", "pace": 0, **data}
+        )
         assert answer["ok"], answer
         result = await self.ended()
         await self.until(lambda: self.station._going is None)
@@ -79,11 +90,13 @@ def records(folder: Path) -> list[tuple[str, Any]]:
     return found
 
 
-# ---- what may be asked for --------------------------------------------------------------------------------------------
+# ---- what may be asked for
+# --------------------------------------------------------------------------------------------
 
 
 def test_the_form_has_types_defaults_and_the_authors_words(tmp_path: Path) -> None:
-    """Parameters as the task file declares them, with the comments behind them; only files of the folder are offered."""
+    """Parameters as the task file declares them, with the comments behind them; only files of the
+    folder are offered."""
     (tmp_path / "known.db").touch()
     (tmp_path / "no name.db").touch()
     form = start_form(MOVING, REMARKED, tmp_path)
@@ -102,14 +115,24 @@ def test_the_form_has_types_defaults_and_the_authors_words(tmp_path: Path) -> No
 def test_everything_that_the_command_line_takes_is_read(tmp_path: Path) -> None:
     """All fields at once, and none."""
     assert read_start(MOVING, {}, tmp_path) == StartOrder()
-    learn = {"file": "mine", "selector": "thompson", "target": 1, "contexts": ["regime", " "], "frozen": True}
+    learn = {
+        "file": "mine",
+        "selector": "thompson",
+        "target": 1,
+        "contexts": ["regime", " "],
+        "frozen": True,
+    }
     given = {"mode": "lockstep", "runs": 7, "seed": 4, "regime": "wild", "pace": 10, "learn": learn}
     order = read_start(MOVING, {**given, "parameters": {"speed": 1, "quiet": True}}, tmp_path)
     assert (order.mode, order.runs, order.seed, order.pace) == ("lockstep", 7, 4, 10.0)
     assert order.parameters == {"speed": 1.0, "quiet": True, "regime": "wild"}
     assert type(order.parameters["speed"]) is float
     assert order.learn is not None and order.learn.path == tmp_path / "mine.db"
-    assert (order.learn.selector, order.learn.contexts, order.learn.frozen) == ("thompson", ("regime",), True)
+    assert (order.learn.selector, order.learn.contexts, order.learn.frozen) == (
+        "thompson",
+        ("regime",),
+        True,
+    )
 
 
 BAD = [
@@ -149,7 +172,9 @@ BAD = [
 
 
 @pytest.mark.parametrize(("data", "word"), BAD)
-def test_what_cannot_be_is_refused_with_a_clear_word(data: dict[str, Any], word: str | None, tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused_with_a_clear_word(
+    data: dict[str, Any], word: str | None, tmp_path: Path
+) -> None:
     """The field, what is wrong with it, and what would do."""
     if word is None:
         assert read_start(MOVING, data, tmp_path).parameters == {}
@@ -161,13 +186,19 @@ def test_what_cannot_be_is_refused_with_a_clear_word(data: dict[str, Any], word:
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=8,
 )
-FIELDS = st.sampled_from(["task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from", "odd"])
+FIELDS = st.sampled_from(
+    ["task", "mode", "runs", "seed", "regime", "parameters", "learn", "pace", "from", "odd"]
+)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.dictionaries(FIELDS, JSON, max_size=6))
 def test_whatever_comes_is_an_order_or_a_refusal(data: dict[str, Any], tmp_path: Path) -> None:
     """Nothing else comes out, and what does is of the declared types; no name leaves its folder."""
@@ -187,11 +218,15 @@ def test_whatever_comes_is_an_order_or_a_refusal(data: dict[str, Any], tmp_path:
         assert isinstance(depart.run, str) and depart.record >= 0
 
 
-# ---- in lock step, live -----------------------------------------------------------------------------------------------
+# ---- in lock step, live
+# -----------------------------------------------------------------------------------------------
 
 
-async def test_a_run_in_lock_step_is_that_of_the_command_line(cell: Simulated, tmp_path: Path) -> None:
-    """Record by record and in its result, at any pace, watched or not; it has a folder, a journal and a result."""
+async def test_a_run_in_lock_step_is_that_of_the_command_line(
+    cell: Simulated, tmp_path: Path
+) -> None:
+    """Record by record and in its result, at any pace, watched or not; it has a folder, a journal
+    and a result."""
     given = [
         "run",
         str(tmp_path / "tasks" / "moving.toml"),
@@ -203,14 +238,22 @@ async def test_a_run_in_lock_step_is_that_of_the_command_line(cell: Simulated, t
         "9",
         "--quiet",
     ]
-    given += ["--services", str(tmp_path / "services.toml"), "--mock", str(tmp_path / "script.toml")]
+    given += [
+        "--services",
+        str(tmp_path / "services.toml"),
+        "--mock",
+        str(tmp_path / "script.toml"),
+    ]
     assert await asyncio.to_thread(main, [*given, "--journal", str(tmp_path / "cli")]) == 0
     [expected] = (tmp_path / "cli").iterdir()
     for pace, watched in ((0, False), (0, True), (4, True)):
         stop = cell.station.subscribe(lambda change: None) if watched else None
         run, result = await cell.simulate(runs=3, seed=9, pace=pace)
         assert records(cell.runs / run) == records(expected)
-        assert {**result, "wall_s": 0} == {**json.loads((expected / RESULT).read_text()), "wall_s": 0}
+        assert {**result, "wall_s": 0} == {
+            **json.loads((expected / RESULT).read_text()),
+            "wall_s": 0,
+        }
         assert json.loads((cell.runs / run / RESULT).read_text()) == result
         assert cell.state["mission"]["id"] == run and cell.state["mission"]["mode"] == "lockstep"
         assert main(["replay", str(cell.runs / run)]) == 0
@@ -219,7 +262,8 @@ async def test_a_run_in_lock_step_is_that_of_the_command_line(cell: Simulated, t
 
 
 async def test_a_run_in_lock_step_is_steered(cell: Simulated) -> None:
-    """While it is paused its time stands still; step, tokens, override, force and abort work as in real time."""
+    """While it is paused its time stands still; step, tokens, override, force and abort work as in
+    real time."""
     assert (await cell.say("load", task="moving"))["ok"]
     assert (await cell.say("breakpoint", element="transitions.seen", on=True))["ok"]
     answer = await cell.say("start", mode="lockstep", pace=0, runs=4)
@@ -237,18 +281,24 @@ async def test_a_run_in_lock_step_is_steered(cell: Simulated) -> None:
     assert cell.state["marking"]["jobs"] == 4
     assert (await cell.say("override_selector", primitive_task="look", action="look_twice"))["ok"]
     assert (await cell.say("step"))["ok"]
-    await cell.until(lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None)
+    await cell.until(
+        lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
+    )
     assert (await cell.say("breakpoint", element="transitions.seen", on=False))["ok"]
     assert (await cell.say("resume"))["ok"]
     assert (await cell.ended())["status"] == "success"
     assert [f["transition"] for f in cell.state["firings"]].count("begin") == 5
-    assert {r["action"] for r in cell.state["ended"] if r["place"] == "look"} == {"look_at_table", "look_twice"}
+    assert {r["action"] for r in cell.state["ended"] if r["place"] == "look"} == {
+        "look_at_table",
+        "look_twice",
+    }
 
 
 async def test_the_stop_of_a_simulated_run_reaches_for_the_devices_too(
     cell: Simulated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever presses it means everything: the run ends, and the real devices are ordered to stop as well."""
+    """Whoever presses it means everything: the run ends, and the real devices are ordered to stop
+    as well."""
     orders: list[str] = []
 
     async def order_all(directory: Any, credentials: Any, verb: str) -> list[Any]:
@@ -262,7 +312,11 @@ async def test_the_stop_of_a_simulated_run_reaches_for_the_devices_too(
     assert cell.state["mission"]["state"] == "stopped"
     assert (await cell.ended())["status"] == "error"
     await cell.until(lambda: cell.station._going is None)
-    assert cell.state["mission"] == {**cell.state["mission"], "state": "stopped", "reason": "emergency stop by ben"}
+    assert cell.state["mission"] == {
+        **cell.state["mission"],
+        "state": "stopped",
+        "reason": "emergency stop by ben",
+    }
     assert (await cell.say("start", task="moving", mode="lockstep"))["code"] == "stopped"
     assert (await cell.station.command("ben", "clear_estop", {}))["code"] == "not_holder"
     assert (await cell.say("clear_estop"))["ok"]
@@ -271,35 +325,51 @@ async def test_the_stop_of_a_simulated_run_reaches_for_the_devices_too(
 
 
 async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> None:
-    """Into the estimates file that was named; a second run begins with what the first one learned, a frozen one adds nothing."""
+    """Into the estimates file that was named; a second run begins with what the first one learned,
+    a frozen one adds nothing."""
     learn = {"file": "mine", "selector": "thompson"}
     _, first = await cell.simulate(runs=6, learn=learn)
-    assert first["learned"] == {"file": "mine.db", "selector": "thompson", "context": "", "runs_counted": 12}
+    assert first["learned"] == {
+        "file": "mine.db",
+        "selector": "thompson",
+        "context": "",
+        "runs_counted": 12,
+    }
     assert {a["action"] for a in cell.state["selectors"]["look"]["alternatives"] if "j" in a}
     assert {r["y"] for r in cell.state["reports"].values()} == {"probability", "J"}
     assert (await cell.station.form("moving"))["learn"]["estimates"] == ["mine"]
     _, second = await cell.simulate(runs=1, learn={**learn, "frozen": True})
     assert second["learned"]["runs_counted"] == 0
-    refused = await cell.say("start", task="moving", mode="lockstep", learn={"file": "none_yet", "frozen": True})
+    refused = await cell.say(
+        "start", task="moving", mode="lockstep", learn={"file": "none_yet", "frozen": True}
+    )
     assert not refused["ok"] and "nothing was learned" in refused["text"]
     (tmp_path / "estimates" / "broken.db").write_text("no database")
     refused = await cell.say("start", task="moving", mode="lockstep", learn={"file": "broken"})
     assert not refused["ok"] and "broken.db" in refused["text"]
-    assert not [p for p in cell.runs.iterdir() if not (p / RESULT).exists()], "a refused start leaves no run"
+    assert not [p for p in cell.runs.iterdir() if not (p / RESULT).exists()], (
+        "a refused start leaves no run"
+    )
 
 
-# ---- from a point -----------------------------------------------------------------------------------------------------
+# ---- from a point
+# -----------------------------------------------------------------------------------------------------
 
 
-async def test_a_run_from_a_point_is_shown_live_and_says_where_it_comes_from(cell: Simulated) -> None:
-    """From its beginning it is the run itself; from the middle it stands where the other stood and reaches an end."""
+async def test_a_run_from_a_point_is_shown_live_and_says_where_it_comes_from(
+    cell: Simulated,
+) -> None:
+    """From its beginning it is the run itself; from the middle it stands where the other stood and
+    reaches an end."""
     run, _ = await cell.simulate(runs=3, seed=5)
     again, _ = await cell.simulate(**{"from": {"run": run, "record": 0}})
     assert records(cell.runs / again) == records(cell.runs / run)
     history = await asyncio.to_thread(opened, cell.runs / run / JOURNAL, run)
     for record in history["records"][:-1]:
         going = dict.fromkeys(record["going"], "error:lost")
-        made, result = await cell.simulate(**{"from": {"run": run, "record": record["number"], "going": going}})
+        made, result = await cell.simulate(
+            **{"from": {"run": run, "record": record["number"], "going": going}}
+        )
         header = read_journal(cell.runs / made / JOURNAL).header
         assert (header["from"]["run"], header["from"]["record"]) == (run, record["number"])
         assert header["from"]["going"] == going

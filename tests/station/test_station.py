@@ -1,4 +1,5 @@
-"""A coordinator that stays: tasks are started again and again, and every start that cannot be is answered clearly."""
+"""A coordinator that stays: tasks are started again and again, and every start that cannot be is
+answered clearly."""
 
 from __future__ import annotations
 
@@ -8,10 +9,10 @@ import os
 
 import pytest
 
-from coordinator.hmi.journals import opened
-from coordinator.operator.door_file import Door, find_door
-from coordinator.record.journal import read_journal
-from coordinator.record.runfolder import JOURNAL, RESULT, NoRunError
+from petrobot.coordinator.hmi.journals import opened
+from petrobot.coordinator.operator.door_file import Door, find_door
+from petrobot.coordinator.record.journal import read_journal
+from petrobot.coordinator.record.runfolder import JOURNAL, RESULT, NoRunError
 from tests.station.conftest import TASK, Cell
 
 pytestmark = pytest.mark.processes
@@ -32,7 +33,9 @@ async def test_a_task_runs_again_and_again_over_real_nodes(cell: Cell) -> None:
     assert cell.state["controls"]["holder"] == "ana"
     history = opened(cell.runs / names[0] / JOURNAL, names[0])
     assert history["fault"] == ""
-    assert [f["reason"]["code"] for r in history["records"] for f in r["firings"] if f["reason"]] == ["slipped"]
+    assert [
+        f["reason"]["code"] for r in history["records"] for f in r["firings"] if f["reason"]
+    ] == ["slipped"]
 
 
 async def test_the_run_is_steered_and_its_door_is_open_while_it_goes_on(cell: Cell) -> None:
@@ -44,7 +47,9 @@ async def test_the_run_is_steered_and_its_door_is_open_while_it_goes_on(cell: Ce
     assert (await cell.say("pause"))["ok"]
     fired = cell.state["mission"]["firings"]
     assert (await cell.say("step"))["ok"]
-    await cell.until(lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None)
+    await cell.until(
+        lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
+    )
     assert (await cell.say("add_tokens", place="jobs"))["ok"]
     assert (await cell.say("resume"))["ok"]
     result = await cell.ended()
@@ -55,13 +60,16 @@ async def test_the_run_is_steered_and_its_door_is_open_while_it_goes_on(cell: Ce
 
 
 async def test_what_cannot_be_started_says_why(cell: Cell) -> None:
-    """No task chosen, no such task, a task with faults, bad parameters, a run that goes on, a stranger."""
+    """No task chosen, no such task, a task with faults, bad parameters, a run that goes on, a
+    stranger."""
     assert (await cell.say("start"))["text"] == "choose a task first"
     assert "no task file nothing.toml" in (await cell.say("start", task="nothing"))["text"]
     cell.tasks.save_text("strange", None, TASK.replace('["pick_part"]', '["pick_apart"]'))
     answer = await cell.say("start", task="strange")
     assert answer["code"] == "faults" and "pick_apart" in answer["text"]
-    assert [finding["key"] for finding in answer["findings"]] == ["primitive_tasks.pick.alternatives"]
+    assert [finding["key"] for finding in answer["findings"]] == [
+        "primitive_tasks.pick.alternatives"
+    ]
     answer = await cell.say("start", task="moving", parameters={"sped": 1.0})
     assert answer["code"] == "bad_data" and "speed" in answer["text"]
     assert not cell.runs.exists()
@@ -73,8 +81,11 @@ async def test_what_cannot_be_started_says_why(cell: Cell) -> None:
     await cell.ended()
 
 
-async def test_a_node_that_is_away_is_named_and_leaves_no_run(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The start is refused with the node's name and address; the page says that it is lost, and a later start succeeds."""
+async def test_a_node_that_is_away_is_named_and_leaves_no_run(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start is refused with the node's name and address; the page says that it is lost, and a
+    later start succeeds."""
     await cell.nodes["arm"].close()
 
     def offered() -> dict[str, bool]:
@@ -85,7 +96,11 @@ async def test_a_node_that_is_away_is_named_and_leaves_no_run(cell: Cell, monkey
             await cell.station.look()
     assert cell.state["nodes"]["arm"]["state"] == "lost"
     answer = await cell.say("start", task="moving")
-    assert answer["code"] == "unreachable" and answer["nodes"] == ["arm"] and "arm at 127.0.0.1:" in answer["text"]
+    assert (
+        answer["code"] == "unreachable"
+        and answer["nodes"] == ["arm"]
+        and "arm at 127.0.0.1:" in answer["text"]
+    )
     assert list(cell.runs.iterdir()) == []
     await cell.nodes["arm"].start()
     assert (await cell.say("start", task="moving"))["ok"]
@@ -99,7 +114,9 @@ async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:
     assert cell.state["marking"] == {"jobs": 2, "arm_free": 1, "look": 0, "pick": 0}
     assert (await cell.say("breakpoint", element="transitions.nowhere"))["code"] == "refused"
     assert (await cell.say("breakpoint", element="transitions.seen", on=True))["ok"]
-    assert (await cell.say("override_selector", primitive_task="look", action="look_thrice"))["code"] == "refused"
+    assert (await cell.say("override_selector", primitive_task="look", action="look_thrice"))[
+        "code"
+    ] == "refused"
     assert (await cell.say("override_selector", primitive_task="look", action="look_twice"))["ok"]
     started = await cell.say("start")
     await cell.until(lambda: cell.state["paused"] is not None)

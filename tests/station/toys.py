@@ -1,8 +1,9 @@
-"""Primitive actions of a toy cell: they take their time and succeed. Scripts (`--mock`) let them fail."""
+"""Primitive actions of a toy cell: they take their time and succeed. Scripts (`--mock`) let them
+fail."""
 
 from __future__ import annotations
 
-from services.action import Context, Result, success
+from petrobot.services.action import Context, Result, success
 
 TAKES = 0.3
 """Seconds."""

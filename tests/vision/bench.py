@@ -1,4 +1,5 @@
-"""A small laboratory for the vision tests: the simulated camera over an analytic rolling ball, and a lock-step run of actions."""
+"""A small laboratory for the vision tests: the simulated camera over an analytic rolling ball, and
+a lock-step run of actions."""
 
 from __future__ import annotations
 
@@ -11,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.action import Cancelled, Result, Status, Wait
-from services.comm.camera import MemoryImages
-from services.comm.image import Image
-from sim.camera import PinholeCamera
-from sim.truth import read_truth
+from petrobot.services.action import Cancelled, Result, Status, Wait
+from petrobot.services.comm.camera import MemoryImages
+from petrobot.services.comm.image import Image
+from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.truth import read_truth
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parents[2]
@@ -31,15 +32,20 @@ def read_cell() -> dict[str, Any]:
 def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:
     """The simulated camera's truth as PinholeCamera takes it."""
     camera = read_truth(cell, "A").camera
-    view = {key: getattr(camera, key) for key in ("position", "rotation", "focal_px", "principal_px", "distortion")}
+    view = {
+        key: getattr(camera, key)
+        for key in ("position", "rotation", "focal_px", "principal_px", "distortion")
+    }
     return {**view, **changes}
 
 
 @dataclass(frozen=True)
 class Ball:
-    """A ball that slides, then rolls on a straight line; written from the mechanics, not from services or sim.
+    """A ball that slides, then rolls on a straight line; written from the mechanics, not from
+    services or sim.
 
-    Released at time 0 from `start` towards `aim` (x, y) with `speed`; a hollow ball with spin share s settles at (3 + 2 s) / 5.
+    Released at time 0 from `start` towards `aim` (x, y) with `speed`; a hollow ball with spin share
+    s settles at (3 + 2 s) / 5.
     """
 
     start: tuple[float, float]
@@ -69,7 +75,10 @@ class Ball:
             slide = self.friction * 9.81
             return self.speed * t - 0.5 * slide * t * t, self.speed - slide * t
         rolled = min(t - until, settled / self.rolling)
-        return slid + settled * rolled - 0.5 * self.rolling * rolled**2, settled - self.rolling * rolled
+        return (
+            slid + settled * rolled - 0.5 * self.rolling * rolled**2,
+            settled - self.rolling * rolled,
+        )
 
     def place(self, t: float) -> Array:
         """(2,) m."""
@@ -104,7 +113,8 @@ def draw_ball(rng: np.random.Generator, regime: str = "A") -> Ball:
 
 @dataclass
 class Bench:
-    """The simulated camera over a table with at most one ball, in lock step; `drawn` may add arm and cup."""
+    """The simulated camera over a table with at most one ball, in lock step; `drawn` may add arm
+    and cup."""
 
     camera: PinholeCamera
     ball: Ball | None = None
@@ -139,7 +149,9 @@ class Bench:
             if place[0] > 0.62 and abs(place[1]) < 0.45:
                 ball, velocity = [*place, 0.62], [*speed, 0.0]
         points, radii = self.arm if self.arm else (None, ())
-        return self.camera.render(ball, velocity or (0, 0, 0), points, radii, self.cup, self.light(self.now))
+        return self.camera.render(
+            ball, velocity or (0, 0, 0), points, radii, self.cup, self.light(self.now)
+        )
 
     def advance(self) -> None:
         """One tick."""
@@ -181,7 +193,8 @@ class BenchPorts:
 
 @dataclass
 class BenchContext:
-    """The context of one run, driven by `run_action`. `published` holds (time, values), values None where withdrawn."""
+    """The context of one run, driven by `run_action`. `published` holds (time, values), values None
+    where withdrawn."""
 
     bench: Bench
     device: Any
@@ -214,7 +227,9 @@ class BenchContext:
     def progress(self, fraction: float, **data: Any) -> None:
         assert 0.0 <= fraction <= 1.0
 
-    async def call(self, service: str, /, deadline: float | None = None, **arguments: Any) -> Result:
+    async def call(
+        self, service: str, /, deadline: float | None = None, **arguments: Any
+    ) -> Result:
         raise AssertionError("vision calls nobody")
 
     async def get(self, name: str) -> Any:
@@ -231,9 +246,13 @@ class BenchContext:
 
 
 def run_action(
-    bench: Bench, action: Coroutine[Any, Any, Result], limit: float = 20.0, cancel_at: float = float("inf")
+    bench: Bench,
+    action: Coroutine[Any, Any, Result],
+    limit: float = 20.0,
+    cancel_at: float = float("inf"),
 ) -> Result:
-    """Drive an action's coroutine tick by tick, as the lock-step shell does. `cancel_at`: the run is cancelled then (s)."""
+    """Drive an action's coroutine tick by tick, as the lock-step shell does. `cancel_at`: the run
+    is cancelled then (s)."""
     begin = bench.now
     try:
         wait = action.send(None)

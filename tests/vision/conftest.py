@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.vision.camera import Camera
-from sim.camera import PinholeCamera
+from petrobot.services.vision.camera import Camera
+from petrobot.sim.camera import PinholeCamera
 from tests.vision.bench import Bench, BenchContext, BenchPorts, read_cell, true_view
 
 

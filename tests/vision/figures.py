@@ -1,6 +1,8 @@
-"""Makes what docs/vision.md shows: the annotated camera image and the tables. Run it as `python -m tests.vision.figures`.
+"""Makes what docs/vision.md shows: the annotated camera image and the tables. Run it as `python -m
+tests.vision.figures`.
 
-With `--tables` it prints the tables (a minute or two), with `--picture` it writes docs/pictures/camera.png.
+With `--tables` it prints the tables (a minute or two), with `--picture` it writes
+docs/pictures/camera.png.
 """
 
 from __future__ import annotations
@@ -15,13 +17,29 @@ from typing import Any
 import cv2
 import numpy as np
 
-from services.action import Result
-from services.vision import actions
-from services.vision.camera import Camera
-from services.vision.location import Window
-from services.vision.prediction import ConstantVelocity, Kalman, LeastSquares, Predictor, Surface
-from sim.camera import PinholeCamera
-from tests.vision.bench import ROOT, Array, Bench, BenchContext, BenchPorts, draw_ball, read_cell, run_action, true_view
+from petrobot.services.action import Result
+from petrobot.services.vision import actions
+from petrobot.services.vision.camera import Camera
+from petrobot.services.vision.location import Window
+from petrobot.services.vision.prediction import (
+    ConstantVelocity,
+    Kalman,
+    LeastSquares,
+    Predictor,
+    Surface,
+)
+from petrobot.sim.camera import PinholeCamera
+from tests.vision.bench import (
+    ROOT,
+    Array,
+    Bench,
+    BenchContext,
+    BenchPorts,
+    draw_ball,
+    read_cell,
+    run_action,
+    true_view,
+)
 
 PICTURE = ROOT / "docs" / "pictures" / "camera.png"
 ENLARGED = 1.5
@@ -77,14 +95,16 @@ class Tally:
         ends = ", ".join(f"{end} {count}" for end, count in self.ends.most_common())
         residual = f"{1e3 * np.median(self.residuals):.2f}" if self.residuals else "-"
         return (
-            f"{ends} | {1e3 * self.cpu / max(self.images, 1):.2f} | {1e3 * self.cpu / self.simulated:.0f} | {residual}"
+            f"{ends} | {1e3 * self.cpu / max(self.images, 1):.2f} | "
+            f"{1e3 * self.cpu / self.simulated:.0f} | {residual}"
         )
 
 
 def throws(
     camera: PinholeCamera, locator: str, predictor: str, regime: str, light: str, count: int
 ) -> tuple[Tally, Tally, Array]:
-    """Throws one after the other before one camera; errors (n, 2) of time and place at 0.45 s before the ball leaves."""
+    """Throws one after the other before one camera; errors (n, 2) of time and place at 0.45 s
+    before the ball leaves."""
     rng, located, tracked, errors = np.random.default_rng(3), Tally(), Tally(), []
     camera.reseed(np.random.default_rng(4))
     bench = TimedBench(camera, light=LIGHTS[light])
@@ -94,7 +114,9 @@ def throws(
         context = BenchContext(bench, driver)
         found = located.run(bench, getattr(actions, f"locate_{locator}")(context))
         if "ball" in found.values:
-            tracked.run(bench, getattr(actions, f"predict_{predictor}")(context, ball=found.values["ball"]))
+            tracked.run(
+                bench, getattr(actions, f"predict_{predictor}")(context, ball=found.values["ball"])
+            )
             leaves = bench.ball.leaves()[0] + bench.release
             points = [
                 (at + v[0] - leaves, v[2] - bench.ball.leaves()[1])
@@ -121,7 +143,10 @@ def print_tables(camera: PinholeCamera) -> None:
         ):
             located, _, _ = throws(camera, locator, "least_squares", regime, light, 20)
             print(f"{locator}, {light}, {regime} | {located.row()}")
-    print("\npredictor, regime | ends of 20 | ms an image | ms a simulated second | - | rms at 0.45 s: ms, mm")
+    print(
+        "\npredictor, regime | ends of 20 | ms an image | ms a simulated second | - | rms at "
+        "0.45 s: ms, mm"
+    )
     for predictor in PREDICTORS:
         for regime in "ABC":
             _, tracked, errors = throws(camera, "background", predictor, regime, "nominal", 20)
@@ -131,18 +156,31 @@ def print_tables(camera: PinholeCamera) -> None:
     for predictor, make in PREDICTORS.items():
         for regime in "ABC":
             cells = [
-                analytic(make, regime, count, rate) for count, rate in ((4, 50), (8, 50), (12, 50), (16, 50), (8, 25))
+                analytic(make, regime, count, rate)
+                for count, rate in ((4, 50), (8, 50), (12, 50), (16, 50), (8, 25))
             ]
-            print(f"{predictor}, {regime} | " + " | ".join(f"{late:.1f} ({off:.1f})" for late, off in cells))
+            print(
+                f"{predictor}, {regime} | "
+                + " | ".join(f"{late:.1f} ({off:.1f})" for late, off in cells)
+            )
 
 
-def analytic(make: Callable[[Surface], Predictor], regime: str, count: int, rate: int) -> tuple[float, float]:
-    """rms errors (ms, mm) of the exit predicted after so many images of analytic balls, places good to 0.3 mm."""
+def analytic(
+    make: Callable[[Surface], Predictor], regime: str, count: int, rate: int
+) -> tuple[float, float]:
+    """rms errors (ms, mm) of the exit predicted after so many images of analytic balls, places good
+    to 0.3 mm."""
     rng, surface, errors = np.random.default_rng(6), Surface.of(read_cell()), []
     for _ in range(200):
-        ball, predictor, first = draw_ball(rng, regime), make(surface), float(rng.uniform(0, 1 / rate))
+        ball, predictor, first = (
+            draw_ball(rng, regime),
+            make(surface),
+            float(rng.uniform(0, 1 / rate)),
+        )
         for k in range(count):
-            predictor.add(first + k / rate, *(ball.place(first + k / rate) + rng.normal(0, 0.0003, 2)))
+            predictor.add(
+                first + k / rate, *(ball.place(first + k / rate) + rng.normal(0, 0.0003, 2))
+            )
         exit_, (leaves, y) = predictor.exit(), ball.leaves()
         if exit_ is not None:
             errors.append((exit_.time - leaves, exit_.point[1] - y))
@@ -151,13 +189,16 @@ def analytic(make: Callable[[Surface], Predictor], regime: str, count: int, rate
 
 
 def draw_picture(camera: PinholeCamera) -> None:
-    """The camera's view with places seen, the window, and the predicted exit with two standard deviations."""
+    """The camera's view with places seen, the window, and the predicted exit with two standard
+    deviations."""
     camera.reseed(np.random.default_rng(4))
     bench = Bench(camera, draw_ball(np.random.default_rng(12), "A"))
     bench.cup = np.eye(4)
     bench.cup[:3, 3] = [0.56, 0.0, 0.55]
     bench.arm = (
-        np.array([[[0.05, 0.15, 0.85], [0.42, 0.05, 0.62]], [[0.42, 0.05, 0.62], [0.50, 0.0, 0.52]]]),
+        np.array(
+            [[[0.05, 0.15, 0.85], [0.42, 0.05, 0.62]], [[0.42, 0.05, 0.62], [0.50, 0.0, 0.52]]]
+        ),
         [0.07, 0.05],
     )
     context = BenchContext(bench, Camera({}, BenchPorts(bench)))
@@ -179,7 +220,9 @@ def draw_picture(camera: PinholeCamera) -> None:
 def annotate(bench: Bench, camera: Camera, places: list[list[float]], values: list[float]) -> Any:
     """Draw over the image of now; noise is averaged away so that the file stays small."""
     stack = np.mean([bench.picture() for _ in range(60)], axis=0)
-    canvas = cv2.cvtColor(np.clip(np.rint(stack * 1.25 / 6) * 6, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    canvas = cv2.cvtColor(
+        np.clip(np.rint(stack * 1.25 / 6) * 6, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR
+    )
     canvas = cv2.resize(canvas, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_AREA)
     red, green, yellow = (80, 80, 255), (90, 220, 90), (60, 210, 255)
     for _, x, y in places:
@@ -193,25 +236,36 @@ def annotate(bench: Bench, camera: Camera, places: list[list[float]], values: li
     ends = [scale(camera.view.to_pixels([x, y + side])) for side in (-half, half)]
     cv2.line(canvas, ends[0], ends[1], red, 5, cv2.LINE_AA, 4)
     cv2.drawMarker(
-        canvas, (scale(edge)[0] // 16, scale(edge)[1] // 16), red, cv2.MARKER_TILTED_CROSS, 18, 2, cv2.LINE_AA
+        canvas,
+        (scale(edge)[0] // 16, scale(edge)[1] // 16),
+        red,
+        cv2.MARKER_TILTED_CROSS,
+        18,
+        2,
+        cv2.LINE_AA,
     )
     lines = (
         ("yellow: where it was located", yellow),
         ("green: where the window sees it now", green),
         (
-            f"red: leaves in {to_go * 1e3:.0f} +- {2e3 * sigma_t:.0f} ms, y = {y * 1e3:.0f} +- {2e3 * sigma_y:.0f} mm",
+            f"red: leaves in {to_go * 1e3:.0f} +- {2e3 * sigma_t:.0f} ms, y = {y * 1e3:.0f} "
+            f"+- {2e3 * sigma_y:.0f} mm",
             red,
         ),
     )
     for k, (text, colour) in enumerate(lines):
-        cv2.putText(canvas, text, (330, 620 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA)
+        cv2.putText(
+            canvas, text, (330, 620 + 26 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 1, cv2.LINE_AA
+        )
     return canvas
 
 
 def window_sees(bench: Bench, camera: Camera) -> Array:
     """The ball's centre (px) as the tracker's window measures it now."""
     assert bench.ball is not None and camera.background.picture is not None
-    near = camera.view.to_pixels(bench.ball.place(bench.now - bench.release)) + np.array([3.0, -2.0])
+    near = camera.view.to_pixels(bench.ball.place(bench.now - bench.release)) + np.array(
+        [3.0, -2.0]
+    )
     seen = Window(camera.view).measure(bench.picture(), camera.background.picture, near, spread=6.0)
     assert seen is not None
     return seen.centre

@@ -1,4 +1,5 @@
-"""The camera's actions end to end on rendered images, in lock step: what they find, what they stream, how they fail."""
+"""The camera's actions end to end on rendered images, in lock step: what they find, what they
+stream, how they fail."""
 
 from __future__ import annotations
 
@@ -8,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.action import Cancelled, Result, Status
-from services.vision import actions
-from services.vision.camera import Camera
-from sim.camera import PinholeCamera
+from petrobot.services.action import Cancelled, Result, Status
+from petrobot.services.vision import actions
+from petrobot.services.vision.camera import Camera
+from petrobot.sim.camera import PinholeCamera
 from tests.vision.bench import Ball, Bench, BenchContext, BenchPorts, draw_ball, run_action
 
 LOCATORS = {
@@ -34,21 +35,30 @@ def catch(
     """Locate, then track."""
     located = run_action(context.bench, LOCATORS[locator](context))
     assert "ball" in located.values, located
-    return located, run_action(context.bench, PREDICTORS[predictor](context, ball=located.values["ball"]))
+    return located, run_action(
+        context.bench, PREDICTORS[predictor](context, ball=located.values["ball"])
+    )
 
 
 def streamed(context: BenchContext) -> list[tuple[float, float, float, list[float]]]:
-    """Per published set point: s before the ball really leaves, error of its time (s) and place (m), and its values."""
+    """Per published set point: s before the ball really leaves, error of its time (s) and place
+    (m), and its values."""
     ball = context.bench.ball
     assert ball is not None
     time, y = ball.leaves()
     leaves = time + context.bench.release
-    return [(leaves - at, at + v[0] - leaves, v[2] - y, v) for at, v in context.published if v is not None]
+    return [
+        (leaves - at, at + v[0] - leaves, v[2] - y, v)
+        for at, v in context.published
+        if v is not None
+    ]
 
 
 @pytest.mark.parametrize("regime", ["A", "B", "C"])
 @pytest.mark.parametrize("locator", ["background", "mog2"])
-def test_a_ball_is_located_tracked_and_predicted(context: BenchContext, regime: str, locator: str) -> None:
+def test_a_ball_is_located_tracked_and_predicted(
+    context: BenchContext, regime: str, locator: str
+) -> None:
     bench = context.bench
     bench.ball = draw_ball(np.random.default_rng(ord(regime)), regime)
     located, tracked = catch(context, locator=locator)
@@ -86,7 +96,9 @@ def test_every_predictor_tracks_a_slow_ball(context: BenchContext, predictor: st
 
 
 @pytest.mark.parametrize("latency", [0.2, 0.4])
-def test_time_to_go_is_right_however_old_the_images_are(context: BenchContext, latency: float) -> None:
+def test_time_to_go_is_right_however_old_the_images_are(
+    context: BenchContext, latency: float
+) -> None:
     context.bench.latency = latency
     context.bench.ball = draw_ball(np.random.default_rng(8), "A")
     _, tracked = catch(context)
@@ -103,7 +115,8 @@ def test_late_images_of_a_fast_ball_are_a_failure_not_an_error(context: BenchCon
 
 
 def test_between_images_the_stream_goes_on_with_fresh_times(context: BenchContext) -> None:
-    """When images fail to come for a moment, set points still do, and their time to go runs down."""
+    """When images fail to come for a moment, set points still do, and their time to go runs
+    down."""
     bench = context.bench
     bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(bench, actions.locate_background(context))
@@ -145,7 +158,9 @@ def test_camera_that_dies_while_tracking(context: BenchContext) -> None:
     context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 0.8)
     located = run_action(context.bench, actions.locate_background(context))
     context.bench.dead_from = context.bench.now + 0.3
-    tracked = run_action(context.bench, actions.predict_kalman(context, ball=located.values["ball"]))
+    tracked = run_action(
+        context.bench, actions.predict_kalman(context, ball=located.values["ball"])
+    )
     assert (tracked.status, tracked.cause) == (Status.ERROR, "no_image")
     assert context.published[-1][1] is None, "withdrawn: nobody stands by it"
     assert context.device.stopped()
@@ -220,7 +235,9 @@ def test_threshold_fails_in_dim_light_and_the_others_do_not(context: BenchContex
     assert Status.ERROR not in outcomes.values()
 
 
-def test_beating_lamps_make_the_stored_background_late_and_the_compensated_one_not(context: BenchContext) -> None:
+def test_beating_lamps_make_the_stored_background_late_and_the_compensated_one_not(
+    context: BenchContext,
+) -> None:
     """Released at eight phases of a light that goes up and down by 60 % once a second."""
     bench, late = context.bench, dict.fromkeys(("background", "compensated"), 0)
     bench.light = lambda time: 1.0 + 0.6 * float(np.sin(2.0 * np.pi * time))
@@ -239,14 +256,22 @@ async def _pause(context: BenchContext, seconds: float) -> Result:
     return Result(Status.SUCCESS)
 
 
-def test_late_and_inaccurate_locations_are_failures_that_still_give_the_ball(context: BenchContext) -> None:
+def test_late_and_inaccurate_locations_are_failures_that_still_give_the_ball(
+    context: BenchContext,
+) -> None:
     context.bench.ball = Ball((2.12, 0.1), (0.62, 0.0), 1.3)
     late = run_action(context.bench, actions.locate_background(context, min_ahead=1.49))
     assert (late.status, late.cause) == (Status.FAILURE, "late") and "ball" in late.values
     context.device.end()
-    context.bench.ball, context.bench.release = Ball((2.12, 0.1), (0.62, 0.0), 1.3), context.bench.now + 0.4
+    context.bench.ball, context.bench.release = (
+        Ball((2.12, 0.1), (0.62, 0.0), 1.3),
+        context.bench.now + 0.4,
+    )
     coarse = run_action(context.bench, actions.locate_mog2(context, max_residual=0.00005))
-    assert (coarse.status, coarse.cause) == (Status.FAILURE, "inaccurate") and "ball" in coarse.values
+    assert (coarse.status, coarse.cause) == (
+        Status.FAILURE,
+        "inaccurate",
+    ) and "ball" in coarse.values
 
 
 def test_background_is_kept_between_runs(context: BenchContext) -> None:
@@ -282,7 +307,9 @@ def test_tracker_goes_on_from_ages_when_the_image_is_not_remembered(context: Ben
     fresh = Camera({}, BenchPorts(context.bench))
     fresh.background = context.device.background
     after = BenchContext(context.bench, fresh)
-    tracked = run_action(context.bench, actions.predict_least_squares(after, ball=located.values["ball"]))
+    tracked = run_action(
+        context.bench, actions.predict_least_squares(after, ball=located.values["ball"])
+    )
     assert tracked.status is Status.SUCCESS, tracked
 
 
@@ -302,7 +329,9 @@ def test_a_ball_that_is_none_is_refused(context: BenchContext, ball: Mapping[str
     assert not [values for _, values in context.published if values]
 
 
-@pytest.mark.parametrize(("option", "value"), [("timeot", 1.0), ("timeout", -1.0), ("timeout", "3"), ("rate", True)])
+@pytest.mark.parametrize(
+    ("option", "value"), [("timeot", 1.0), ("timeout", -1.0), ("timeout", "3"), ("rate", True)]
+)
 def test_bad_options_are_refused_by_name(context: BenchContext, option: str, value: Any) -> None:
     with pytest.raises(ValueError, match=option):
         run_action(context.bench, actions.locate_background(context, **{option: value}))

@@ -1,4 +1,5 @@
-"""Calibration: from rendered board images it finds the seeded truth; from corners alone over many cameras; files and command."""
+"""Calibration: from rendered board images it finds the seeded truth; from corners alone over many
+cameras; files and command."""
 
 from __future__ import annotations
 
@@ -10,26 +11,35 @@ import cv2
 import numpy as np
 import pytest
 
-from coordinator.cli import main
-from services.vision import calibrate as command
-from services.vision.calibration import Board, BoardView, Calibration, CalibrationError, adjust, calibrate, find_corners
-from services.vision.calibration_file import (
+from petrobot.coordinator.cli import main
+from petrobot.services.vision import calibrate as command
+from petrobot.services.vision.calibration import (
+    Board,
+    BoardView,
+    Calibration,
+    CalibrationError,
+    adjust,
+    calibrate,
+    find_corners,
+)
+from petrobot.services.vision.calibration_file import (
     DEFAULT,
     CalibrationFileError,
     calibration_text,
     parse_calibration,
     read_views,
 )
-from services.vision.optics import Array, Optics
-from sim.board import HELD, LAID, board_views, save_board_views
-from sim.camera import PinholeCamera
+from petrobot.services.vision.optics import Array, Optics
+from petrobot.sim.board import HELD, LAID, board_views, save_board_views
+from petrobot.sim.camera import PinholeCamera
 from tests.vision.test_optics import drawn_optics
 
 Views = list[BoardView]
 
 
 def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
-    """Distances (m) between where balls are on the table and where the calibrated camera takes them to be."""
+    """Distances (m) between where balls are on the table and where the calibrated camera takes them
+    to be."""
     x, y = np.meshgrid(np.linspace(0.62, 2.22, 17), np.linspace(-0.45, 0.45, 9))
     balls = np.stack([x, y, np.full_like(x, 0.62)], axis=-1).reshape(-1, 3)
     off = found.to_plane(camera.project(balls), 0.62) - balls[:, :2]
@@ -37,7 +47,9 @@ def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
 
 
 @pytest.fixture(scope="module")
-def folder(cell: dict[str, Any], pinhole: PinholeCamera, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(
+    cell: dict[str, Any], pinhole: PinholeCamera, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """Board images of the simulated camera, as somebody would take them."""
     pinhole.reseed(np.random.default_rng(21))
     place = tmp_path_factory.mktemp("views")
@@ -55,12 +67,16 @@ def found(views: Views) -> Calibration:
     return calibrate(views, Board())
 
 
-def test_rendered_boards_give_the_true_camera(found: Calibration, pinhole: PinholeCamera, cell: dict[str, Any]) -> None:
+def test_rendered_boards_give_the_true_camera(
+    found: Calibration, pinhole: PinholeCamera, cell: dict[str, Any]
+) -> None:
     error = table_error(found.optics, pinhole)
     assert float(np.sqrt(np.mean(error**2))) < 0.5e-3
     assert error.max() < 1.0e-3
     nominal = table_error(Optics.nominal(cell), pinhole)
-    assert float(np.sqrt(np.mean(nominal**2))) > 5e-3, "the truth differs: there was something to find"
+    assert float(np.sqrt(np.mean(nominal**2))) > 5e-3, (
+        "the truth differs: there was something to find"
+    )
     assert found.residual_px < 0.15
     assert found.table_residual < 1e-3
     assert found.table_sigma < 0.6e-3
@@ -76,10 +92,14 @@ def test_shipped_calibration_fits_the_simulated_camera(pinhole: PinholeCamera) -
     shipped = parse_calibration(DEFAULT.read_text(encoding="utf-8"), DEFAULT.name)
     error = table_error(shipped.optics, pinhole)
     assert float(np.sqrt(np.mean(error**2))) < 0.5e-3
-    assert not np.allclose(shipped.optics.position, pinhole.position, atol=1e-7), "calibrated, not copied"
+    assert not np.allclose(shipped.optics.position, pinhole.position, atol=1e-7), (
+        "calibrated, not copied"
+    )
 
 
-def synthetic_corners(optics: Optics, rng: np.random.Generator, noise: float, placement: float) -> tuple[Any, Any]:
+def synthetic_corners(
+    optics: Optics, rng: np.random.Generator, noise: float, placement: float
+) -> tuple[Any, Any]:
     """Corners (px) and stated poses of boards laid and held, without images."""
     corners: list[Array] = []
     poses: list[Array | None] = []
@@ -112,7 +132,8 @@ def test_any_camera_is_found_from_exact_corners(cell: dict[str, Any], seed: int)
 
 
 def test_stated_accuracy_is_that_of_repeated_calibrations(cell: dict[str, Any]) -> None:
-    """The standard deviation that a calibration states is that by which calibrations of one camera differ."""
+    """The standard deviation that a calibration states is that by which calibrations of one camera
+    differ."""
     truth, errors, stated = drawn_optics(cell, 0), [], []
     for seed in range(6):
         corners, poses = synthetic_corners(truth, np.random.default_rng(seed), 0.07, 0.0003)
@@ -175,7 +196,10 @@ def test_bad_file_is_refused_with_file_and_remedy(old: str, new: str, fault: str
         ("[board", "no TOML"),
         ("[board]\ncolumns = 9\nrows = 6\n", "key 'square' is missing"),
         ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n', "a.png: not there"),
-        ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\npose=[1]\n', "4 rows of 4"),
+        (
+            '[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\npose=[1]\n',
+            "4 rows of 4",
+        ),
     ],
 )
 def test_bad_views_are_refused(
@@ -183,14 +207,20 @@ def test_bad_views_are_refused(
 ) -> None:
     if text is not None:
         (tmp_path / "views.toml").write_text(text, encoding="utf-8")
-    assert command.calibrate_main(["--views", str(tmp_path), "--output", str(tmp_path / "out.toml")]) == 2
+    assert (
+        command.calibrate_main(["--views", str(tmp_path), "--output", str(tmp_path / "out.toml")])
+        == 2
+    )
     assert fault in capsys.readouterr().err
     assert not (tmp_path / "out.toml").exists()
 
 
-def test_missing_images_are_taken_from_the_camera(folder: Path, views: Views, tmp_path: Path) -> None:
-    """A folder with views.toml alone: each image is taken when the operator says so, and again when the board is cut off."""
-    from services.comm.image import Image
+def test_missing_images_are_taken_from_the_camera(
+    folder: Path, views: Views, tmp_path: Path
+) -> None:
+    """A folder with views.toml alone: each image is taken when the operator says so, and again when
+    the board is cut off."""
+    from petrobot.services.comm.image import Image
 
     lines = (folder / "views.toml").read_text(encoding="utf-8").split("[[views]]")
     (tmp_path / "views.toml").write_text("[[views]]".join(lines[:3]), encoding="utf-8")
@@ -223,12 +253,21 @@ def test_missing_images_are_taken_from_the_camera(folder: Path, views: Views, tm
     assert said == ["the board is not seen whole; once more"]
     assert asked[-1] == "closed" and len(asked) == 4
     taken, _ = read_views(tmp_path)
-    assert np.array_equal(taken[0].pixels, views[0].pixels) and np.array_equal(taken[1].pixels, views[1].pixels)
+    assert np.array_equal(taken[0].pixels, views[0].pixels) and np.array_equal(
+        taken[1].pixels, views[1].pixels
+    )
 
 
-def test_measured_places_differ_from_true_ones(cell: dict[str, Any], pinhole: PinholeCamera) -> None:
+def test_measured_places_differ_from_true_ones(
+    cell: dict[str, Any], pinhole: PinholeCamera
+) -> None:
     """The simulated operator errs: boards do not lie exactly where they were measured."""
-    poses = [pose for _, pose in zip(range(3), board_views(cell, pinhole, np.random.default_rng(0)), strict=False)]
+    poses = [
+        pose
+        for _, pose in zip(
+            range(3), board_views(cell, pinhole, np.random.default_rng(0)), strict=False
+        )
+    ]
     first = find_corners(poses[0][0], Board())
     stated = poses[0][1]
     assert first is not None and stated is not None
@@ -239,17 +278,23 @@ def test_measured_places_differ_from_true_ones(cell: dict[str, Any], pinhole: Pi
 def test_shipped_calibration_is_what_the_command_makes(
     tmp_path: Path, pinhole: PinholeCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`--simulated` takes all images first and then calibrates, to the shipped file; it never writes over what is there."""
+    """`--simulated` takes all images first and then calibrates, to the shipped file; it never
+    writes over what is there."""
     views, made = tmp_path / "views", tmp_path / "made.toml"
     told = ["calibrate", "--views", str(views), "--simulated", "--output", str(made)]
     assert main([*told, "--source", "capture:0"]) == 2
     assert "leave one out" in capsys.readouterr().err and not views.exists()
     assert main(told) == 0
-    optics = [parse_calibration(f.read_text(encoding="utf-8"), f.name).optics for f in (made, DEFAULT)]
+    optics = [
+        parse_calibration(f.read_text(encoding="utf-8"), f.name).optics for f in (made, DEFAULT)
+    ]
     assert table_error(*optics).max() < 0.02e-3 and table_error(optics[0], pinhole).max() < 1e-3
     said = capsys.readouterr().out
     assert "board seen whole in" in said and str(made) in said
     assert main(told) == 2
     assert f"{views} is not empty" in capsys.readouterr().err
-    assert main(["calibrate", "--views", str(views), "--output", str(tmp_path / "nowhere" / "c.toml")]) == 2
+    assert (
+        main(["calibrate", "--views", str(views), "--output", str(tmp_path / "nowhere" / "c.toml")])
+        == 2
+    )
     assert "nowhere/c.toml: there is no folder" in capsys.readouterr().err

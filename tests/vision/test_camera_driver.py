@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from services.action import Result, Status
-from services.comm.image import Image
-from services.vision.actions import locate_background, predict_least_squares
-from services.vision.calibration_file import DEFAULT, CalibrationFileError
-from services.vision.camera import CELL, Camera, CameraError
-from services.vision.location import FixedThreshold
+from petrobot.services.action import Result, Status
+from petrobot.services.comm.image import Image
+from petrobot.services.vision.actions import locate_background, predict_least_squares
+from petrobot.services.vision.calibration_file import DEFAULT, CalibrationFileError
+from petrobot.services.vision.camera import CELL, Camera, CameraError
+from petrobot.services.vision.location import FixedThreshold
 from tests.vision.bench import Bench, BenchContext, BenchPorts, draw_ball, run_action
 
 
@@ -103,7 +103,7 @@ def test_detectors_are_made_once(context: BenchContext) -> None:
 
 
 def test_a_source_that_cannot_be_opened_is_no_image(context: BenchContext) -> None:
-    from services.vision import actions
+    from petrobot.services.vision import actions
 
     class Unplugged:
         def start(self, rate: float) -> None:
@@ -121,14 +121,17 @@ def test_a_source_that_cannot_be_opened_is_no_image(context: BenchContext) -> No
             return Unplugged()
 
     camera = Camera({}, Ports(context.bench))
-    located = run_action(context.bench, actions.locate_background(BenchContext(context.bench, camera)))
+    located = run_action(
+        context.bench, actions.locate_background(BenchContext(context.bench, camera))
+    )
     assert (located.status, located.cause) == (Status.ERROR, "no_image")
     assert "cannot be opened" in located.text
     camera.background.learn(np.zeros((2, 2), np.uint8))
 
 
 def test_the_operator_sees_what_was_seen(context: BenchContext) -> None:
-    """The newest image as a JPEG, the ball where it was found, the way to its predicted exit; nothing before the first."""
+    """The newest image as a JPEG, the ball where it was found, the way to its predicted exit;
+    nothing before the first."""
     camera, bench = context.device, context.bench
     assert camera.picture() == {}
     bench.ball = draw_ball(np.random.default_rng(4), "A")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.vision.confirmation import Confirmation, Track
+from petrobot.services.vision.confirmation import Confirmation, Track
 
 STICKERS = [(0.87, 0.22), (1.42, 0.36), (1.92, 0.28), (1.42, -0.20)]
 
@@ -32,7 +32,8 @@ def test_a_rolling_ball_is_confirmed_by_the_asked_number(
     rng = np.random.default_rng(seed)
     way = speed * 0.02
     places = [
-        [(2.0 - k * way + rng.normal(0, 5e-4), y + slope * k * way + rng.normal(0, 5e-4))] for k in range(count + 4)
+        [(2.0 - k * way + rng.normal(0, 5e-4), y + slope * k * way + rng.normal(0, 5e-4))]
+        for k in range(count + 4)
     ]
     answers = follow(Confirmation(count), places)
     first = next(k for k, track in enumerate(answers) if track is not None)
@@ -48,14 +49,20 @@ def test_a_rolling_ball_is_confirmed_by_the_asked_number(
 
 def test_things_that_stand_still_are_never_a_ball() -> None:
     rng = np.random.default_rng(0)
-    places = [[(x + rng.normal(0, 2e-3), y + rng.normal(0, 2e-3)) for x, y in STICKERS] for _ in range(200)]
+    places = [
+        [(x + rng.normal(0, 2e-3), y + rng.normal(0, 2e-3)) for x, y in STICKERS]
+        for _ in range(200)
+    ]
     assert not any(follow(Confirmation(4), places))
 
 
 def test_a_ball_among_stickers_is_found() -> None:
     rng = np.random.default_rng(1)
     places = [
-        [*((x + rng.normal(0, 2e-3), y + rng.normal(0, 2e-3)) for x, y in STICKERS), (2.1 - 0.03 * k, 0.1 + 0.001 * k)]
+        [
+            *((x + rng.normal(0, 2e-3), y + rng.normal(0, 2e-3)) for x, y in STICKERS),
+            (2.1 - 0.03 * k, 0.1 + 0.001 * k),
+        ]
         for k in range(8)
     ]
     track = next(track for track in follow(Confirmation(4), places) if track is not None)
@@ -64,7 +71,10 @@ def test_a_ball_among_stickers_is_found() -> None:
 
 def test_scattered_candidates_are_no_ball() -> None:
     rng = np.random.default_rng(2)
-    places = [[(float(x), float(y)) for x, y in rng.uniform([0.7, -0.4], [2.1, 0.4], (2, 2))] for _ in range(100)]
+    places = [
+        [(float(x), float(y)) for x, y in rng.uniform([0.7, -0.4], [2.1, 0.4], (2, 2))]
+        for _ in range(100)
+    ]
     assert sum(track is not None for track in follow(Confirmation(5), places)) <= 1
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.vision.calibration_file import DEFAULT, parse_calibration
-from services.vision.confirmation import Confirmation
-from services.vision.location import (
+from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
+from petrobot.services.vision.confirmation import Confirmation
+from petrobot.services.vision.location import (
     Background,
     BackgroundSubtraction,
     CompensatedSubtraction,
@@ -22,9 +22,9 @@ from services.vision.location import (
     Window,
     ball_blobs,
 )
-from services.vision.optics import Array
-from services.vision.table import TableView
-from sim.camera import PinholeCamera
+from petrobot.services.vision.optics import Array
+from petrobot.services.vision.table import TableView
+from petrobot.sim.camera import PinholeCamera
 
 DETECTORS = ("background", "mog2", "hough", "threshold", "compensated")
 IMAGES = 70
@@ -33,7 +33,9 @@ IMAGES = 70
 @pytest.fixture(scope="module")
 def view(cell: dict[str, Any]) -> TableView:
     """The table as the shipped calibration knows it."""
-    return TableView.of(cell, parse_calibration(DEFAULT.read_text(encoding="utf-8"), "calibration").optics)
+    return TableView.of(
+        cell, parse_calibration(DEFAULT.read_text(encoding="utf-8"), "calibration").optics
+    )
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,9 @@ def make(name: str, view: TableView, camera: PinholeCamera, light: float = 1.0) 
     return detector
 
 
-def balls(seed: int, count: int = IMAGES, x: tuple[float, float] = (0.75, 2.12)) -> list[tuple[Array, Array]]:
+def balls(
+    seed: int, count: int = IMAGES, x: tuple[float, float] = (0.75, 2.12)
+) -> list[tuple[Array, Array]]:
     """Places (3,) and velocities (3,) of rolling balls all over the table."""
     rng = np.random.default_rng(seed)
     return [
@@ -75,7 +79,9 @@ def balls(seed: int, count: int = IMAGES, x: tuple[float, float] = (0.75, 2.12))
     ]
 
 
-def score(detector: Detector, view: TableView, camera: PinholeCamera, light: float = 1.0, **where: Any) -> Scores:
+def score(
+    detector: Detector, view: TableView, camera: PinholeCamera, light: float = 1.0, **where: Any
+) -> Scores:
     """Judge a detector over many balls."""
     errors, false = [], 0
     sample = balls(5, **where)
@@ -86,7 +92,9 @@ def score(detector: Detector, view: TableView, camera: PinholeCamera, light: flo
         if len(away) and away.min() <= 0.02:
             errors.append(away.min())
     return Scores(
-        len(errors) / len(sample), float(np.sqrt(np.mean(np.square(errors)))) if errors else 0.0, false / len(sample)
+        len(errors) / len(sample),
+        float(np.sqrt(np.mean(np.square(errors)))) if errors else 0.0,
+        false / len(sample),
     )
 
 
@@ -117,14 +125,22 @@ def test_threshold_works_in_the_bright_part_only(view: TableView, pinhole: Pinho
 
 
 def test_dim_light_blinds_the_threshold_alone(view: TableView, pinhole: PinholeCamera) -> None:
-    found = {name: score(make(name, view, pinhole, 0.6), view, pinhole, 0.6, count=30).found for name in DETECTORS}
+    found = {
+        name: score(make(name, view, pinhole, 0.6), view, pinhole, 0.6, count=30).found
+        for name in DETECTORS
+    }
     assert found["threshold"] == 0.0
     assert min(share for name, share in found.items() if name != "threshold") > 0.85
 
 
-def test_light_that_changed_blinds_the_stored_background(view: TableView, pinhole: PinholeCamera) -> None:
-    """Learned at 0.75 of the light, looked at in 1.3 of it: the others do not mind, or have learned meanwhile."""
-    assert score(make("compensated", view, pinhole, 0.75), view, pinhole, 1.3, count=30).found > 0.95
+def test_light_that_changed_blinds_the_stored_background(
+    view: TableView, pinhole: PinholeCamera
+) -> None:
+    """Learned at 0.75 of the light, looked at in 1.3 of it: the others do not mind, or have learned
+    meanwhile."""
+    assert (
+        score(make("compensated", view, pinhole, 0.75), view, pinhole, 1.3, count=30).found > 0.95
+    )
     stored = score(make("background", view, pinhole, 0.75), view, pinhole, 1.3, count=30)
     assert stored.found < 0.7
     mixture = make("mog2", view, pinhole, 0.75)
@@ -149,7 +165,9 @@ def test_compensated_subtraction_does_not_mind_in_which_light_it_learned(
 def test_an_empty_table_has_no_ball(view: TableView, pinhole: PinholeCamera, name: str) -> None:
     detector = make(name, view, pinhole)
     candidates = [detector.detect(pinhole.render(None)) for _ in range(10)]
-    if name == "hough":  # stickers are circles too; it is `Confirmation` that rejects what does not roll
+    if (
+        name == "hough"
+    ):  # stickers are circles too; it is `Confirmation` that rejects what does not roll
         places = view.to_table(np.concatenate(candidates))
         assert len(places) and view.on_table(places).all()
     else:
@@ -157,7 +175,9 @@ def test_an_empty_table_has_no_ball(view: TableView, pinhole: PinholeCamera, nam
 
 
 @pytest.mark.parametrize("name", ["background", "compensated", "mog2"])
-def test_arm_and_cup_over_the_table_are_no_ball(view: TableView, pinhole: PinholeCamera, name: str) -> None:
+def test_arm_and_cup_over_the_table_are_no_ball(
+    view: TableView, pinhole: PinholeCamera, name: str
+) -> None:
     """The cup's mouth is round too, but does not roll towards the edge."""
     detector, confirmation, candidates = make(name, view, pinhole), Confirmation(4), 0
     cup = np.eye(4)
@@ -191,7 +211,9 @@ def test_window_is_accurate_in_any_light(
     for place, velocity in sample:
         expected = view.to_pixels(place[:2]) + rng.uniform(-3, 3, 2)
         image = pinhole.render(place, velocity, light=light)
-        seen = window.measure(image, picture, expected, view.streak_px(float(-velocity[0])), spread=6.0)
+        seen = window.measure(
+            image, picture, expected, view.streak_px(float(-velocity[0])), spread=6.0
+        )
         if seen is not None:
             errors.append(np.hypot(*(view.to_table(seen.centre) - place[:2])))
     assert len(errors) >= 0.97 * len(sample)
@@ -202,13 +224,17 @@ def test_window_scatter_is_a_fraction_of_a_millimetre(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray
 ) -> None:
     window, place = Window(view), np.array([1.5, 0.1, 0.62])
-    seen = [window.measure(pinhole.render(place), picture, view.to_pixels(place[:2])) for _ in range(30)]
+    seen = [
+        window.measure(pinhole.render(place), picture, view.to_pixels(place[:2])) for _ in range(30)
+    ]
     places = np.array([view.to_table(s.centre) for s in seen if s is not None])
     assert len(places) == 30
     assert places.std(axis=0).max() < 0.2e-3
 
 
-def test_window_with_nothing_there(view: TableView, pinhole: PinholeCamera, picture: np.ndarray) -> None:
+def test_window_with_nothing_there(
+    view: TableView, pinhole: PinholeCamera, picture: np.ndarray
+) -> None:
     window, empty = Window(view), pinhole.render(None)
     for place, _ in balls(2, 40):
         assert window.measure(empty, picture, view.to_pixels(place[:2]), 3.0, 8.0) is None
@@ -217,7 +243,8 @@ def test_window_with_nothing_there(view: TableView, pinhole: PinholeCamera, pict
 def test_a_half_hidden_ball_is_not_measured_wrongly(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray
 ) -> None:
-    """An arm slides over the ball: as soon as it hides a part that would bias the place there is no measurement."""
+    """An arm slides over the ball: as soon as it hides a part that would bias the place there is no
+    measurement."""
     window, place, kept = Window(view), np.array([0.90, 0.0, 0.62]), []
     for edge in np.linspace(-0.06, 0.06, 25):
         arm = np.array([[[0.90 + 0.5, edge - 0.05, 0.75], [0.90 - 0.5, edge - 0.05, 0.75]]])
@@ -229,7 +256,9 @@ def test_a_half_hidden_ball_is_not_measured_wrongly(
     assert max(kept) < 0.004
 
 
-def test_the_window_leaves_what_is_not_near(view: TableView, pinhole: PinholeCamera, picture: np.ndarray) -> None:
+def test_the_window_leaves_what_is_not_near(
+    view: TableView, pinhole: PinholeCamera, picture: np.ndarray
+) -> None:
     place = np.array([1.5, 0.1, 0.62])
     far = view.to_pixels(place[:2]) + np.array([14.0, 0.0])
     assert Window(view).measure(pinhole.render(place), picture, far, spread=5.0) is None
@@ -240,7 +269,9 @@ def test_window_outside_the_image(view: TableView, picture: np.ndarray) -> None:
         assert Window(view).measure(picture, picture, np.array(pixel)) is None
 
 
-def test_background_keeps_no_ghost_of_a_passing_ball(view: TableView, pinhole: PinholeCamera) -> None:
+def test_background_keeps_no_ghost_of_a_passing_ball(
+    view: TableView, pinhole: PinholeCamera
+) -> None:
     background = Background()
     for _ in range(5):
         background.learn(pinhole.render(None))

@@ -1,4 +1,5 @@
-"""Images on the wire and from files: any cutting of the bytes, bad bytes, newest wins, restarts, devices that are not there."""
+"""Images on the wire and from files: any cutting of the bytes, bad bytes, newest wins, restarts,
+devices that are not there."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.comm.camera import (
+from petrobot.services.comm.camera import (
     IMAGE_HEADER,
     ImageDecoder,
     ImageFormatError,
@@ -23,8 +24,8 @@ from services.comm.camera import (
     encode_image,
     open_images,
 )
-from services.comm.capture import CaptureImages
-from services.comm.image import Image, ImageSource
+from petrobot.services.comm.capture import CaptureImages
+from petrobot.services.comm.image import Image, ImageSource
 
 
 def grey(level: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
@@ -33,7 +34,9 @@ def grey(level: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
 
 def test_wire_format_byte_by_byte() -> None:
     data = encode_image(WireImage(2, 7, 0.5, np.array([[1, 2, 3], [4, 5, 6]], np.uint8)))
-    assert data == bytes.fromhex("50494d47 00000002 0000000000000007 3fe0000000000000 0002 0003 00000006 010203040506")
+    assert data == bytes.fromhex(
+        "50494d47 00000002 0000000000000007 3fe0000000000000 0002 0003 00000006 010203040506"
+    )
 
 
 @given(cuts=st.lists(st.integers(0, 3 * (32 + 12)), max_size=8), take=st.booleans())
@@ -105,7 +108,9 @@ def until(condition: Callable[[], object], *steps: Callable[[], object]) -> obje
     raise AssertionError("it never came")
 
 
-def test_images_flow_at_the_asked_rate_and_stop(server: ImageServer, receiver: StreamImages) -> None:
+def test_images_flow_at_the_asked_rate_and_stop(
+    server: ImageServer, receiver: StreamImages
+) -> None:
     receiver.start(40.0)
     until(lambda: server.rate == 40.0, server.poll, receiver.newest)
     sent = time.monotonic() - 0.125
@@ -121,8 +126,11 @@ def test_images_flow_at_the_asked_rate_and_stop(server: ImageServer, receiver: S
     assert receiver.newest() is None
 
 
-def test_newest_wins_and_no_one_waits_for_a_slow_receiver(server: ImageServer, receiver: StreamImages) -> None:
-    """A receiver that does not read misses images; the camera goes on at once and memory does not grow."""
+def test_newest_wins_and_no_one_waits_for_a_slow_receiver(
+    server: ImageServer, receiver: StreamImages
+) -> None:
+    """A receiver that does not read misses images; the camera goes on at once and memory does not
+    grow."""
     receiver.start(50.0)
     until(lambda: server.rate > 0.0, server.poll, receiver.newest)
     big = grey(0, (480, 640))
@@ -145,7 +153,9 @@ def test_newest_wins_and_no_one_waits_for_a_slow_receiver(server: ImageServer, r
     assert [image.sequence for image in seen] == sorted({image.sequence for image in seen})
 
 
-def test_images_of_an_earlier_start_are_dropped(server: ImageServer, receiver: StreamImages) -> None:
+def test_images_of_an_earlier_start_are_dropped(
+    server: ImageServer, receiver: StreamImages
+) -> None:
     receiver.start(50.0)
     until(lambda: server.rate > 0.0, server.poll, receiver.newest)
     server.send(grey(1), 0.0)

@@ -1,4 +1,5 @@
-"""The calibrated camera's geometry against OpenCV, and its inverse against itself; the simulated camera's likewise."""
+"""The calibrated camera's geometry against OpenCV, and its inverse against itself; the simulated
+camera's likewise."""
 
 from __future__ import annotations
 
@@ -10,16 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.vision.optics import Optics
-from services.vision.table import TableView
-from sim.camera import PinholeCamera
+from petrobot.services.vision.optics import Optics
+from petrobot.services.vision.table import TableView
+from petrobot.sim.camera import PinholeCamera
 from tests.vision.bench import true_view
 
 
 def drawn_optics(cell: dict[str, Any], seed: int) -> Optics:
     """The nominal camera with errors larger than any installation's."""
     rng, nominal = np.random.default_rng(seed), Optics.nominal(cell)
-    k1, k2, p1, p2 = (float(k) for k in np.array(nominal.distortion) + rng.normal(0, [0.03, 0.01, 5e-4, 5e-4]))
+    k1, k2, p1, p2 = (
+        float(k) for k in np.array(nominal.distortion) + rng.normal(0, [0.03, 0.01, 5e-4, 5e-4])
+    )
     return Optics(
         (float(640 + rng.normal(0, 10)), float(640 + rng.normal(0, 10))),
         (float(319.5 + rng.normal(0, 6)), float(239.5 + rng.normal(0, 6))),
@@ -29,10 +32,14 @@ def drawn_optics(cell: dict[str, Any], seed: int) -> Optics:
     )
 
 
-def by_opencv(points: np.ndarray, rotation: np.ndarray, position: np.ndarray, matrix: Any, distortion: Any) -> Any:
+def by_opencv(
+    points: np.ndarray, rotation: np.ndarray, position: np.ndarray, matrix: Any, distortion: Any
+) -> Any:
     """The same pixels from cv2.projectPoints."""
     turn = cv2.Rodrigues(rotation)[0]
-    pixels = cv2.projectPoints(points, turn, -rotation @ position, np.asarray(matrix), np.asarray(distortion))[0]
+    pixels = cv2.projectPoints(
+        points, turn, -rotation @ position, np.asarray(matrix), np.asarray(distortion)
+    )[0]
     return pixels.reshape(-1, 2)
 
 
@@ -56,8 +63,12 @@ def test_simulated_projection_is_opencvs(cell: dict[str, Any]) -> None:
     assert np.abs(camera.project(points) - expected).max() < 1e-9
 
 
-@given(u=st.floats(0.0, 639.0), v=st.floats(0.0, 479.0), z=st.floats(0.0, 0.9), seed=st.integers(0, 20))
-def test_to_plane_is_the_inverse_everywhere_in_the_image(u: float, v: float, z: float, seed: int) -> None:
+@given(
+    u=st.floats(0.0, 639.0), v=st.floats(0.0, 479.0), z=st.floats(0.0, 0.9), seed=st.integers(0, 20)
+)
+def test_to_plane_is_the_inverse_everywhere_in_the_image(
+    u: float, v: float, z: float, seed: int
+) -> None:
     from tests.vision.bench import read_cell
 
     optics = drawn_optics(read_cell(), seed)
@@ -83,7 +94,8 @@ def test_nominal_camera_sees_the_whole_table(cell: dict[str, Any]) -> None:
 
 
 def test_view_speaks_of_the_balls_centre(cell: dict[str, Any]) -> None:
-    """A ball's centre is 20 mm above the table: taking the table top instead would be up to 9 mm wrong at its ends."""
+    """A ball's centre is 20 mm above the table: taking the table top instead would be up to 9 mm
+    wrong at its ends."""
     view = TableView.of(cell, Optics.nominal(cell))
     pixel = view.optics.project([0.62, 0.0, 0.62])
     assert np.allclose(view.to_table(pixel), [0.62, 0.0], atol=1e-9)

@@ -1,4 +1,5 @@
-"""Predictors against an analytic ball that slides, then rolls with an unknown resistance: accuracy, honesty, other ways out."""
+"""Predictors against an analytic ball that slides, then rolls with an unknown resistance: accuracy,
+honesty, other ways out."""
 
 from __future__ import annotations
 
@@ -10,7 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.vision.prediction import ConstantVelocity, Exit, Kalman, LeastSquares, Predictor, Surface, Way
+from petrobot.services.vision.prediction import (
+    ConstantVelocity,
+    Exit,
+    Kalman,
+    LeastSquares,
+    Predictor,
+    Surface,
+    Way,
+)
 from tests.vision.bench import Ball, draw_ball, read_cell
 
 SURFACE = Surface.of(read_cell())
@@ -22,8 +31,11 @@ PREDICTORS: dict[str, Callable[[Surface], Predictor]] = {
 NOISE = 0.0003
 
 
-def watch(predictor: Predictor, ball: Ball, count: int, rate: float, rng: np.random.Generator) -> Exit:
-    """The exit that is predicted after `count` images, the first within one image of the release."""
+def watch(
+    predictor: Predictor, ball: Ball, count: int, rate: float, rng: np.random.Generator
+) -> Exit:
+    """The exit that is predicted after `count` images, the first within one image of the
+    release."""
     first = float(rng.uniform(0.0, 1.0 / rate))
     for k in range(count):
         t = first + k / rate
@@ -33,8 +45,11 @@ def watch(predictor: Predictor, ball: Ball, count: int, rate: float, rng: np.ran
     return exit_
 
 
-def errors(name: str, regime: str, count: int, rate: float, throws: int = 60) -> tuple[float, float, float]:
-    """rms error of the time (s) and of the place (m) over throws, and rms of the time error over its stated sigma."""
+def errors(
+    name: str, regime: str, count: int, rate: float, throws: int = 60
+) -> tuple[float, float, float]:
+    """rms error of the time (s) and of the place (m) over throws, and rms of the time error over
+    its stated sigma."""
     rng, times, places, stated = np.random.default_rng(17), [], [], []
     for _ in range(throws):
         ball = draw_ball(rng, regime)
@@ -67,7 +82,9 @@ def errors(name: str, regime: str, count: int, rate: float, throws: int = 60) ->
         ("constant_velocity", "C", 16, 50, 0.008, 0.002),
     ],
 )
-def test_accuracy(name: str, regime: str, count: int, rate: float, time: float, place: float) -> None:
+def test_accuracy(
+    name: str, regime: str, count: int, rate: float, time: float, place: float
+) -> None:
     time_error, place_error, _ = errors(name, regime, count, rate)
     assert time_error <= time
     assert place_error <= place
@@ -80,10 +97,13 @@ def test_more_effort_is_more_accurate(regime: str) -> None:
     assert late["least_squares"] <= 1.1 * late["kalman"]
 
 
-@pytest.mark.parametrize(("name", "least", "most"), [("least_squares", 0.4, 1.4), ("kalman", 0.25, 2.4)])
+@pytest.mark.parametrize(
+    ("name", "least", "most"), [("least_squares", 0.4, 1.4), ("kalman", 0.25, 2.4)]
+)
 @pytest.mark.parametrize("count", [6, 10, 20])
 def test_stated_uncertainty_is_honest(name: str, least: float, most: float, count: int) -> None:
-    """A predictor's own sigma of the time covers its errors without being idle, in slow and fast regimes."""
+    """A predictor's own sigma of the time covers its errors without being idle, in slow and fast
+    regimes."""
     for regime in ("A", "C"):
         assert least <= errors(name, regime, count, 50)[2] <= most
 
@@ -99,7 +119,9 @@ def test_even_speed_knows_not_what_it_does_not_know() -> None:
     name=st.sampled_from(sorted(PREDICTORS)),
 )
 @settings(max_examples=60, deadline=None)
-def test_exact_places_of_a_purely_rolling_ball_are_enough(speed: float, y: float, aim: float, name: str) -> None:
+def test_exact_places_of_a_purely_rolling_ball_are_enough(
+    speed: float, y: float, aim: float, name: str
+) -> None:
     ball = Ball((2.0, y), (0.62, aim), speed, spin=1.0, rolling=SURFACE.rolling)
     predictor = PREDICTORS[name](SURFACE)
     for k in range(25):
@@ -107,10 +129,16 @@ def test_exact_places_of_a_purely_rolling_ball_are_enough(speed: float, y: float
     exit_ = predictor.exit()
     assert exit_ is not None and exit_.way is Way.NEAR_EDGE
     time, place = ball.leaves()
-    slack = 0.2 * time**2 * 0.0589 / speed + 0.5 * 0.0589 * time**2 / speed if name == "constant_velocity" else 0.004
+    slack = (
+        0.2 * time**2 * 0.0589 / speed + 0.5 * 0.0589 * time**2 / speed
+        if name == "constant_velocity"
+        else 0.004
+    )
     assert abs(exit_.time - time) < slack + 0.002
     assert exit_.point == pytest.approx([0.62, place], abs=1e-3)
-    assert np.hypot(*exit_.velocity) == pytest.approx(ball.way(time)[1], abs=0.15 if slack > 0.005 else 0.02)
+    assert np.hypot(*exit_.velocity) == pytest.approx(
+        ball.way(time)[1], abs=0.15 if slack > 0.005 else 0.02
+    )
     assert predictor.place(0.5) == pytest.approx(ball.place(0.5), abs=2e-3)
     assert predictor.count == 25
 
@@ -153,11 +181,17 @@ def test_nothing_is_predicted_from_two_places(name: str) -> None:
 
 @pytest.mark.parametrize("friction", [0.1, 0.2, 0.4])
 def test_sliding_of_unknown_length_is_found(friction: float) -> None:
-    """The friction decides how long a ball slides; least squares averages over the moments at which it may end."""
+    """The friction decides how long a ball slides; least squares averages over the moments at which
+    it may end."""
     rng, late = np.random.default_rng(3), []
     for _ in range(40):
         ball = Ball(
-            (2.12, 0.0), (0.62, float(rng.uniform(-0.3, 0.3))), float(rng.uniform(1.5, 2.5)), 0.7, 0.0589, friction
+            (2.12, 0.0),
+            (0.62, float(rng.uniform(-0.3, 0.3))),
+            float(rng.uniform(1.5, 2.5)),
+            0.7,
+            0.0589,
+            friction,
         )
         exit_ = watch(LeastSquares(SURFACE), ball, 18, 50, rng)
         late.append(exit_.time - ball.leaves()[0])
@@ -165,7 +199,8 @@ def test_sliding_of_unknown_length_is_found(friction: float) -> None:
 
 
 def test_known_resistance_is_taken_for_known() -> None:
-    """With a resistance 25 % off, a predictor that takes the nominal for known is wrong; one that estimates it is not."""
+    """With a resistance 25 % off, a predictor that takes the nominal for known is wrong; one that
+    estimates it is not."""
     ball = Ball((2.12, 0.0), (0.62, 0.0), 0.9, spin=1.0, rolling=1.25 * SURFACE.rolling)
     time, errors_of = ball.leaves()[0], {}
     for sigma in (0.0, None):
@@ -177,7 +212,8 @@ def test_known_resistance_is_taken_for_known() -> None:
 
 @pytest.mark.parametrize("make", [LeastSquares, Kalman])
 def test_coarse_places_count_less(make: Callable[[Surface], Predictor]) -> None:
-    """Coarse places at the beginning (from a coarse locator) do not spoil the fine ones that follow."""
+    """Coarse places at the beginning (from a coarse locator) do not spoil the fine ones that
+    follow."""
     ball = Ball((2.12, 0.0), (0.62, 0.1), 1.8)
     spoiled: list[float] = []
     plain: list[float] = []
@@ -200,10 +236,18 @@ def test_cost_of_an_observation_does_not_grow() -> None:
     predictor: Any = LeastSquares(SURFACE)
     for k in range(3):
         predictor.add(0.02 * k, 2.0 - 0.02 * k, 0.0)
-    size = {name: np.size(value) for name, value in vars(predictor).items() if isinstance(value, np.ndarray)}
+    size = {
+        name: np.size(value)
+        for name, value in vars(predictor).items()
+        if isinstance(value, np.ndarray)
+    }
     for k in range(3, 300):
         predictor.add(0.02 * k, 2.0 - 0.004 * k, 0.0)
-    assert size == {name: np.size(value) for name, value in vars(predictor).items() if isinstance(value, np.ndarray)}
+    assert size == {
+        name: np.size(value)
+        for name, value in vars(predictor).items()
+        if isinstance(value, np.ndarray)
+    }
 
 
 def test_gap_of_the_surface() -> None:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sim.camera import PinholeCamera
-from sim.scenery import Chessboard
+from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.scenery import Chessboard
 from tests.vision.bench import true_view
 
 
@@ -20,8 +20,11 @@ def clean(cell: dict[str, Any]) -> PinholeCamera:
     return PinholeCamera(cell, view, np.random.default_rng(0))
 
 
-def ball_pixels(camera: PinholeCamera, ball: Any, velocity: Any = (0, 0, 0)) -> tuple[np.ndarray, float]:
-    """Centroid (u, v) and area (px) of what a ball makes brighter by more than half its contrast."""
+def ball_pixels(
+    camera: PinholeCamera, ball: Any, velocity: Any = (0, 0, 0)
+) -> tuple[np.ndarray, float]:
+    """Centroid (u, v) and area (px) of what a ball makes brighter by more than half its
+    contrast."""
     empty = camera.render(None).astype(float)
     brighter = np.clip(camera.render(ball, velocity) - empty, 0, None)
     weight = np.clip(brighter / 70.0, 0.0, 1.0)
@@ -30,8 +33,12 @@ def ball_pixels(camera: PinholeCamera, ball: Any, velocity: Any = (0, 0, 0)) -> 
     return np.array([u @ values, v @ values]) / values.sum(), float(values.sum())
 
 
-@pytest.mark.parametrize("place", [(2.10, 0.24), (1.55, 0.05), (1.42, -0.20), (0.95, 0.33), (0.78, -0.37)])
-def test_a_ball_is_where_opencv_projects_its_centre(clean: PinholeCamera, place: tuple[float, float]) -> None:
+@pytest.mark.parametrize(
+    "place", [(2.10, 0.24), (1.55, 0.05), (1.42, -0.20), (0.95, 0.33), (0.78, -0.37)]
+)
+def test_a_ball_is_where_opencv_projects_its_centre(
+    clean: PinholeCamera, place: tuple[float, float]
+) -> None:
     ball = np.array([*place, 0.62])
     turn, shift = cv2.Rodrigues(clean.rotation)[0], -clean.rotation @ clean.position
     matrix = np.array([[clean.focal, 0, clean.cx], [0, clean.focal, clean.cy], [0, 0, 1]])
@@ -45,11 +52,15 @@ def test_a_ball_is_where_opencv_projects_its_centre(clean: PinholeCamera, place:
 def test_a_moving_ball_is_a_streak_about_its_place_at_mid_exposure(
     clean: PinholeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sim.camera.SHADOW_DEPTH", 0.0)
+    monkeypatch.setattr("petrobot.sim.camera.SHADOW_DEPTH", 0.0)
     ball = np.array([1.45, 0.10, 0.62])
     empty = clean.background.astype(float)
-    still, moving = (np.clip(clean.render(ball, v) - empty, 0, None) for v in ((0, 0, 0), (-2.5, 0, 0)))
-    assert np.abs(ball_pixels(clean, ball)[0] - ball_pixels(clean, ball, (-2.5, 0, 0))[0]).max() < 0.15
+    still, moving = (
+        np.clip(clean.render(ball, v) - empty, 0, None) for v in ((0, 0, 0), (-2.5, 0, 0))
+    )
+    assert (
+        np.abs(ball_pixels(clean, ball)[0] - ball_pixels(clean, ball, (-2.5, 0, 0))[0]).max() < 0.15
+    )
     assert moving.sum() == pytest.approx(still.sum(), rel=0.03), "the same light, spread out"
     way = 2.5 * 0.004 * clean.focal / float(clean.to_camera(ball)[2])
     # a blurred image's spread along the way grows by the variance of an even exposure, way^2 / 12
@@ -101,7 +112,10 @@ def test_ball_in_the_cup_is_seen_through_its_mouth(clean: PinholeCamera) -> None
 
 def test_capsule_ends_are_where_they_project(clean: PinholeCamera) -> None:
     ends = np.array([[[1.0, -0.2, 0.8], [1.3, 0.2, 0.8]]])
-    changed = np.abs(clean.render(None, arm_points=ends, arm_radii=[0.04]).astype(int) - clean.background) > 5
+    changed = (
+        np.abs(clean.render(None, arm_points=ends, arm_radii=[0.04]).astype(int) - clean.background)
+        > 5
+    )
     for u, v in clean.project(ends[0]):
         assert changed[round(v), round(u)]
     v, u = np.nonzero(changed)
@@ -110,7 +124,9 @@ def test_capsule_ends_are_where_they_project(clean: PinholeCamera) -> None:
 
 
 def test_light_and_gradient(cell: dict[str, Any], clean: PinholeCamera) -> None:
-    assert clean.render(None, light=0.5).mean() == pytest.approx(clean.background.mean() / 2, abs=0.6)
+    assert clean.render(None, light=0.5).mean() == pytest.approx(
+        clean.background.mean() / 2, abs=0.6
+    )
     view = true_view(cell, noise=0.0, light_gradient=(-0.4, 0.0), vignetting=0.0)
     sloping = PinholeCamera(cell, view, np.random.default_rng(0)).background.astype(float)
     ratio = sloping / np.maximum(clean.background, 1.0)
@@ -126,9 +142,13 @@ def test_noise_has_its_sigma_and_is_new_in_each_image(cell: dict[str, Any]) -> N
 
 
 def test_same_generator_same_images(cell: dict[str, Any]) -> None:
-    first, second = (PinholeCamera(cell, true_view(cell), np.random.default_rng(5)) for _ in range(2))
+    first, second = (
+        PinholeCamera(cell, true_view(cell), np.random.default_rng(5)) for _ in range(2)
+    )
     for place in (1.9, 1.4):
-        assert np.array_equal(first.render([place, 0, 0.62], (-1, 0, 0)), second.render([place, 0, 0.62], (-1, 0, 0)))
+        assert np.array_equal(
+            first.render([place, 0, 0.62], (-1, 0, 0)), second.render([place, 0, 0.62], (-1, 0, 0))
+        )
     first.reseed(np.random.default_rng(8))
     second.reseed(np.random.default_rng(9))
     assert not np.array_equal(first.render(None), second.render(None))
@@ -139,7 +159,9 @@ def test_unknown_truth_is_refused(cell: dict[str, Any]) -> None:
         PinholeCamera(cell, {"focal_length": 600.0}, np.random.default_rng(0))
 
 
-def test_table_that_stands_otherwise_is_drawn_otherwise(cell: dict[str, Any], clean: PinholeCamera) -> None:
+def test_table_that_stands_otherwise_is_drawn_otherwise(
+    cell: dict[str, Any], clean: PinholeCamera
+) -> None:
     view = true_view(cell, noise=0.0, light_gradient=(0.0, 0.0), vignetting=0.0, near_edge=0.70)
     other = PinholeCamera(cell, view, np.random.default_rng(0))
     u, v = (round(c) for c in clean.project([0.66, 0.1, 0.6]))
@@ -151,7 +173,9 @@ def test_board_corners_are_where_they_project(clean: PinholeCamera) -> None:
     pose[:3, 3] = [1.15, -0.15, 0.60]
     picture = clean.render_board(pose, board)
     y, x = np.mgrid[0 : board.rows, 0 : board.columns]
-    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * board.square + pose[:3, 3]
+    points = (
+        np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * board.square + pose[:3, 3]
+    )
     wanted = clean.project(points).astype(np.float32)[:, None]
     limit = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 40, 0.001)
     found = cv2.cornerSubPix(picture, wanted.copy(), (5, 5), (-1, -1), limit)
@@ -159,7 +183,8 @@ def test_board_corners_are_where_they_project(clean: PinholeCamera) -> None:
 
 
 def test_noise_added_without_a_look_is_the_noise_added_with_one(cell: dict[str, Any]) -> None:
-    """Arm, cup and ball in view or not: the short way to an image gives every pixel of the long one."""
+    """Arm, cup and ball in view or not: the short way to an image gives every pixel of the long
+    one."""
     rng = np.random.default_rng(4)
     short, long = (PinholeCamera(cell, true_view(cell), np.random.default_rng(7)) for _ in range(2))
     assert short._sound
@@ -175,8 +200,12 @@ def test_noise_added_without_a_look_is_the_noise_added_with_one(cell: dict[str, 
 def test_a_scene_drawn_in_stripes_is_the_scene_drawn_at_once(
     cell: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    striped, whole = (PinholeCamera(cell, true_view(cell), np.random.default_rng(0)) for _ in range(2))
+    striped, whole = (
+        PinholeCamera(cell, true_view(cell), np.random.default_rng(0)) for _ in range(2)
+    )
     striped.warm_up()
-    monkeypatch.setattr("sim.scenery.STRIPE", whole.height)
+    monkeypatch.setattr("petrobot.sim.scenery.STRIPE", whole.height)
     whole.warm_up()
-    assert np.array_equal(striped.background, whole.background) and np.array_equal(striped._rays, whole._rays)
+    assert np.array_equal(striped.background, whole.background) and np.array_equal(
+        striped._rays, whole._rays
+    )

@@ -1,1 +1,2 @@
-"""The operator's commands: each steers the mission run that goes on, in the protocol that the page speaks too."""
+"""The operator's commands: each steers the mission run that goes on, in the protocol that the page
+speaks too."""

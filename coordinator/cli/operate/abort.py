@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot abort"
 

@@ -1,4 +1,5 @@
-"""Pause the run before a transition fires or when a token enters a place; without a name, tell where it would."""
+"""Pause the run before a transition fires or when a token enters a place; without a name, tell
+where it would."""
 
 from __future__ import annotations
 
@@ -6,11 +7,11 @@ import argparse
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot break start"
 
@@ -33,7 +34,10 @@ def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]
     task = client.state["task"] or {"places": [], "transitions": []}
     kinds = {one["name"]: kind for kind in ("places", "transitions") for one in task[kind]}
     name = options.element.rpartition(".")[2]
-    return {"element": f"{kinds[hand.named(kinds, name, 'place or transition')]}.{name}", "on": not options.off}
+    return {
+        "element": f"{kinds[hand.named(kinds, name, 'place or transition')]}.{name}",
+        "on": not options.off,
+    }
 
 
 async def _told(client: OperatorClient, answer: hand.Answer) -> str:
@@ -46,7 +50,7 @@ def _words(breakpoints: list[str]) -> str:
 
 
 async def _list(options: argparse.Namespace) -> int:
-    from coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.hmi.client import OperatorError
 
     door = hand.find(options)
     try:
@@ -54,5 +58,7 @@ async def _list(options: argparse.Namespace) -> int:
             breakpoints = client.state["breakpoints"]
     except OperatorError as fault:
         raise CommandError(3, f"{door.run}: {fault}") from fault
-    hand.show(options, {"run": door.run, "ok": True, "breakpoints": breakpoints}, _words(breakpoints))
+    hand.show(
+        options, {"run": door.run, "ok": True, "breakpoints": breakpoints}, _words(breakpoints)
+    )
     return 0

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot raise image_tick"
 
@@ -23,7 +23,9 @@ def run(options: argparse.Namespace) -> int:
     """Raise."""
 
     def data(client: OperatorClient) -> dict[str, Any]:
-        external = {name: one for name, one in client.state["events"].items() if one["scope"] == "external"}
+        external = {
+            name: one for name, one in client.state["events"].items() if one["scope"] == "external"
+        }
         return {"event": hand.named(external, options.event, "external event")}
 
     async def told(client: OperatorClient, answer: hand.Answer) -> str:

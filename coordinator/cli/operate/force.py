@@ -1,14 +1,15 @@
-"""Leave an action place by one of its exits whatever its run does; the run counts neither as success nor as failure."""
+"""Leave an action place by one of its exits whatever its run does; the run counts neither as
+success nor as failure."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot force catch_ball missed"
 
@@ -37,4 +38,7 @@ def _data(client: OperatorClient, options: argparse.Namespace) -> dict[str, Any]
             exits.setdefault(arc["place"], {})[arc["transition"]] = None
     place = hand.named(exits, options.place, "action place")
     run_id = next((run["id"] for run in client.state["runs"].values() if run["place"] == place), "")
-    return {"run": run_id, "transition": hand.named(exits[place], options.exit, f"way out of {place}")}
+    return {
+        "run": run_id,
+        "transition": hand.named(exits[place], options.exit, f"way out of {place}"),
+    }

@@ -1,4 +1,5 @@
-"""What the operator's commands share: the run is found, the controls are taken, one command is given, its answer is told."""
+"""What the operator's commands share: the run is found, the controls are taken, one command is
+given, its answer is told."""
 
 from __future__ import annotations
 
@@ -11,12 +12,12 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.loading import write_json
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import write_json
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
-    from coordinator.operator.door_file import Door
+    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.door_file import Door
 
 Answer = dict[str, Any]
 BAD_INPUT = frozenset({"bad_data", "unknown", "unknown_command"})
@@ -25,7 +26,9 @@ BAD_INPUT = frozenset({"bad_data", "unknown", "unknown_command"})
 
 def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     """Which run."""
-    parser.add_argument("--run", metavar="RUN", help="a run's id or folder (default: the newest run that goes on)")
+    parser.add_argument(
+        "--run", metavar="RUN", help="a run's id or folder (default: the newest run that goes on)"
+    )
     parser.add_argument(
         "--journal",
         metavar="FOLDER",
@@ -39,7 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Which run, who gives the command, and how the answer is written."""
     add_run_arguments(parser)
     parser.add_argument(
-        "--as", dest="name", metavar="NAME", help="who you are for the others (default: your user name)"
+        "--as",
+        dest="name",
+        metavar="NAME",
+        help="who you are for the others (default: your user name)",
     )
     parser.add_argument(
         "--take",
@@ -47,9 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         type=float,
         const=30.0,
-        help="ask whoever holds the controls for them, and wait up to S seconds (default: %(const)g)",
+        help="ask whoever holds the controls for them, and wait up to S seconds (default: "
+        "%(const)g)",
     )
-    parser.add_argument("--json", metavar="FILE", help="write the answer as JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="write the answer as JSON (- for standard output)"
+    )
 
 
 def give(
@@ -60,7 +69,8 @@ def give(
 ) -> int:
     """Give one command and tell its answer: 0, 1 when it was refused.
 
-    `data(hand)` is asked for once the snapshot is there; `told(hand, answer)` gives what people are told when it was obeyed.
+    `data(hand)` is asked for once the snapshot is there; `told(hand, answer)` gives what people are
+    told when it was obeyed.
     """
     return asyncio.run(_give(options, verb, data, told))
 
@@ -71,7 +81,7 @@ async def _give(
     data: Callable[[OperatorClient], dict[str, Any]] | None,
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None,
 ) -> int:
-    from coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.hmi.client import OperatorError
 
     door = find(options)
     try:
@@ -80,7 +90,9 @@ async def _give(
             await take_controls(hand, options.take)
             answer = await hand.command(verb, given)
             if not answer.get("ok"):
-                raise CommandError(2 if answer.get("code") in BAD_INPUT else 1, f"{door.run}: {answer.get('text')}")
+                raise CommandError(
+                    2 if answer.get("code") in BAD_INPUT else 1, f"{door.run}: {answer.get('text')}"
+                )
             text = await told(hand, answer) if told is not None else "done"
     except OperatorError as fault:
         raise CommandError(3, f"{door.run}: {fault}") from fault
@@ -98,8 +110,8 @@ def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> N
 
 def find(options: argparse.Namespace) -> Door:
     """The door of the run that is meant."""
-    from coordinator.operator.door_file import find_door
-    from coordinator.record.runfolder import NoRunError
+    from petrobot.coordinator.operator.door_file import find_door
+    from petrobot.coordinator.record.runfolder import NoRunError
 
     try:
         return find_door(options.run, options.journal)
@@ -108,8 +120,9 @@ def find(options: argparse.Namespace) -> Door:
 
 
 def connect(door: Door, name: str | None) -> OperatorClient:
-    """A client of the run. The same name is the same operator at each call: the controls stay his for 10 s in between."""
-    from coordinator.hmi.client import OperatorClient
+    """A client of the run. The same name is the same operator at each call: the controls stay his
+    for 10 s in between."""
+    from petrobot.coordinator.hmi.client import OperatorClient
 
     name = name or user_name()
     secret = hmac.digest(door.token.encode(), f"operator {name}".encode(), hashlib.sha256).hex()
@@ -125,7 +138,8 @@ def user_name() -> str:
 
 
 async def take_controls(hand: OperatorClient, wait: float | None) -> None:
-    """Take the controls, or ask for them and wait `wait` seconds. Raises CommandError (1) when another keeps them."""
+    """Take the controls, or ask for them and wait `wait` seconds. Raises CommandError (1) when
+    another keeps them."""
     answer = await hand.command("take_controls")
     if answer.get("ok"):
         return
@@ -139,7 +153,7 @@ async def take_controls(hand: OperatorClient, wait: float | None) -> None:
 
 def named(known: Mapping[str, Any], name: str, what: str) -> str:
     """A name that the task knows. Raises CommandError (2) with the nearest ones."""
-    from coordinator.conditions.wording import nearest
+    from petrobot.coordinator.conditions.wording import nearest
 
     if name not in known:
         raise CommandError(2, f"no {what} is named {name!r}{nearest(name, list(known))}")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli import CommandError
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot override track_ball predict_kalman"
 
@@ -31,7 +31,11 @@ def run(options: argparse.Namespace) -> int:
         selectors = client.state["selectors"]
         task = hand.named(selectors, options.task, "primitive task")
         if options.action is not None:
-            hand.named({one["action"]: one for one in selectors[task]["alternatives"]}, options.action, "alternative")
+            hand.named(
+                {one["action"]: one for one in selectors[task]["alternatives"]},
+                options.action,
+                "alternative",
+            )
         return {"primitive_task": task, "action": options.action}
 
     async def told(client: OperatorClient, answer: hand.Answer) -> str:

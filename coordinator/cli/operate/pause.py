@@ -1,14 +1,15 @@
-"""Pause the run that goes on: nothing fires or starts, and every node says whether its devices hold."""
+"""Pause the run that goes on: nothing fires or starts, and every node says whether its devices
+hold."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot pause"
 WORDS = {

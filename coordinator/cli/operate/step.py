@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot step"
 PATIENCE = 2.0
@@ -30,7 +30,9 @@ def run(options: argparse.Namespace) -> int:
         return {}
 
     async def told(client: OperatorClient, answer: hand.Answer) -> str:
-        if not await client.until(lambda state: state["mission"].get("firings", 0) > seen, PATIENCE):
+        if not await client.until(
+            lambda state: state["mission"].get("firings", 0) > seen, PATIENCE
+        ):
             return "it goes on until something can fire, and pauses then"
         firing = client.state["firings"][-1]
         answer["firing"] = firing

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from coordinator.cli.operate import hand
+from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot token runs +2"
 
@@ -41,5 +41,7 @@ def _change(text: str) -> int:
     except ValueError:
         value = 0
     if not value:
-        raise argparse.ArgumentTypeError(f"{text} changes nothing: write how many tokens more or fewer, as +1 or -1")
+        raise argparse.ArgumentTypeError(
+            f"{text} changes nothing: write how many tokens more or fewer, as +1 or -1"
+        )
     return value

@@ -1,4 +1,5 @@
-"""Follow the run that goes on: firings, starts and ends of actions, commands of operators; until it ends."""
+"""Follow the run that goes on: firings, starts and ends of actions, commands of operators; until it
+ends."""
 
 from __future__ import annotations
 
@@ -9,12 +10,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from coordinator.cli import CommandError
-from coordinator.cli.operate import hand
-from services.comm.json_text import json_text
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.operate import hand
+from petrobot.services.comm.json_text import json_text
 
 if TYPE_CHECKING:
-    from coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.hmi.client import OperatorClient
 
 EXAMPLE = "petrobot watch --json - | jq .kind"
 ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
@@ -25,9 +26,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     hand.add_run_arguments(parser)
     parser.add_argument(
-        "--as", dest="name", metavar="NAME", help="who you are for the others (default: your user name)"
+        "--as",
+        dest="name",
+        metavar="NAME",
+        help="who you are for the others (default: your user name)",
     )
-    parser.add_argument("--json", metavar="FILE", help="every change as a line of JSON (- for standard output)")
+    parser.add_argument(
+        "--json", metavar="FILE", help="every change as a line of JSON (- for standard output)"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -42,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 async def _watch(options: argparse.Namespace, out: TextIO) -> int:
-    from coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.hmi.client import OperatorError
 
     door = hand.find(options)
     try:
@@ -72,7 +78,10 @@ def _write(out: TextIO, text: str) -> None:
 def _snapshot(client: OperatorClient) -> str:
     mission, controls = client.state["mission"], client.state["controls"]
     tokens = ", ".join(f"{place} {n}" for place, n in client.state["marking"].items() if n)
-    return f"{mission['id']}: {mission['state']}; controls: {controls['holder'] or 'nobody'}; tokens: {tokens}"
+    return (
+        f"{mission['id']}: {mission['state']}; controls: "
+        f"{controls['holder'] or 'nobody'}; tokens: {tokens}"
+    )
 
 
 def _line(change: Mapping[str, Any]) -> str:
@@ -98,11 +107,14 @@ def _paused(change: Mapping[str, Any]) -> str:
 
 _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "fired": lambda c: f"fired    {c['firing']['transition']}  ({c['firing']['cause']})",
-    "run_started": lambda c: f"started  {c['run']['id']}  {c['run']['action']} on {c['run']['node'] or 'no node'}",
+    "run_started": lambda c: (
+        f"started  {c['run']['id']}  {c['run']['action']} on {c['run']['node'] or 'no node'}"
+    ),
     "run_ended": _ended,
     "paused": _paused,
     "mission": lambda c: (
-        f"mission  {c['mission']['state']}" + (f": {c['mission']['reason']}" if c["mission"].get("reason") else "")
+        f"mission  {c['mission']['state']}"
+        + (f": {c['mission']['reason']}" if c["mission"].get("reason") else "")
         if "state" in c["mission"]
         else ""
     ),
@@ -110,5 +122,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "controls": lambda c: f"controls {c['controls']['holder'] or 'free'}",
     "breakpoints": lambda c: f"breaks   {', '.join(c['breakpoints']) or 'none'}",
     "selector": lambda c: f"selector {c['name']}: {c['selector'].get('override') or 'free choice'}",
-    "node": lambda c: f"node     {c['name']} {c['node']['state']} {c['node'].get('text', '')}".rstrip(),
+    "node": lambda c: (
+        f"node     {c['name']} {c['node']['state']} {c['node'].get('text', '')}".rstrip()
+    ),
 }

@@ -1,7 +1,9 @@
-"""Makes the golden journals anew: `python -m tests.record.golden.make`. Do it only when the semantics are meant to change.
+"""Makes the golden journals anew: `python -m tests.record.golden.make`. Do it only when the
+semantics are meant to change.
 
-Each is a mission run of a shipped task in lock step with scripted actions. The tests derive every marking and instruction of them
-again (tests/record/test_golden.py), so a change that no version of petrobot may make by accident is noticed.
+Each is a mission run of a shipped task in lock step with scripted actions. The tests derive every
+marking and instruction of them again (tests/record/test_golden.py), so a change that no version of
+petrobot may make by accident is noticed.
 """
 
 from __future__ import annotations
@@ -9,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from coordinator.cli.loading import load_task, task_path
-from coordinator.launch import Setting, lockstep_cell, lockstep_id, with_runs
-from coordinator.record.journal import JournalWriter
-from coordinator.record.recording import JournalStore
-from coordinator.record.runfolder import header
-from services.action import Status
-from services.comm.directory import parse
-from services.scripted import Line
+from petrobot.coordinator.cli.loading import load_task, task_path
+from petrobot.coordinator.launch import Setting, lockstep_cell, lockstep_id, with_runs
+from petrobot.coordinator.record.journal import JournalWriter
+from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.record.runfolder import header
+from petrobot.services.action import Status
+from petrobot.services.comm.directory import parse
+from petrobot.services.scripted import Line
 from tests.mission.scripted_cell import scripts, services_text
 
 FOLDER = Path(__file__).parent
@@ -81,12 +83,23 @@ def make(name: str, folder: Path) -> Path:
     task, path = load_task(task_name), folder / f"{name}.journal"
     text = services_text(task)
     setting = Setting(task, runs=runs)
-    given = {"services_path": "services.toml", "seed": setting.seed, "runs": with_runs(task, runs)[1]}
+    given = {
+        "services_path": "services.toml",
+        "seed": setting.seed,
+        "runs": with_runs(task, runs)[1],
+    }
     source = task_path(task_name).read_text(encoding="utf-8")
-    parameters = {"parameters": dict(task.parameters), "cell": "launched", "mock": "", "durable": False}
+    parameters = {
+        "parameters": dict(task.parameters),
+        "cell": "launched",
+        "mock": "",
+        "durable": False,
+    }
     first = header(lockstep_id(setting), source, text, "lockstep", {**given, **parameters})
     store = JournalStore(JournalWriter(path, first), 0.0)
-    cell, party = lockstep_cell(parse(text, Path("services.toml")), setting, scripts(task, lines), store=store)
+    cell, party = lockstep_cell(
+        parse(text, Path("services.toml")), setting, scripts(task, lines), store=store
+    )
     if not cell.run(lambda: party.over, 1_000_000):
         raise RuntimeError(f"{name} does not end")
     store.writer.close()

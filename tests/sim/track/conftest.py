@@ -1,4 +1,5 @@
-"""The rover's laboratory on the bench: a small CANopen master of the tests' own, and a driver who sees the truth."""
+"""The rover's laboratory on the bench: a small CANopen master of the tests' own, and a driver who
+sees the truth."""
 
 from __future__ import annotations
 
@@ -10,13 +11,22 @@ from typing import Any
 
 import pytest
 
-from services.comm.canbus import Frame
-from services.comm.canopen import SYNC, NmtCommand, Type, map_pdo, nmt, pdo_struct, sdo_read_request, sdo_write_request
-from services.comm.channels import can_body
-from services.comm.cia402 import SENT, VELOCITY_RECEIVED, Mode, Object, to_units
-from services.comm.party import TICK
-from sim.track_laboratory import TrackLaboratory
-from sim.track_truth import TrackSite, read_track_site
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import (
+    SYNC,
+    NmtCommand,
+    Type,
+    map_pdo,
+    nmt,
+    pdo_struct,
+    sdo_read_request,
+    sdo_write_request,
+)
+from petrobot.services.comm.channels import can_body
+from petrobot.services.comm.cia402 import SENT, VELOCITY_RECEIVED, Mode, Object, to_units
+from petrobot.services.comm.party import TICK
+from petrobot.sim.track_laboratory import TrackLaboratory
+from petrobot.sim.track_truth import TrackSite, read_track_site
 from tests.sim.laboratory_bench import LaboratoryBench
 
 REPOSITORY = Path(__file__).parents[3]
@@ -34,7 +44,8 @@ def track_site() -> TrackSite:
 
 
 class RoverMaster:
-    """Sets both drives and the sensor up over SDO, enables the drives, and sends set points of speed (rad/s, left and right)."""
+    """Sets both drives and the sensor up over SDO, enables the drives, and sends set points of
+    speed (rad/s, left and right)."""
 
     def __init__(self) -> None:
         self.wanted = [0.0, 0.0]
@@ -51,7 +62,9 @@ class RoverMaster:
     def _setup_frames() -> list[list[Frame]]:
         groups = [[nmt(NmtCommand.ENTER_PREOPERATIONAL)]]
         for node in (1, 2):
-            transfers = map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, 0x200 + node, 1, VELOCITY_RECEIVED)
+            transfers = map_pdo(
+                Object.RPDO1, Object.RPDO1_MAPPING, 0x200 + node, 1, VELOCITY_RECEIVED
+            )
             transfers += map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, 0x180 + node, 1, SENT)
             writes = [(t.index, t.sub, t.type.pack(t.value or 0)) for t in transfers]
             writes.append((Object.SYNC_PERIOD, 0, Type.UNSIGNED32.pack(20_000)))
@@ -67,10 +80,15 @@ class RoverMaster:
         if not self.enable:
             self._word = 0x00
         elif any(word & 0x08 for word in self.status):
-            self._word = 0x00 if self._word == 0x80 else 0x80  # a fault is reset by the bit's rising edge
+            self._word = (
+                0x00 if self._word == 0x80 else 0x80
+            )  # a fault is reset by the bit's rising edge
         else:
             self._word = {0x00: 0x06, 0x80: 0x06, 0x06: 0x07}.get(self._word, 0x0F)
-        frames = [Frame(0x201 + side, _RPDO.pack(self._word, to_units(self.wanted[side]))) for side in (0, 1)]
+        frames = [
+            Frame(0x201 + side, _RPDO.pack(self._word, to_units(self.wanted[side])))
+            for side in (0, 1)
+        ]
         return [*frames, SYNC]
 
     def take(self, frames: Sequence[Frame]) -> None:
@@ -85,7 +103,9 @@ class RoverMaster:
             elif 0x81 <= frame.id <= 0x83:
                 self.emergencies.append((frame.id - 0x80, int.from_bytes(frame.data[:2], "little")))
             elif 0x581 <= frame.id <= 0x583 and frame.data[0] & 0xE0 == 0x40:
-                self.replies[frame.id - 0x580, int.from_bytes(frame.data[1:3], "little")] = frame.data[4:]
+                self.replies[frame.id - 0x580, int.from_bytes(frame.data[1:3], "little")] = (
+                    frame.data[4:]
+                )
 
     @property
     def enabled(self) -> bool:
@@ -99,7 +119,9 @@ class RoverBench(LaboratoryBench):
     cycle = SYNC_TICKS
 
     def __init__(self, site: TrackSite, **options: Any) -> None:
-        self.lab = TrackLaboratory("laboratory", site, lambda name: PARTIES.get(name, name), **options)
+        self.lab = TrackLaboratory(
+            "laboratory", site, lambda name: PARTIES.get(name, name), **options
+        )
         self.master = RoverMaster()
         super().__init__(self.lab, self.master, "rover")
 
@@ -112,10 +134,14 @@ class RoverBench(LaboratoryBench):
 
     def drive(self, speed: float, turn: float) -> None:
         """From now on so fast (m/s, rad/s), as a driver with the nominal numbers would."""
-        self.master.wanted = [(speed - 0.5 * WIDTH * turn) / RADIUS, (speed + 0.5 * WIDTH * turn) / RADIUS]
+        self.master.wanted = [
+            (speed - 0.5 * WIDTH * turn) / RADIUS,
+            (speed + 0.5 * WIDTH * turn) / RADIUS,
+        ]
 
     def pursue(self, speed: float, end: float, ahead: float = 0.35) -> None:
-        """Go after the point of the true centre line `ahead` metres farther, and stop beyond arc length `end` (m)."""
+        """Go after the point of the true centre line `ahead` metres farther, and stop beyond arc
+        length `end` (m)."""
         x, y, heading = self.lab.rover.pose
         near = self.lab.track.nearest(x, y)
         there = self.lab.track.at(near.s + ahead)
@@ -124,7 +150,9 @@ class RoverBench(LaboratoryBench):
         speed = speed if near.s < end else 0.0
         self.drive(speed, 2.0 * speed * aside / (dx * dx + dy * dy))
 
-    def follow(self, speed: float = 0.5, end: float | None = None, at_most: float = 200.0) -> dict[str, Any]:
+    def follow(
+        self, speed: float = 0.5, end: float | None = None, at_most: float = 200.0
+    ) -> dict[str, Any]:
         """Drive along the true centre line to the T, or to `end`, and stand; gives the score."""
         goal = self.lab.track.length if end is None else end
         for _ in range(round(at_most / (SYNC_TICKS * TICK))):

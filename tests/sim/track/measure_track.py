@@ -1,7 +1,9 @@
-"""Measures what the rover's laboratory costs: `python tests/sim/track/measure_track.py [REGIME ...]`; no test, figures for people.
+"""Measures what the rover's laboratory costs: `python tests/sim/track/measure_track.py [REGIME
+...]`; no test, figures for people.
 
-CPU milliseconds for a simulated second while a driver who sees the truth goes along the track at 0.5 m/s, by part, with 25
-images/s; the cost of a tick in which nothing is due, of an image, and of a new experiment.
+CPU milliseconds for a simulated second while a driver who sees the truth goes along the track at
+0.5 m/s, by part, with 25 images/s; the cost of a tick in which nothing is due, of an image, and of
+a new experiment.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ def measure(regime: str) -> None:
     """One paragraph of figures."""
     from conftest import ROVER_FILE, RoverBench  # type: ignore[import-not-found]
 
-    from sim.track_truth import read_track_site
+    from petrobot.sim.track_truth import read_track_site
 
     bench = RoverBench(read_track_site(ROVER_FILE), seed=1, regime=regime)
     begun = time.process_time()
@@ -58,7 +60,10 @@ def measure(regime: str) -> None:
     began = lab.now
     score = bench.follow(0.5)
     seconds = lab.now - began
-    print(f"{regime}: {seconds:.1f} s simulated, finished {score['finished']}, {score['rms_mm']:.1f} mm rms")
+    print(
+        f"{regime}: {seconds:.1f} s simulated, finished {score['finished']}, "
+        f"{score['rms_mm']:.1f} mm rms"
+    )
     for name, spent in meter.seconds.items():
         print(f"  {name:30s} {1e3 * spent / seconds:6.2f} ms/s")
     print(f"  {'a new experiment':30s} {1e3 * prepared:6.2f} ms")
@@ -73,13 +78,19 @@ def _single(bench: Any) -> None:
         begun = time.process_time()
         for _ in range(IMAGES):
             lab.picture(lab.rover.now)
-        print(f"  {f'an image at {speed} m/s':30s} {1e6 * (time.process_time() - begun) / IMAGES:6.1f} us")
+        print(
+            f"  {f'an image at {speed} m/s':30s} "
+            f"{1e6 * (time.process_time() - begun) / IMAGES:6.1f} us"
+        )
     lab.exposures.want(lab.now, 0.0, 9)
     begun = time.process_time()
     for _ in range(IDLE_TICKS):
         lab.tick(lab.now)
         lab.take_frames()
-    print(f"  {'a tick while it stands':30s} {1e6 * (time.process_time() - begun) / IDLE_TICKS:6.1f} us")
+    print(
+        f"  {'a tick while it stands':30s} "
+        f"{1e6 * (time.process_time() - begun) / IDLE_TICKS:6.1f} us"
+    )
 
 
 if __name__ == "__main__":

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.rover import Rover
-from sim.track_elements import Pose
-from sim.track_truth import RoverTruth, TrackSite, WheelTruth
+from petrobot.sim.rover import Rover
+from petrobot.sim.track_elements import Pose
+from petrobot.sim.track_truth import RoverTruth, TrackSite, WheelTruth
 
 SETTINGS = {
     "placed": 0.0,
@@ -65,7 +65,9 @@ speeds = st.floats(-8.0, 8.0)
 
 @given(speeds, speeds, st.floats(0.1, 5.0), st.floats(-3.0, 3.0))
 @settings(max_examples=80, deadline=None)
-def test_steady_wheels_lead_along_a_circular_arc(left: float, right: float, time: float, heading: float) -> None:
+def test_steady_wheels_lead_along_a_circular_arc(
+    left: float, right: float, time: float, heading: float
+) -> None:
     body = rover(Pose(1.0, 2.0, heading))
     settled(body, left, right)
     body.move_to(time)
@@ -92,8 +94,9 @@ def test_a_wheel_follows_with_its_lag(target: float, time: float) -> None:
 @given(st.lists(st.floats(0.001, 0.09), min_size=1, max_size=30))
 @settings(max_examples=40, deadline=None)
 def test_looking_often_changes_next_to_nothing(pauses: list[float]) -> None:
-    """Where the rover is depends on when it is looked at by rounding of the arcs alone, and by when it is first seen that a
-    wheel is nearer to its set point than what counts as there (1e-6 rad/s, so less than that times its lag)."""
+    """Where the rover is depends on when it is looked at by rounding of the arcs alone, and by when
+    it is first seen that a wheel is nearer to its set point than what counts as there (1e-6 rad/s,
+    so less than that times its lag)."""
     often, once = (rover(slip=0.02, slip_aside=0.01, slip_turn=0.02, seed=3) for _ in range(2))
     for body in (often, once):
         command(body, 3.0, 6.0)
@@ -103,7 +106,9 @@ def test_looking_often_changes_next_to_nothing(pauses: list[float]) -> None:
         often.move_to(now)
     once.move_to(now)
     assert often.wheels[1].angle == pytest.approx(once.wheels[1].angle, abs=1e-7)
-    assert (often.x, often.y, often.heading) == pytest.approx((once.x, once.y, once.heading), abs=2e-4)
+    assert (often.x, often.y, often.heading) == pytest.approx(
+        (once.x, once.y, once.heading), abs=2e-4
+    )
 
 
 def test_brakes_hold() -> None:
@@ -147,7 +152,9 @@ def test_slip_has_the_spread_and_the_memory_asked_for() -> None:
         last = body.x
         body.heading, body.y = 0.0, 0.0
     slips = 1.0 - np.array(ways) / 0.01
-    assert np.nanstd(slips) == pytest.approx(0.02 / math.sqrt(2.0), rel=0.15)  # the mean of two wheels
+    assert np.nanstd(slips) == pytest.approx(
+        0.02 / math.sqrt(2.0), rel=0.15
+    )  # the mean of two wheels
     kept = np.corrcoef(slips[:-10], slips[10:])[0, 1]
     assert kept == pytest.approx(math.exp(-1.0), abs=0.12)
 

@@ -1,4 +1,5 @@
-"""The wheel drives in cyclic synchronous velocity mode and the sensor on the bus, as a master sees them."""
+"""The wheel drives in cyclic synchronous velocity mode and the sensor on the bus, as a master sees
+them."""
 
 from __future__ import annotations
 
@@ -13,20 +14,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.can_hub import Hub
-from services.comm.canbus import Frame
-from services.comm.canopen import NmtState as Network
-from services.comm.canopen import Type, heartbeat, sdo_write_request
-from services.comm.cia402 import Fault, Mode, Object, State, StatusBit, from_units, state_of
-from sim.rover import Rover
-from sim.rover_drives import RoverBus
-from sim.rover_sensor import Echo, ReflectorSensor
-from sim.track_truth import TrackSite
+from petrobot.services.comm.can_hub import Hub
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen import NmtState as Network
+from petrobot.services.comm.canopen import Type, heartbeat, sdo_write_request
+from petrobot.services.comm.cia402 import (
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    from_units,
+    state_of,
+)
+from petrobot.sim.rover import Rover
+from petrobot.sim.rover_drives import RoverBus
+from petrobot.sim.rover_sensor import Echo, ReflectorSensor
+from petrobot.sim.track_truth import TrackSite
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
-DRIVE_EDS = str(files("services.comm.eds").joinpath("wheel_drive.eds"))
-SENSOR_EDS = str(files("services.comm.eds").joinpath("reflector_sensor.eds"))
+DRIVE_EDS = str(files("petrobot.services.comm.eds").joinpath("wheel_drive.eds"))
+SENSOR_EDS = str(files("petrobot.services.comm.eds").joinpath("reflector_sensor.eds"))
 PATIENCE = 10.0
 U16, U32, I32 = Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER32
 
@@ -128,7 +137,11 @@ def test_a_lost_heartbeat_stops_a_drive_that_watches_it(rover_bench: Bench) -> N
     bench = rover_bench(regime="plain")
     bench.enable()
     beat = U32.pack(0x7F << 16 | 100)
-    bench.post("can", "rover", (Frame(0x601, b"\x23\x16\x10\x01" + beat), heartbeat(0x7F, Network.OPERATIONAL)))
+    bench.post(
+        "can",
+        "rover",
+        (Frame(0x601, b"\x23\x16\x10\x01" + beat), heartbeat(0x7F, Network.OPERATIONAL)),
+    )
     bench.wait(0.3)
     assert (1, Fault.HEARTBEAT) in bench.master.emergencies
     assert not any(node == 2 for node, _ in bench.master.emergencies)
@@ -298,7 +311,10 @@ def test_the_canopen_package_masters_our_wheel_drive(live: LiveRover, network: A
     node.rpdo[1][0x60FF].raw = 3_000_000
     node.rpdo[1].update()
     _until(lambda: abs(live.rover.wheels[1].speed - 3.0) < 0.05, "the wheel does not turn as told")
-    _until(lambda: abs(node.tpdo[1][0x606C].raw - 3_000_000) < 400_000, "the drive does not tell its speed")
+    _until(
+        lambda: abs(node.tpdo[1][0x606C].raw - 3_000_000) < 400_000,
+        "the drive does not tell its speed",
+    )
     assert live.rover.wheels[0].speed == 0.0
     with pytest.raises(canopen.SdoAbortedError) as refused:
         node.sdo[0x6060].raw = 8

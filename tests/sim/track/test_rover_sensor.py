@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.rover_sensor import look
-from sim.track_elements import Pose
-from sim.track_truth import SensorTruth, TrackSite
+from petrobot.sim.rover_sensor import look
+from petrobot.sim.track_elements import Pose
+from petrobot.sim.track_truth import SensorTruth, TrackSite
 
 PERFECT = SensorTruth(
     forward=0.1,
@@ -35,9 +35,17 @@ def rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-@given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(-3.1, 3.1), st.floats(0.55, 5.9), st.floats(-1.04, 1.04))
+@given(
+    st.floats(-5.0, 5.0),
+    st.floats(-5.0, 5.0),
+    st.floats(-3.1, 3.1),
+    st.floats(0.55, 5.9),
+    st.floats(-1.04, 1.04),
+)
 @settings(max_examples=80, deadline=None)
-def test_bearing_and_range_from_any_pose(x: float, y: float, heading: float, level: float, bearing: float) -> None:
+def test_bearing_and_range_from_any_pose(
+    x: float, y: float, heading: float, level: float, bearing: float
+) -> None:
     there = (
         x + 0.1 * math.cos(heading) + level * math.cos(heading + bearing),
         y + 0.1 * math.sin(heading) + level * math.sin(heading + bearing),
@@ -68,13 +76,20 @@ def test_the_field_of_view_has_limits(level: float, bearing: float, seen: bool) 
 
 
 def test_several_reflectors_answer_the_nearest_first() -> None:
-    echoes = look(PERFECT, Pose(0.0, 0.0, 0.0), [(4.1, 1.0), (2.1, -0.5), (-3.0, 0.0), (5.1, 0.0)], rng())
+    echoes = look(
+        PERFECT, Pose(0.0, 0.0, 0.0), [(4.1, 1.0), (2.1, -0.5), (-3.0, 0.0), (5.1, 0.0)], rng()
+    )
     assert [round(echo.range, 2) for echo in echoes] == [2.08, 4.13, 5.01]
 
 
 def test_noise_offsets_and_rounding() -> None:
     truth = replace(
-        PERFECT, bearing_offset=0.01, range_offset=-0.02, bearing_noise=0.005, range_noise=0.02, step=0.0005
+        PERFECT,
+        bearing_offset=0.01,
+        range_offset=-0.02,
+        bearing_noise=0.005,
+        range_noise=0.02,
+        step=0.0005,
     )
     draws = rng()
     echoes = [look(truth, Pose(0.0, 0.0, 0.0), [(3.1, 0.0)], draws)[0] for _ in range(4000)]

@@ -1,4 +1,5 @@
-"""The track: what every track keeps to, its centre line, the nearest point, the colour of the floor."""
+"""The track: what every track keeps to, its centre line, the nearest point, the colour of the
+floor."""
 
 from __future__ import annotations
 
@@ -10,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.track import BOARD, KINDS, Track, TrackError
-from sim.track_elements import BAR_LENGTH, BAR_MARGIN, HALF_WIDTH, SQUARE, Element, Kind
-from sim.track_floor import COARSE, FINE, ORIGIN, Floor
+from petrobot.sim.track import BOARD, KINDS, Track, TrackError
+from petrobot.sim.track_elements import BAR_LENGTH, BAR_MARGIN, HALF_WIDTH, SQUARE, Element, Kind
+from petrobot.sim.track_floor import COARSE, FINE, ORIGIN, Floor
 
 tracks = st.builds(
     Track.by_seed,
@@ -95,7 +96,9 @@ def test_a_seed_gives_one_track_and_another_seed_another() -> None:
 
 def test_the_share_of_arcs_is_what_is_asked_for() -> None:
     def arcs(share: float) -> float:
-        letters = "".join(Track.by_seed(seed, 14, 0, "mixed", share).plain()["elements"] for seed in range(60))
+        letters = "".join(
+            Track.by_seed(seed, 14, 0, "mixed", share).plain()["elements"] for seed in range(60)
+        )
         return 1.0 - letters.count("S") / len(letters)
 
     assert arcs(0.1) < 0.35 < arcs(0.5) < 0.6 < arcs(1.0)
@@ -140,7 +143,9 @@ def test_what_is_no_track_is_refused(make: object, text: str) -> None:
 
 @given(tracks, st.floats(0.0, 1.0), st.floats(-0.45, 0.45))
 @settings(max_examples=150, deadline=None)
-def test_the_nearest_point_of_a_point_aside_is_where_it_came_from(track: Track, share: float, offset: float) -> None:
+def test_the_nearest_point_of_a_point_aside_is_where_it_came_from(
+    track: Track, share: float, offset: float
+) -> None:
     s = share * track.length
     x, y, heading = track.at(s)
     near = track.nearest(x - offset * math.sin(heading), y + offset * math.cos(heading))
@@ -154,7 +159,9 @@ def test_the_nearest_point_of_a_point_aside_is_where_it_came_from(track: Track, 
 def test_no_point_of_the_line_is_nearer_than_the_nearest(track: Track, x: float, y: float) -> None:
     near = track.nearest(x, y)
     ends = track.elements[-1].at(SQUARE)
-    line = np.array([track.at(s)[:2] for s in np.linspace(0.0, track.length + BAR_MARGIN, 1500).tolist()])
+    line = np.array(
+        [track.at(s)[:2] for s in np.linspace(0.0, track.length + BAR_MARGIN, 1500).tolist()]
+    )
     least = float(np.hypot(line[:, 0] - x, line[:, 1] - y).min())
     assert near.distance <= least + 1e-9
     assert near.distance >= least - 0.02
@@ -177,7 +184,9 @@ def test_the_floor_has_the_track_in_the_opposite_colour(track: Track) -> None:
         element = track.elements[track.element_at(s)]
         own = (element.square[0] + element.square[1]) % 2 == 0
         x, y, heading = track.at(s)
-        aside = np.array([0.0, HALF_WIDTH - 0.002, HALF_WIDTH + 0.002, -HALF_WIDTH + 0.002, -HALF_WIDTH - 0.002])
+        aside = np.array(
+            [0.0, HALF_WIDTH - 0.002, HALF_WIDTH + 0.002, -HALF_WIDTH + 0.002, -HALF_WIDTH - 0.002]
+        )
         seen = track.floor(x - aside * math.sin(heading), y + aside * math.cos(heading)).tolist()
         plain = int(own)
         if abs(s - element.start) < 0.01 or abs(s - element.end) < 0.01:
@@ -204,7 +213,10 @@ def test_the_floors_pictures_show_the_floor(seed: int) -> None:
     floor.paint(Track.contest())
     floor.paint(track)
     rng = np.random.default_rng(seed)
-    columns, rows = rng.integers(0, floor.fine.shape[1], 20_000), rng.integers(0, floor.fine.shape[0], 20_000)
+    columns, rows = (
+        rng.integers(0, floor.fine.shape[1], 20_000),
+        rng.integers(0, floor.fine.shape[0], 20_000),
+    )
     truth = track.floor(ORIGIN + (columns + 0.5) * FINE, ORIGIN + (rows + 0.5) * FINE)
     assert np.array_equal(floor.fine[rows, columns] > 127, truth == 1)
     n = round(COARSE / FINE)

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim.track import Track
-from sim.track_camera import FloorCamera, Motion, Mount
-from sim.track_floor import Floor
-from sim.track_light import Hall
-from sim.track_truth import LightTruth, TrackSite
+from petrobot.sim.track import Track
+from petrobot.sim.track_camera import FloorCamera, Motion, Mount
+from petrobot.sim.track_floor import Floor
+from petrobot.sim.track_light import Hall
+from petrobot.sim.track_truth import LightTruth, TrackSite
 
 NOMINAL = Mount(0.10, 0.60, 0.663, 0.0, 0.0, 140.0, (79.5, 59.5), 160, 120)
 TRACK = Track.of((1, 1), 0, "SSSSS")
@@ -72,7 +72,9 @@ def test_pixels_and_floor_are_inverse(mount: Mount, u: float, v: float) -> None:
 def test_turning_the_camera_moves_the_picture_the_other_way() -> None:
     ahead = np.array((1.0, 0.0))
     u, v = NOMINAL.project(ahead)
-    assert replace(NOMINAL, yaw=0.05).project(ahead)[0] > u + 5.0  # turned left: things wander to the right
+    assert (
+        replace(NOMINAL, yaw=0.05).project(ahead)[0] > u + 5.0
+    )  # turned left: things wander to the right
     assert replace(NOMINAL, pitch=0.7).project(ahead)[1] < v - 4.0  # turned down: things wander up
 
 
@@ -92,7 +94,11 @@ def test_known_points_of_the_floor_are_where_they_should_be(floor: Floor, headin
         u, v = NOMINAL.project((ahead, aside))
         guess = np.array([[[round(u), round(v)]]], np.float32)
         found = cv2.cornerSubPix(
-            image, guess, (4, 4), (-1, -1), (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
+            image,
+            guess,
+            (4, 4),
+            (-1, -1),
+            (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-4),
         )
         assert found.ravel() == pytest.approx((u, v), abs=0.25)
 
@@ -101,7 +107,9 @@ def test_the_track_is_as_wide_in_the_picture_as_it_should_be(floor: Floor) -> No
     image = take(camera(), floor, Motion(4.2, 3.0, 0.0, 0.0, 0.0)).astype(float)
     for row in (70, 90, 110):
         x, _, w = NOMINAL.to_floor() @ (79.5, float(row), 1.0)
-        depth = (x / w - NOMINAL.forward) * math.cos(NOMINAL.pitch) + NOMINAL.height * math.sin(NOMINAL.pitch)
+        depth = (x / w - NOMINAL.forward) * math.cos(NOMINAL.pitch) + NOMINAL.height * math.sin(
+            NOMINAL.pitch
+        )
         track, paint = image[row, 60:100], image[row, 20]
         width = np.abs(track - paint).sum() / 160.0
         assert width == pytest.approx(140.0 * 0.05 / depth, rel=0.03)
@@ -143,8 +151,11 @@ def test_greys_light_veil_and_noise(floor: Floor) -> None:
 
 @pytest.mark.parametrize("at", [(4.0, 3.0), (-0.9, 3.0), (16.9, 16.9), (8.0, -0.9)])
 @pytest.mark.parametrize("heading", [0.3, 1.9, -2.2])
-def test_every_pixel_shows_the_floor_that_it_looks_at(floor: Floor, at: tuple[float, float], heading: float) -> None:
-    """Also at the board's rim, and whatever the camera has looked at before: the window on the floor goes along."""
+def test_every_pixel_shows_the_floor_that_it_looks_at(
+    floor: Floor, at: tuple[float, float], heading: float
+) -> None:
+    """Also at the board's rim, and whatever the camera has looked at before: the window on the
+    floor goes along."""
     eye = camera()
     take(eye, floor, Motion(5.0, 5.0, 0.0, 0.0, 0.0))
     image = take(eye, floor, Motion(*at, heading, 0.0, 0.0))

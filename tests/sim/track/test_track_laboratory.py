@@ -1,4 +1,5 @@
-"""The whole laboratory on the bench: a run, its services, faults, images, and the same seed twice."""
+"""The whole laboratory on the bench: a run, its services, faults, images, and the same seed
+twice."""
 
 from __future__ import annotations
 
@@ -14,14 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.comm.directory import load
-from services.comm.messages import Outcome
-from sim.laboratory_party import SERVICES
-from sim.track import Track
-from sim.track_faults import ROVER_FAULTS
-from sim.track_laboratory import TrackLaboratory, make_laboratory
-from sim.track_truth import TrackSite, read_track_site
-from sim.truth import LaboratoryError
+from petrobot.services.comm.directory import load
+from petrobot.services.comm.messages import Outcome
+from petrobot.sim.laboratory_party import SERVICES
+from petrobot.sim.track import Track
+from petrobot.sim.track_faults import ROVER_FAULTS
+from petrobot.sim.track_laboratory import TrackLaboratory, make_laboratory
+from petrobot.sim.track_truth import TrackSite, read_track_site
+from petrobot.sim.truth import LaboratoryError
 
 Bench = Callable[..., Any]
 REPOSITORY = Path(__file__).parents[3]
@@ -33,7 +34,10 @@ SERVICES_FILE = REPOSITORY / "services" / "mobile" / "track.services.toml"
 
 def test_a_driver_who_sees_the_truth_finishes(rover_bench: Bench) -> None:
     bench = rover_bench()
-    assert bench.call("laboratory_prepare", seed=5, regime="mixed", elements=9, interruptions=1).status == "success"
+    assert (
+        bench.call("laboratory_prepare", seed=5, regime="mixed", elements=9, interruptions=1).status
+        == "success"
+    )
     bench.enable()
     score = bench.follow(0.5)
     assert score["finished"]
@@ -124,17 +128,24 @@ def test_the_image_shows_the_track_ahead(rover_bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("speed", [0, 0.0, -0.5, 1.3, 5, "fast", float("nan")])
-def test_a_speed_that_no_wheel_has_is_refused_with_what_can_be(rover_bench: Bench, speed: object) -> None:
+def test_a_speed_that_no_wheel_has_is_refused_with_what_can_be(
+    rover_bench: Bench, speed: object
+) -> None:
     ended = rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed)
     assert ended.status == "error" and "speed" in ended.text and "1.2 m/s" in ended.text
 
 
 @pytest.mark.parametrize("speed", [1, 0.05, 1.2])
 def test_a_speed_that_the_wheels_have_is_taken(rover_bench: Bench, speed: float) -> None:
-    assert rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed).status == "success"
+    assert (
+        rover_bench().call("laboratory_prepare", seed=1, regime="plain", speed=speed).status
+        == "success"
+    )
 
 
-def test_every_regime_and_every_disturbance_can_be_prepared(track_site: TrackSite, rover_bench: Bench) -> None:
+def test_every_regime_and_every_disturbance_can_be_prepared(
+    track_site: TrackSite, rover_bench: Bench
+) -> None:
     bench = rover_bench()
     for regime in track_site.settings["regimes"]:
         assert bench.call("laboratory_prepare", seed=3, regime=regime).status == "success"
@@ -228,8 +239,12 @@ def test_a_dead_sensor_is_silent(rover_bench: Bench) -> None:
     assert len(bench.master.echoes) > count + 15
 
 
-@pytest.mark.parametrize(("kind", "arguments"), [("drive_fault", {"joint": 2}), ("power", {"duration": 5.0})])
-def test_the_rover_stops_by_itself(rover_bench: Bench, kind: str, arguments: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "arguments"), [("drive_fault", {"joint": 2}), ("power", {"duration": 5.0})]
+)
+def test_the_rover_stops_by_itself(
+    rover_bench: Bench, kind: str, arguments: dict[str, Any]
+) -> None:
     bench = prepared(rover_bench)
     bench.drive(0.5, 0.0)
     bench.wait(1.0)
@@ -251,7 +266,9 @@ def test_a_bus_that_is_off_lets_the_drives_stop(rover_bench: Bench) -> None:
     assert bench.run(lambda: bench.lab.rover.speed > 0.4, 2.0)
 
 
-def test_a_rover_that_leaves_the_board_gets_no_power_before_the_next_experiment(rover_bench: Bench) -> None:
+def test_a_rover_that_leaves_the_board_gets_no_power_before_the_next_experiment(
+    rover_bench: Bench,
+) -> None:
     bench = prepared(rover_bench)
     rover = bench.lab.rover
     rover.x, rover.y, rover.heading = 16.5, 8.0, 0.0
@@ -261,7 +278,9 @@ def test_a_rover_that_leaves_the_board_gets_no_power_before_the_next_experiment(
     bench.wait(0.5)  # the bench's master tries to reset the fault
     assert rover.standing
     assert not bench.master.enabled
-    assert [each["kind"] for each in bench.call("laboratory_score").values["penalties"]][-1] == "left_board"
+    assert [each["kind"] for each in bench.call("laboratory_score").values["penalties"]][
+        -1
+    ] == "left_board"
     bench.call("laboratory_prepare", seed=1)
     assert bench.run(lambda: bench.master.enabled, 1.0)
 
@@ -270,21 +289,29 @@ def test_every_fault_can_be_asked_for(rover_bench: Bench) -> None:
     bench = prepared(rover_bench)
     for kind, keys in ROVER_FAULTS.keys.items():
         arguments = {"joint": 1} if "joint" in keys else {}
-        assert bench.call("laboratory_fault", kind=kind, after=100.0, **arguments).status == "success"
+        assert (
+            bench.call("laboratory_fault", kind=kind, after=100.0, **arguments).status == "success"
+        )
 
 
 # The same seed
 
 
 def digest(rover_bench: Bench, seed: int, prepare_first: bool) -> str:
-    bench = rover_bench(seed=99) if prepare_first else rover_bench(seed=seed, regime="mixed+flash+slip+blind")
+    bench = (
+        rover_bench(seed=99)
+        if prepare_first
+        else rover_bench(seed=seed, regime="mixed+flash+slip+blind")
+    )
     if prepare_first:
         bench.enable()
     bench.call("laboratory_prepare", seed=seed, regime="mixed+flash+slip+blind")
     bench.enable()
     bench.want_images(25.0)
     score = bench.follow(0.5, end=5.0)
-    told = hashlib.sha256(json.dumps([score["path"][-5:], score["rms_mm"], bench.master.echoes[-20:]]).encode())
+    told = hashlib.sha256(
+        json.dumps([score["path"][-5:], score["rms_mm"], bench.master.echoes[-20:]]).encode()
+    )
     for _, body in bench.images[-20:]:
         told.update(body["pixels"].tobytes())
     return told.hexdigest()
@@ -300,17 +327,27 @@ def test_a_seed_gives_one_run_in_another_process(rover_bench: Bench) -> None:
     program = (
         "import json, sys\n"
         "from pathlib import Path\n"
-        "from sim.track_truth import read_track_site\n"
-        "from sim.track_laboratory import TrackLaboratory\n"
-        "lab = TrackLaboratory('l', read_track_site(Path(sys.argv[1])), str, seed=3, regime='arcs+flash')\n"
-        "print([int(lab.picture(t * 0.04).astype(int).sum()) for t in range(20)], lab.track.plain())\n"
+        "from petrobot.sim.track_truth import read_track_site\n"
+        "from petrobot.sim.track_laboratory import TrackLaboratory\n"
+        "lab = TrackLaboratory('l', read_track_site(Path(sys.argv[1])), str, seed=3, "
+        "regime='arcs+flash')\n"
+        "print([int(lab.picture(t * 0.04).astype(int).sum()) for t in range(20)], "
+        "lab.track.plain())\n"
     )
     rover = str(REPOSITORY / "services" / "mobile" / "rover.toml")
     told = subprocess.run(
-        [sys.executable, "-c", program, rover], cwd=REPOSITORY, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", program, rover],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     ).stdout
     lab = TrackLaboratory("l", read_track_site(Path(rover)), str, seed=3, regime="arcs+flash")
-    assert told.strip() == f"{[int(lab.picture(t * 0.04).astype(int).sum()) for t in range(20)]} {lab.track.plain()}"
+    assert (
+        told.strip() == f"{[int(lab.picture(t * 0.04).astype(int).sum()) for t in range(20)]} "
+        f"{lab.track.plain()}"
+    )
 
 
 # The location file

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sim.track import Track
-from sim.track_film import FilmError, View, film, images, main
-from sim.track_plan import floor_plan, pictures, summary
+from petrobot.sim.track import Track
+from petrobot.sim.track_film import FilmError, View, film, images, main
+from petrobot.sim.track_plan import floor_plan, pictures, summary
 
 ROVER_FILE = Path(__file__).parents[3] / "services" / "mobile" / "rover.toml"
 SVG = "{http://www.w3.org/2000/svg}"
@@ -62,7 +62,11 @@ def test_two_runs_are_told_apart_and_names_are_escaped(score: dict[str, Any]) ->
     root = ElementTree.fromstring(floor_plan([score, score], ["homing & more", "<search>"]))
     texts = [element.text or "" for element in root.iter(f"{SVG}text")]
     assert [text.partition(":")[0] for text in texts] == ["homing & more", "<search>"]
-    strokes = {element.get("stroke") for element in root.iter(f"{SVG}path") if len(element.get("d", "")) > 300}
+    strokes = {
+        element.get("stroke")
+        for element in root.iter(f"{SVG}path")
+        if len(element.get("d", "")) > 300
+    }
     assert len(strokes) == 2
 
 
@@ -90,7 +94,9 @@ def test_a_plan_needs_a_run() -> None:
         floor_plan([])
 
 
-def test_the_films_images_show_the_rover_where_it_was(score: dict[str, Any], nominal: dict[str, Any]) -> None:
+def test_the_films_images_show_the_rover_where_it_was(
+    score: dict[str, Any], nominal: dict[str, Any]
+) -> None:
     view = View(Track.read(score["track"]))
     shown = list(images(score, nominal, fps=5.0, speedup=5.0))
     path = np.array(score["path"])
@@ -104,7 +110,9 @@ def test_the_films_images_show_the_rover_where_it_was(score: dict[str, Any], nom
 
 
 @pytest.mark.parametrize("suffix", [".avi", ".gif"])
-def test_a_film_is_written(score: dict[str, Any], nominal: dict[str, Any], tmp_path: Path, suffix: str) -> None:
+def test_a_film_is_written(
+    score: dict[str, Any], nominal: dict[str, Any], tmp_path: Path, suffix: str
+) -> None:
     path = tmp_path / f"run{suffix}"
     count = film(score, nominal, path, fps=10.0, speedup=20.0)
     if suffix == ".gif":
@@ -116,14 +124,18 @@ def test_a_film_is_written(score: dict[str, Any], nominal: dict[str, Any], tmp_p
     video.release()
 
 
-def test_what_cannot_be_filmed_is_said(score: dict[str, Any], nominal: dict[str, Any], tmp_path: Path) -> None:
+def test_what_cannot_be_filmed_is_said(
+    score: dict[str, Any], nominal: dict[str, Any], tmp_path: Path
+) -> None:
     with pytest.raises(FilmError, match=r"'\.mov'"):
         film(score, nominal, tmp_path / "run.mov")
     with pytest.raises(FilmError, match="no path"):
         film({**score, "path": []}, nominal, tmp_path / "run.gif")
 
 
-def test_the_command_line(score: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line(
+    score: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     result, plan = tmp_path / "run.json", tmp_path / "run.svg"
     result.write_text(json.dumps({"task": "follow_track", **score}))
     assert main([str(result), "--plan", str(plan), "--animate", "8"]) == 0

@@ -1,4 +1,5 @@
-"""The rover's laboratory on the wall clock: the shell that every laboratory has, and `python -m sim` as a process."""
+"""The rover's laboratory on the wall clock: the shell that every laboratory has, and `python -m
+petrobot.sim` as a process."""
 
 from __future__ import annotations
 
@@ -12,19 +13,27 @@ from typing import Any
 
 import pytest
 
-from services.comm.camera import StreamImages
-from services.comm.can_ports import StreamPort
-from services.comm.directory import load
-from services.comm.messages import Call
-from sim.realtime import LaboratoryShell, bus_channel, camera_address
-from sim.track import Track
-from sim.track_laboratory import TrackLaboratory
-from sim.truth import LaboratoryError
+from petrobot.services.comm.camera import StreamImages
+from petrobot.services.comm.can_ports import StreamPort
+from petrobot.services.comm.directory import load
+from petrobot.services.comm.messages import Call
+from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
+from petrobot.sim.track import Track
+from petrobot.sim.track_laboratory import TrackLaboratory
+from petrobot.sim.truth import LaboratoryError
 from tests.ports import free_ports
-from tests.sim.laboratory_shell import PATIENCE, REPOSITORY, call, program, running, score_as_member, until
+from tests.sim.laboratory_shell import (
+    PATIENCE,
+    REPOSITORY,
+    call,
+    program,
+    running,
+    score_as_member,
+    until,
+)
 
 
-def services_file(folder: Path, sim: str = "sim.track_laboratory:make_laboratory") -> Path:
+def services_file(folder: Path, sim: str = "petrobot.sim.track_laboratory:make_laboratory") -> Path:
     """The shipped location file with free ports, its devices named by hand."""
     node, bus, camera, coordinator = free_ports(4)
     file = folder / "services.toml"
@@ -65,7 +74,9 @@ async def shell(tmp_path: Path) -> AsyncIterator[LaboratoryShell]:
         yield started
 
 
-async def test_the_rover_drives_over_the_bus(shell: LaboratoryShell, rover_master: Callable[[], Any]) -> None:
+async def test_the_rover_drives_over_the_bus(
+    shell: LaboratoryShell, rover_master: Callable[[], Any]
+) -> None:
     lab = shell.laboratory
     assert isinstance(lab, TrackLaboratory)
     answer = await call(shell.server.address, "laboratory_prepare", seed=3, regime="plain")
@@ -120,13 +131,17 @@ async def test_images_come_over_the_wire(shell: LaboratoryShell) -> None:
 
 async def test_faults_and_refusals_are_answered(shell: LaboratoryShell) -> None:
     address = shell.server.address
-    assert (await call(address, "laboratory_fault", kind="dead_sensor", duration=1.0)).status == "success"
+    assert (
+        await call(address, "laboratory_fault", kind="dead_sensor", duration=1.0)
+    ).status == "success"
     refused = await call(address, "laboratory_prepare", regime="arcs+fog")
     assert (refused.status, refused.cause) == ("error", "bad_arguments")
     assert "'fog'" in refused.text
 
 
-def test_what_makes_no_laboratory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_makes_no_laboratory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "odd_laboratory.py").write_text("def make(directory, name):\n    return object()\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(LaboratoryError, match="LaboratoryParty"):
@@ -141,7 +156,9 @@ def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
     try:
         assert process.stdout is not None
         assert "ready" in process.stdout.readline()
-        prepared = asyncio.run(call(directory.address("laboratory"), "laboratory_prepare", seed=2, regime="contest"))
+        prepared = asyncio.run(
+            call(directory.address("laboratory"), "laboratory_prepare", seed=2, regime="contest")
+        )
         assert prepared.status == "success"
         score = asyncio.run(call(directory.address("laboratory"), "laboratory_score")).values
         assert (score["interruptions"], score["finished"]) == (3, False)
@@ -156,11 +173,16 @@ def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
     file = services_file(tmp_path)
     text = file.read_text()
     port = text.split("[nodes.drive]")[1].split("port = ")[1].split()[0]
-    alone = text[: text.index("[nodes.drive]")] + text[text.index("[services.laboratory_prepare]") :]
+    alone = (
+        text[: text.index("[nodes.drive]")] + text[text.index("[services.laboratory_prepare]") :]
+    )
     file.write_text(f'{alone}[coordinator]\nhost = "127.0.0.1"\nport = {port}\n')
     directory = load(file)
     process = program("--services", str(file), "--lockstep")
-    calls = [Call("1", "laboratory_prepare", {"seed": 6, "regime": "contest"}), Call("2", "laboratory_score")]
+    calls = [
+        Call("1", "laboratory_prepare", {"seed": 6, "regime": "contest"}),
+        Call("2", "laboratory_score"),
+    ]
     try:
         score = score_as_member(directory, calls)
         assert score["regime"] == "contest"

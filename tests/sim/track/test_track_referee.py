@@ -8,16 +8,19 @@ from typing import Any
 
 import pytest
 
-from sim.track import Track
-from sim.track_elements import Pose
-from sim.track_referee import Referee
+from petrobot.sim.track import Track
+from petrobot.sim.track_elements import Pose
+from petrobot.sim.track_referee import Referee
 
 TRACK = Track.of((0, 3), 0, "SSSSSSS", (3,))  # along y = 7 from x = 0; no paint from x = 6 to x = 8
 DT, SPEED = 0.02, 0.5
 
 
-def ride(points: Iterable[tuple[float, float]], track: Track = TRACK, stand: float = 1.0) -> tuple[Referee, float]:
-    """Past points (m) at a constant speed in straight lines, then standing; gives referee and time."""
+def ride(
+    points: Iterable[tuple[float, float]], track: Track = TRACK, stand: float = 1.0
+) -> tuple[Referee, float]:
+    """Past points (m) at a constant speed in straight lines, then standing; gives referee and
+    time."""
     referee, now, at = Referee(track, 1, "straight", 0.0), 0.0, None
     for x, y in points:
         if at is None:
@@ -28,7 +31,9 @@ def ride(points: Iterable[tuple[float, float]], track: Track = TRACK, stand: flo
         for k in range(1, max(1, round(way / (SPEED * DT))) + 1):
             share = k / max(1, round(way / (SPEED * DT)))
             now += DT
-            referee.watch(now, Pose(at[0] + share * (x - at[0]), at[1] + share * (y - at[1]), 0.0), SPEED)
+            referee.watch(
+                now, Pose(at[0] + share * (x - at[0]), at[1] + share * (y - at[1]), 0.0), SPEED
+            )
         at = x, y
     assert at is not None
     for _ in range(round(stand / DT)):
@@ -58,7 +63,9 @@ def test_a_clean_run() -> None:
 
 
 def test_errors_count_by_way_on_painted_elements_alone() -> None:
-    referee, now = ride([(0.0, 7.0), (0.02, 7.01), (6.0, 7.01), (6.5, 7.08), (8.0, 7.02), (13.8, 7.02)])
+    referee, now = ride(
+        [(0.0, 7.0), (0.02, 7.01), (6.0, 7.01), (6.5, 7.08), (8.0, 7.02), (13.8, 7.02)]
+    )
     score = referee.score(now)
     assert score["rms_mm"] == pytest.approx(math.sqrt((6 * 10**2 + 5.65 * 20**2) / 11.65), rel=0.02)
     assert score["max_mm"] == pytest.approx(20.0, abs=0.5)
@@ -81,7 +88,9 @@ def test_standing_at_a_bad_place_does_not_weigh() -> None:
         ([(6.0, 7.0), (6.8, 7.0), (5.5, 7.2), (6.8, 7.0), (13.8, 7.0)], 1, []),  # back and on
     ],
 )
-def test_interruptions(points: list[tuple[float, float]], recovered: int, penalties: list[str]) -> None:
+def test_interruptions(
+    points: list[tuple[float, float]], recovered: int, penalties: list[str]
+) -> None:
     referee, now = ride([(0.0, 7.0), *points])
     score = referee.score(now)
     assert score["recovered"] == recovered
@@ -90,7 +99,17 @@ def test_interruptions(points: list[tuple[float, float]], recovered: int, penalt
 
 def test_leaving_the_track_counts_once_each_time() -> None:
     referee, now = ride(
-        [(0.0, 7.0), (1.0, 7.0), (1.5, 7.5), (2.0, 7.5), (2.5, 7.0), (3.0, 7.0), (3.5, 7.4), (4.0, 7.0), (5.0, 7.0)]
+        [
+            (0.0, 7.0),
+            (1.0, 7.0),
+            (1.5, 7.5),
+            (2.0, 7.5),
+            (2.5, 7.0),
+            (3.0, 7.0),
+            (3.5, 7.4),
+            (4.0, 7.0),
+            (5.0, 7.0),
+        ]
     )
     score = referee.score(now)
     assert kinds(score) == ["track_left", "track_left"]
@@ -117,10 +136,16 @@ def test_an_interruption_that_is_left_out_is_missed() -> None:
         (15.50, True, False, ["not_stopped"]),
     ],
 )
-def test_where_it_must_stop(end: float, finished: bool, stopped: bool, penalties: list[str]) -> None:
+def test_where_it_must_stop(
+    end: float, finished: bool, stopped: bool, penalties: list[str]
+) -> None:
     referee, now = ride([(0.0, 7.0), (end, 7.0)])
     score = referee.score(now)
-    assert (score["finished"], score["stopped_at_T"], kinds(score)) == (finished, stopped, penalties)
+    assert (score["finished"], score["stopped_at_T"], kinds(score)) == (
+        finished,
+        stopped,
+        penalties,
+    )
 
 
 def test_a_run_that_is_over_while_it_still_goes_on_has_not_stopped() -> None:

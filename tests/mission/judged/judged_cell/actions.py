@@ -1,11 +1,12 @@
-"""Actions of a cell whose picks are judged later: by an inspection on another node, by the score, or by nobody."""
+"""Actions of a cell whose picks are judged later: by an inspection on another node, by the score,
+or by nobody."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
-from services.action import Context, Result, Status, provisional, success
+from petrobot.services.action import Context, Result, Status, provisional, success
 
 
 def number(run: str) -> int:
@@ -20,20 +21,27 @@ async def pick(ctx: Context, *, side: str) -> Result:
 
 
 async def inspect(ctx: Context, *, run: str) -> Result:
-    """Look at what was picked: the first and fourth are crooked (the first is said twice), the third and sixth hidden."""
+    """Look at what was picked: the first and fourth are crooked (the first is said twice), the
+    third and sixth hidden."""
     await ctx.sleep(0.05)
     if number(run) in (1, 4):
         ctx.verdict(run, Status.FAILURE, "crooked", "held by a corner")
     if number(run) in (1, 2, 5):
         ctx.verdict(run, Status.SUCCESS)
     if number(run) == 5:
-        ctx.verdict(run.replace("pick", "inspect"), Status.FAILURE, "sure")  # a run that was never provisional
+        ctx.verdict(
+            run.replace("pick", "inspect"), Status.FAILURE, "sure"
+        )  # a run that was never provisional
     return success()
 
 
 def score(ctx: Context, *, cycles: Sequence[dict[str, Any]]) -> Result:
     """The third part was found on the floor in the evening."""
     hidden = [one for cycle in cycles for one in cycle.get("provisional", ())]
-    fell = {one["run"]: {"status": "failure", "cause": "fell"} for one in hidden if number(one["run"]) == 3}
+    fell = {
+        one["run"]: {"status": "failure", "cause": "fell"}
+        for one in hidden
+        if number(one["run"]) == 3
+    }
     rows = [{"n": cycle["n"], "held": cycle["status"]} for cycle in cycles]
     return success(parts=rows, hidden=[one["run"] for one in hidden], verdicts=fell)

@@ -1,1 +1,2 @@
-"""A laboratory's own package, outside of petrobot: drivers and actions for the tests of the node."""
+"""A laboratory's own package, outside of petrobot: drivers and actions for the tests of the
+node."""

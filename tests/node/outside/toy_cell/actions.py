@@ -1,4 +1,5 @@
-"""Actions and services of the toy cell: good ones, slow ones, and ones that hang, crash or eat memory."""
+"""Actions and services of the toy cell: good ones, slow ones, and ones that hang, crash or eat
+memory."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from services.action import Cancelled, Context, Result, Status, error, failure, success
+from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
 
 
 def add(ctx: Context, *, a: int, b: int = 1) -> Result:
@@ -194,7 +195,8 @@ def block(ctx: Context, *, seconds: float) -> Result:
 
 
 def leave_behind(ctx: Context, *, how: str, mark: str, then: str = "return") -> Result:
-    """Start something that lives on, in one of many ways; `mark` gets its process id. Then return, block, crash or leave."""
+    """Start something that lives on, in one of many ways; `mark` gets its process id. Then return,
+    block, crash or leave."""
     LEAVERS[how](mark)
     while not (Path(mark).exists() and Path(mark).read_text()):
         time.sleep(0.005)
@@ -215,7 +217,8 @@ def _fork(mark: str) -> None:
 
 
 def _daemon(mark: str) -> None:
-    """Fork twice into a session of its own: its parent is gone, and so is all that tells where it comes from."""
+    """Fork twice into a session of its own: its parent is gone, and so is all that tells where it
+    comes from."""
     if os.fork() == 0:
         os.setsid()
         os.environ.clear()
@@ -263,7 +266,12 @@ left: list[subprocess.Popen[bytes]] = []
 
 
 async def order(
-    ctx: Context, *, send: list[dict[str, Any]], seconds: float = 0.0, look: bool = False, ends: str = "success"
+    ctx: Context,
+    *,
+    send: list[dict[str, Any]],
+    seconds: float = 0.0,
+    look: bool = False,
+    ends: str = "success",
 ) -> Result:
     """Send commands, wait a bit, and end as asked, whatever the driver made of the commands."""
     for body in send:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from services.comm.canbus import Frame
-from services.device import Ports
+from petrobot.services.comm.canbus import Frame
+from petrobot.services.device import Ports
 
 
 class Slide:
@@ -137,9 +137,11 @@ class Eye:
 
 
 class Broken:
-    """A cyclic device whose driver raises where its key `breaks` says, once an action has sent it `{"break": true}`.
+    """A cyclic device whose driver raises where its key `breaks` says, once an action has sent it
+    `{"break": true}`.
 
-    `sees` is what its `state` and `picture` tell; it counts as moving from `{"go": true}` until it is stopped.
+    `sees` is what its `state` and `picture` tell; it counts as moving from `{"go": true}` until it
+    is stopped.
     """
 
     def __init__(self, config: Mapping[str, Any], ports: Ports) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from services.action import Context, Result, Status, error, failure, success
+from petrobot.services.action import Context, Result, Status, error, failure, success
 
 
 class OwnEnd(BaseException):

@@ -1,0 +1,58 @@
+"""petrobot: a robot task is one Petri net, run over several computers.
+
+What users import is here: what an action uses and returns, the drivers' contract, and the clock of
+a test. Everything in `petrobot.coordinator`, `petrobot.services` and `petrobot.sim` is private, and
+may change without notice.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from petrobot.services.action import (
+        Cancelled,
+        Context,
+        Result,
+        Status,
+        error,
+        failure,
+        provisional,
+        success,
+    )
+    from petrobot.services.device import Driver, Ports, Remote, Setpoint
+    from petrobot.services.rehearsal import Rehearsal, rehearse
+
+__all__ = [
+    "Cancelled",
+    "Context",
+    "Driver",
+    "Ports",
+    "Rehearsal",
+    "Remote",
+    "Result",
+    "Setpoint",
+    "Status",
+    "error",
+    "failure",
+    "provisional",
+    "rehearse",
+    "success",
+]
+
+_HOMES = {
+    **dict.fromkeys(("Driver", "Ports", "Remote", "Setpoint"), "petrobot.services.device"),
+    **dict.fromkeys(("Rehearsal", "rehearse"), "petrobot.services.rehearsal"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded when first used: a command that runs no action starts without any of it.
+    if name not in __all__:
+        raise AttributeError(f"petrobot has no {name!r}; it has {', '.join(__all__)}")
+    return getattr(importlib.import_module(_HOMES.get(name, "petrobot.services.action")), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
