@@ -28,27 +28,27 @@ demo: $(VENV)/.ready
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p petrobot -p tests
+	$(BIN)/mypy -p petrobot -p tests -p tools
 
 test: lint
 	$(BIN)/pytest -n 2 -rs -m "not proof"
 
 load: $(VENV)/.ready
-	$(BIN)/python -m tests.bench.under_load $(ROUNDS)
+	$(BIN)/python -m tools.bench.under_load $(ROUNDS)
 
 proof: $(VENV)/.ready
-	$(BIN)/python -m tests.proof
+	$(BIN)/python -m tools.proof
 
 bench: $(VENV)/.ready
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test,bench,fast,oracle]"
-	$(BIN)/python tests/bench/wire.py
-	$(BIN)/python tests/bench/faults.py
-	$(BIN)/python tests/bench/estop.py
-	$(BIN)/python tests/bench/doors.py
-	$(BIN)/python tests/bench/journal.py
-	$(BIN)/python tests/bench/durability.py
-	$(BIN)/python -m tests.bench.analysis --write docs/figures-analysis.md
-	$(BIN)/python -m tests.bench.learning
+	$(BIN)/python tools/bench/wire.py
+	$(BIN)/python tools/bench/faults.py
+	$(BIN)/python tools/bench/estop.py
+	$(BIN)/python tools/bench/doors.py
+	$(BIN)/python tools/bench/journal.py
+	$(BIN)/python tools/bench/durability.py
+	$(BIN)/python -m tools.bench.analysis --write docs/figures-analysis.md
+	$(BIN)/python -m tools.bench.learning
 
 clean:
 	rm -rf $(VENV) build *.egg-info reports runs .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.coordinator.engine import Engine, Point
-from petrobot.coordinator.mission.executor import Executor
-from petrobot.coordinator.mission.lockstep_party import NAME, CoordinatorParty
-from petrobot.coordinator.mission.mission import Mission
-from petrobot.coordinator.mission.partners import (
+from petrobot.coordinator.run.executor import Executor
+from petrobot.coordinator.run.interfaces import (
     FirstAlternative,
     Forgetful,
     Observer,
     Selector,
     Store,
 )
-from petrobot.coordinator.record.journal import Journal, JournalWriter
-from petrobot.coordinator.record.recording import (
+from petrobot.coordinator.run.journal import Journal, JournalWriter
+from petrobot.coordinator.run.lockstep import NAME, CoordinatorParty
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.recording import (
     EPOCH,
     JournalStore,
     as_recorded,
@@ -33,18 +33,18 @@ from petrobot.coordinator.record.recording import (
     replay,
     stages,
 )
-from petrobot.coordinator.supervisor import Program, is_local
+from petrobot.coordinator.run.supervisor import Program, is_local
 from petrobot.coordinator.task import Task
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.cell import Cell, Delays
-from petrobot.services.comm.directory import Directory, NodeEntry, module_name
-from petrobot.services.comm.lockstep import Member
-from petrobot.services.comm.lockstep_process import cell_key
-from petrobot.services.comm.messages import Hello
-from petrobot.services.comm.party import Party
-from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.location_file import Directory, NodeEntry, module_name
+from petrobot.services.comm.lockstep.cell import Cell, Delays
+from petrobot.services.comm.lockstep.mesh import Member
+from petrobot.services.comm.lockstep.party import Party
+from petrobot.services.comm.lockstep.process import cell_key
+from petrobot.services.comm.protocol.messages import Hello
+from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 
-NODE_PARTY = "petrobot.services.lockstep_node:LockstepNode"
+NODE_PARTY = "petrobot.services.node.lockstep:LockstepNode"
 SCRIPTED = "petrobot.services.scripted:load"
 
 Substitutes = Mapping[str, Callable[..., Any]]

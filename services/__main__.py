@@ -10,24 +10,24 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from petrobot.services.comm.directory import (
+from petrobot.services.comm.location_file import (
     Directory,
     DirectoryError,
     parse,
     read_text,
     verify_imports,
 )
-from petrobot.services.comm.directory_file import nearest
-from petrobot.services.comm.lockstep import CellError
-from petrobot.services.comm.lockstep_process import run_member
-from petrobot.services.comm.parentage import die_with, wanted_with_parent
-from petrobot.services.comm.quantities import number
-from petrobot.services.comm.security import KeyFileError, KeyNeededError
-from petrobot.services.lockstep_node import LockstepNode
+from petrobot.services.comm.location_file.reading import nearest
+from petrobot.services.comm.lockstep.mesh import CellError
+from petrobot.services.comm.lockstep.process import run_member
+from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
+from petrobot.services.host.command_line import number
+from petrobot.services.host.parent_death import die_with, wanted_with_parent
+from petrobot.services.node.lockstep import LockstepNode
+from petrobot.services.node.realtime import serve
 from petrobot.services.scripted import ScriptError
 from petrobot.services.scripted import load as load_script
-from petrobot.services.shell import serve
-from petrobot.services.worker import log_to_stderr
+from petrobot.services.worker.process import log_to_stderr
 
 EXAMPLE = "example:\n  python -m petrobot.services vision --services services.toml"
 

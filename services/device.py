@@ -13,10 +13,10 @@ import logging
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol, runtime_checkable
 
-from petrobot.services.comm.canbus import CanBus
-from petrobot.services.comm.directory_file import nearest
-from petrobot.services.comm.image import ImageSource
-from petrobot.services.comm.plain import plain
+from petrobot.services.comm.canopen.bus import CanBus
+from petrobot.services.comm.location_file.reading import nearest
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.comm.streams.image import ImageSource
 
 _log = logging.getLogger(__name__)
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.services.action import Result, Status, error
-from petrobot.services.comm.directory import MEMORY_CALLS, ActionEntry
-from petrobot.services.comm.party import TICK
-from petrobot.services.memory import Memory
-from petrobot.services.place import InlinePlace
-from petrobot.services.runs import (
+from petrobot.services.comm.location_file import MEMORY_CALLS, ActionEntry
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.memory import Memory
+from petrobot.services.worker.runs import (
     Answered,
     Asked,
     Begin,

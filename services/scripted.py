@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.services.action import Context, Result, Status
-from petrobot.services.comm.directory_file import nearest
+from petrobot.services.comm.location_file.reading import nearest
 
 _KEYS = ("status", "seconds", "values", "cause", "text", "events", "deferred")
 _EVENT_KEYS = ("after", "name", "data")

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from petrobot.services.comm.directory import Directory, DirectoryError, load, resolve
-from petrobot.services.comm.lockstep import CellError
-from petrobot.services.comm.lockstep_process import run_member
-from petrobot.services.comm.quantities import number
-from petrobot.services.comm.security import KeyFileError, KeyNeededError
+from petrobot.services.comm.location_file import Directory, DirectoryError, load, resolve
+from petrobot.services.comm.lockstep.mesh import CellError
+from petrobot.services.comm.lockstep.process import run_member
+from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
+from petrobot.services.host.command_line import number
+from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import serve
-from petrobot.sim.truth import LaboratoryError
 
 EXAMPLE = "example:\n  python -m petrobot.sim --services services.toml"
 
@@ -53,7 +53,7 @@ def read(path: Path) -> tuple[Directory, str]:
     name = directory.laboratory()
     if not name:
         text = (
-            'no node is simulated; write sim = "petrobot.sim.laboratory:make_laboratory" '
+            'no node is simulated; write sim = "petrobot.sim.catching.laboratory:make_laboratory" '
             "in one [nodes.NAME]"
         )
         raise DirectoryError((f"{path}: {text}",))

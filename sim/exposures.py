@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from petrobot.sim.camera import Picture, PinholeCamera
-from petrobot.sim.truth import Truth
+from petrobot.sim.catching.camera import Picture, PinholeCamera
+from petrobot.sim.catching.truth import Truth
 
 _ON_TIME = 1e-9
 """s of rounding."""

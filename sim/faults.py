@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen.bus import Frame
 
 
 @dataclass(frozen=True, slots=True)

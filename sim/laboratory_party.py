@@ -12,11 +12,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
-from petrobot.services.comm.callee import Callee, Commanded, Offer, Order
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.channels import can_body, image_body, read_can, read_images_wanted
-from petrobot.services.comm.messages import Call, Executed, Outcome
-from petrobot.services.comm.party import TICK, Envelope
+from petrobot.services.comm.calls.callee import Callee, Commanded, Offer, Order
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.lockstep.channels import (
+    can_body,
+    image_body,
+    read_can,
+    read_images_wanted,
+)
+from petrobot.services.comm.lockstep.party import TICK, Envelope
+from petrobot.services.comm.protocol.messages import Call, Executed, Outcome
 from petrobot.sim.exposures import Exposures
 
 PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "laboratory_fault")

@@ -26,17 +26,17 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Final
 
-from petrobot.services.comm.callee import Callee, Offer, Order, StartRun
-from petrobot.services.comm.camera import ImageServer
-from petrobot.services.comm.can_hub import Hub
-from petrobot.services.comm.credentials import credentials
-from petrobot.services.comm.directory import Directory, resolve
-from petrobot.services.comm.listening import listening, refuse_unusable
-from petrobot.services.comm.messages import Call, Outcome
-from petrobot.services.comm.party import TICK
-from petrobot.services.comm.server import Server
+from petrobot.services.comm.calls.callee import Callee, Offer, Order, StartRun
+from petrobot.services.comm.calls.listening import listening, refuse_unusable
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.location_file import Directory, resolve
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.comm.protocol.messages import Call, Outcome
+from petrobot.services.comm.streams.camera import ImageServer
+from petrobot.services.comm.tls.credentials import credentials
+from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
-from petrobot.sim.truth import LaboratoryError
 
 SLIP: Final = 0.1
 """s behind the clock from which on the world's time slips."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from petrobot.services.comm.server import Server
-from petrobot.services.node import Node
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.node.node import Node
 from tests.waiting import beat
 
 

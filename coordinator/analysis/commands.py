@@ -16,25 +16,30 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.formats import read_net, written
-from petrobot.coordinator.analysis.gspn import Gspn
-from petrobot.coordinator.analysis.netfile import FormatError, NetFile
-from petrobot.coordinator.analysis.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.picture import graph_svg
-from petrobot.coordinator.analysis.rates import read_rates, unit_rates
+from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.picture import graph_svg
+from petrobot.coordinator.analysis.net.space import EngineName, Limits, explore
 from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
-from petrobot.coordinator.analysis.simulate import Estimate, Simulation, goal_by_marking, simulate
-from petrobot.coordinator.analysis.space import EngineName, Limits, explore
-from petrobot.coordinator.analysis.stochastic import Measured, NoEstimate, stochastic_view
-from petrobot.coordinator.analysis.whatif import (
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.rates import read_rates, unit_rates
+from petrobot.coordinator.analysis.time.simulate import (
+    Estimate,
+    Simulation,
+    goal_by_marking,
+    simulate,
+)
+from petrobot.coordinator.analysis.time.stochastic import Measured, NoEstimate, stochastic_view
+from petrobot.coordinator.analysis.time.whatif import (
     Change,
     change_gspn,
     change_net,
     change_task,
     read_change,
 )
-from petrobot.coordinator.net import Net
 from petrobot.coordinator.task import Place, Task, Transition
-from petrobot.services.comm.whole_file import write_whole
+from petrobot.coordinator.task.net import Net
+from petrobot.services.host.whole_file import write_whole
 
 OK, FAULT, BAD_INPUT = 0, 1, 2
 

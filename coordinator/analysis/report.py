@@ -5,32 +5,105 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.analysis.coverability import Coverability, settle_bounds
-from petrobot.coordinator.analysis.forecast import Forecast, forecast
-from petrobot.coordinator.analysis.graph import Mask
-from petrobot.coordinator.analysis.gspn import Chain, Gspn
-from petrobot.coordinator.analysis.markov import LongRun, long_run
-from petrobot.coordinator.analysis.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.pumping import find_pump
-from petrobot.coordinator.analysis.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.robot import (
+from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.graph import Mask
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
+from petrobot.coordinator.analysis.net.robot import (
     Recovery,
     RobotVerdicts,
     all_returned,
     judge,
     one_run_each,
 )
-from petrobot.coordinator.analysis.space import INTERRUPTED, EngineName, Limits, Space, explore
-from petrobot.coordinator.analysis.stochastic import Measured, stochastic_view
-from petrobot.coordinator.analysis.structural import Structure
-from petrobot.coordinator.analysis.structure import place_bounds
-from petrobot.coordinator.analysis.verdict import Verdict
-from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.net.siphons import (
+    PlaceSets,
+    controlled_siphons,
+    minimal_siphons,
+    minimal_traps,
+)
+from petrobot.coordinator.analysis.net.space import INTERRUPTED, EngineName, Limits, Space, explore
+from petrobot.coordinator.analysis.net.structure import (
+    Semiflows,
+    conflict_sets,
+    exclusive_places,
+    is_strictly_conservative,
+    lyapunov,
+    place_bounds,
+    place_semiflows,
+    transition_semiflows,
+)
+from petrobot.coordinator.analysis.net.verdict import Verdict
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.time.markov import LongRun, long_run
+from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.task import Kind, Task
+from petrobot.coordinator.task.net import Marking, Net
+
+# What the arcs of a net alone say, as plain data: invariants, siphons and traps, conflicts, conservativeness.
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What the arcs alone say, computed when asked for."""
+
+    net: Net
+
+    @cached_property
+    def place_flows(self) -> Semiflows:
+        """P-semiflows."""
+        return place_semiflows(self.net)
+
+    @cached_property
+    def transition_flows(self) -> Semiflows:
+        """T-semiflows."""
+        return transition_semiflows(self.net)
+
+    @cached_property
+    def siphons(self) -> PlaceSets:
+        """Minimal siphons."""
+        return minimal_siphons(self.net)
+
+    @cached_property
+    def traps(self) -> PlaceSets:
+        """Minimal traps."""
+        return minimal_traps(self.net)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, places and transitions by name."""
+        places, transitions = self.net.places, self.net.transitions
+        function = lyapunov(self.net)
+        return {
+            "p_invariants": [
+                {places[p]: n for p, n in sorted(y.items())} for y in self.place_flows.vectors
+            ],
+            "t_invariants": [
+                {transitions[t]: n for t, n in sorted(x.items())}
+                for x in self.transition_flows.vectors
+            ],
+            "invariants_complete": self.place_flows.complete and self.transition_flows.complete,
+            "siphons": [sorted(places[p] for p in s) for s in self.siphons.sets],
+            "traps": [sorted(places[p] for p in s) for s in self.traps.sets],
+            "siphons_complete": self.siphons.complete and self.traps.complete,
+            "siphons_controlled": controlled_siphons(self.net, found=self.siphons),
+            "structurally_bounded": function is not None,
+            "conservative": function is not None and function.conserved,
+            "strictly_conservative": is_strictly_conservative(self.net),
+            "lyapunov": {places[p]: n for p, n in sorted(function.weights.items())}
+            if function
+            else None,
+            "conflicts": [[transitions[t] for t in group] for group in conflict_sets(self.net)],
+            "exclusive_places": sorted(
+                [places[p], places[q]] for p, q in exclusive_places(self.net, self.place_flows)
+            ),
+        }
+
 
 SHOWN = 20
 """Entries of a list that the text shows."""

@@ -161,7 +161,7 @@ def _run(run: Callable[[argparse.Namespace], int], options: argparse.Namespace) 
         what = f"{fault.filename}: {fault.strerror}" if fault.filename else str(fault.strerror)
         raise CommandError(2, f"{what}; {FILE_FAULTS[fault.errno]}") from fault
     except Exception as fault:
-        from petrobot.services.comm.security import KeyFileError, KeyNeededError
+        from petrobot.services.comm.protocol.security import KeyFileError, KeyNeededError
 
         if isinstance(fault, KeyFileError | KeyNeededError):
             raise CommandError(2, str(fault)) from fault

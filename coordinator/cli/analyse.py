@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import task_path, write_json
-from petrobot.services.comm.quantities import number, whole
+from petrobot.services.host.command_line import number, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.analysis.commands import Outcome
+    from petrobot.coordinator.analysis.net.space import Limits
     from petrobot.coordinator.analysis.report import Analysis
-    from petrobot.coordinator.analysis.space import Limits
 
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
 TOLD_EVERY, TOLD_AFTER = 0.5, 2.0
@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Analyse."""
     from petrobot.coordinator.analysis.commands import analyse_command
-    from petrobot.coordinator.analysis.space import Limits
-    from petrobot.coordinator.taskfile import load
+    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.task.file import load
 
     longest = options.seconds or None
     limits = Limits(
@@ -108,7 +108,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _draw(analysis: Analysis, path: Path, folder: Path, *, quiet: bool) -> None:
     from petrobot.coordinator.cli.witnesses import draw_witnesses
-    from petrobot.coordinator.taskfile import load
+    from petrobot.coordinator.task.file import load
 
     made = draw_witnesses(analysis, load(path) if path.suffix == ".toml" else analysis.net, folder)
     if not quiet:

@@ -9,7 +9,7 @@ from petrobot.coordinator.cli import CommandError
 
 EXAMPLE = "petrobot calibrate --views board_images --simulated --output calibration.toml"
 ROOM = "petrobot.services.vision.calibrate"
-LABORATORY = "petrobot.sim.board:main"
+LABORATORY = "petrobot.sim.catching.board:main"
 """Takes board images with the simulated camera as it truly hangs: `main([folder])`."""
 
 

@@ -22,11 +22,11 @@ from petrobot.coordinator.cli.loading import (
     task_path,
     write_json,
 )
-from petrobot.services.comm.quantities import number, probability, whole
+from petrobot.services.host.command_line import number, probability, whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.campaign.conduct import Campaign
-    from petrobot.coordinator.campaign.plan import Plan
+    from petrobot.coordinator.studies.campaign.conduct import Campaign
+    from petrobot.coordinator.studies.campaign.plan import Plan
     from petrobot.coordinator.task import Task
 
 EXAMPLE = (
@@ -141,11 +141,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run or resume the campaign; print and write its result."""
-    from petrobot.coordinator.campaign.conduct import Campaign
-    from petrobot.coordinator.campaign.lock import held
-    from petrobot.coordinator.campaign.plan import CampaignError, identity, read_manifest
-    from petrobot.coordinator.campaign.progress import ProgressLine
-    from petrobot.coordinator.campaign.table import write_parquet
+    from petrobot.coordinator.studies.campaign.conduct import Campaign
+    from petrobot.coordinator.studies.campaign.plan import CampaignError, identity, read_manifest
+    from petrobot.coordinator.studies.campaign.progress import ProgressLine
+    from petrobot.coordinator.studies.campaign.table import held, write_parquet
 
     shown = ProgressLine(sys.stderr)
     shown.wanted = shown.wanted and not options.quiet
@@ -207,7 +206,7 @@ def _written(folder: Path) -> Iterator[None]:
 
 def _refuse_misfit(forecast: Path, plan: Plan) -> None:
     from petrobot.coordinator.cli.forecast import fitting
-    from petrobot.coordinator.forecast.registered import ForecastError, read
+    from petrobot.coordinator.studies.forecast.registered import ForecastError, read
 
     try:
         fitting(forecast, read(forecast), plan)
@@ -217,7 +216,7 @@ def _refuse_misfit(forecast: Path, plan: Plan) -> None:
 
 def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
     from petrobot.coordinator.cli.forecast import compared
-    from petrobot.coordinator.forecast.registered import ForecastError
+    from petrobot.coordinator.studies.forecast.registered import ForecastError
 
     try:
         return compared(forecast, folder)
@@ -227,14 +226,14 @@ def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
 
 def _print_check(check: dict[str, Any] | None) -> None:
     if check is not None:
-        from petrobot.coordinator.forecast.tables import agreement_text
+        from petrobot.coordinator.studies.forecast.tables import agreement_text
 
         print(agreement_text(check))
 
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.check import check
     from petrobot.coordinator.cli.lockstep import substitutes
+    from petrobot.coordinator.task.check import check
 
     directory = load_directory(options.services)
     report = check(task, {action: entry.node for action, entry in directory.actions.items()})
@@ -248,8 +247,8 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.campaign.cluster import ClusterPool
-    from petrobot.coordinator.campaign.pool import LocalPool
+    from petrobot.coordinator.studies.campaign.cluster import ClusterPool
+    from petrobot.coordinator.studies.campaign.pool import LocalPool
 
     if options.cluster:
         async with ClusterPool(campaign.plan, options.cluster) as cluster:
@@ -262,9 +261,9 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
 
 
 def _plan(options: argparse.Namespace, task: Task) -> Plan:
-    from petrobot.coordinator.campaign.plan import Plan, digest
-    from petrobot.coordinator.campaign.policies import learns
-    from petrobot.coordinator.cli.parameters import parameter_of
+    from petrobot.coordinator.cli.options import parameter_of
+    from petrobot.coordinator.studies.campaign.plan import Plan, digest
+    from petrobot.coordinator.studies.campaign.policies import learns
 
     given = dict(_pair("--set", text) for text in options.set)
     regimes = tuple(name for name in options.regime.split(",") if name) or (
@@ -299,7 +298,7 @@ def _block(task: Task, wanted: int | None) -> int:
 
 
 def _selector_options(options: argparse.Namespace) -> dict[str, Any]:
-    from petrobot.coordinator.campaign.policies import learned_choices
+    from petrobot.coordinator.studies.campaign.policies import learned_choices
 
     found: dict[str, Any] = {
         name: value for name in ("target", "rho") if (value := getattr(options, name)) is not None

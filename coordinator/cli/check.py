@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from petrobot.coordinator.analysis.report import Analysis
-    from petrobot.coordinator.check import Report
     from petrobot.coordinator.task import Task
+    from petrobot.coordinator.task.check import Report
 
 EXAMPLE = "petrobot check catch_ball"
 NO_CELL = "no-cell"
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _checked(task: Task, services: Path) -> Report:
     """What is to be said of the task, and of the actions that a location file offers it."""
-    from petrobot.coordinator.check import check
+    from petrobot.coordinator.task.check import check
 
     if services == SHIPPED_CELL and not services.exists():
         said = (
@@ -107,7 +107,7 @@ def _checked(task: Task, services: Path) -> Report:
 
 def _noted(report: Report, said: str) -> Report:
     """The findings with a note about the location file that was not given."""
-    from petrobot.coordinator.check import Finding, Report, Severity
+    from petrobot.coordinator.task.check import Finding, Report, Severity
 
     remedy = "write one of your own, or give --services FILE"
     return Report(
@@ -118,7 +118,7 @@ def _noted(report: Report, said: str) -> Report:
 def _missing(task: Task, services: Path | None) -> list[str]:
     """What the task needs and the nodes do not give now: a line for each node that is away or
     offers less than it should."""
-    from petrobot.coordinator.mission.asking import ask_all
+    from petrobot.coordinator.run.node_status import ask_all
 
     directory = load_directory(services)
     used = {
@@ -146,8 +146,8 @@ def _missing(task: Task, services: Path | None) -> list[str]:
 
 
 def _analysed(task: Task) -> Analysis:
+    from petrobot.coordinator.analysis.net.space import Limits
     from petrobot.coordinator.analysis.report import analyse
-    from petrobot.coordinator.analysis.space import Limits
 
     limits = Limits(states=MOST_STATES, seconds=LONGEST, memory=MOST_MEMORY, clock=time.monotonic)
     return analyse(task, limits=limits)
@@ -180,7 +180,7 @@ def _told(report: Report, name: str) -> list[str]:
 def _lines(report: Report, name: str) -> list[int | None]:
     """The line of each finding's key, or of the macro place in which it is; None for what is not
     about the task file."""
-    from petrobot.coordinator.taskfile.errors import key_lines, line_of
+    from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     lines = key_lines(task_path(name).read_text(encoding="utf-8"))
     return [None if f.code == NO_CELL else line_of(f.key, lines) for f in report.findings]

@@ -28,6 +28,6 @@ def run(options: argparse.Namespace) -> int:
     """Convert."""
     from petrobot.coordinator.analysis.commands import convert_command
     from petrobot.coordinator.cli.analyse import give
-    from petrobot.coordinator.taskfile import load
+    from petrobot.coordinator.task.file import load
 
     return give(convert_command(task_path(options.source), options.target, load), options.json)

@@ -15,7 +15,7 @@ from petrobot.coordinator.cli.loading import add_services_argument, load_directo
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.door_file import Door
-    from petrobot.coordinator.operator.emergency import Stopped
+    from petrobot.coordinator.operator.emergency_stop import Stopped
 
 EXAMPLE = "petrobot estop"
 COORDINATOR_PATIENCE = 1.0
@@ -55,8 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Stop, or clear; 0 when every node with devices has answered, 3 otherwise."""
-    from petrobot.coordinator.operator.emergency import CLEAR, STOP, order_all
-    from petrobot.services.comm.credentials import COORDINATOR, credentials
+    from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
+    from petrobot.services.comm.tls.credentials import COORDINATOR, credentials
 
     door = _door(options)
     path = options.services or (Path(door.services) if door is not None and door.services else None)
@@ -78,7 +78,7 @@ def _door(options: argparse.Namespace) -> Door | None:
     """The run that goes on, if one does: it says which cell is meant, and its coordinator is
     told."""
     from petrobot.coordinator.operator.door_file import find_door
-    from petrobot.coordinator.record.runfolder import NoRunError
+    from petrobot.coordinator.run.folder import NoRunError
 
     try:
         return find_door(options.run, options.journal)
@@ -92,7 +92,7 @@ async def _tell(door: Door, folder: Path) -> str:
     """Let the coordinator abort its run, so that it does not look for a way around; what came of
     it, in words."""
     from petrobot.coordinator.cli.operate.hand import connect
-    from petrobot.coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.operator.client import OperatorError
 
     try:
         async with asyncio.timeout(COORDINATOR_PATIENCE), connect(door, None) as client:
@@ -107,7 +107,7 @@ async def _tell(door: Door, folder: Path) -> str:
 def _goes_on(door: Door, folder: Path) -> bool:
     """Whether the run's door is still there: a run whose devices stop may end by itself."""
     from petrobot.coordinator.operator.door_file import find_door
-    from petrobot.coordinator.record.runfolder import NoRunError
+    from petrobot.coordinator.run.folder import NoRunError
 
     try:
         return find_door(door.run, folder) == door

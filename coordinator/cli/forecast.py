@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import load_directory, load_task, write_json
-from petrobot.services.comm.quantities import whole
-from petrobot.services.comm.whole_file import make_folder, write_whole
+from petrobot.services.host.command_line import whole
+from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.campaign.plan import Plan
-    from petrobot.coordinator.campaign.rows import Row
-    from petrobot.coordinator.forecast.history import Training
     from petrobot.coordinator.learning.learning import Estimates
+    from petrobot.coordinator.studies.campaign.plan import Plan
+    from petrobot.coordinator.studies.campaign.rows import Row
+    from petrobot.coordinator.studies.forecast.history import Training
     from petrobot.coordinator.task import Task
 
 EXAMPLE = (
@@ -93,8 +93,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Forecast, or compare: exit code 1 when the forecast is doubtful or disagrees."""
-    from petrobot.coordinator.campaign.plan import CampaignError
-    from petrobot.coordinator.forecast.registered import ForecastError
+    from petrobot.coordinator.studies.campaign.plan import CampaignError
+    from petrobot.coordinator.studies.forecast.registered import ForecastError
 
     try:
         if options.compare is not None:
@@ -110,8 +110,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _forecast(options: argparse.Namespace) -> int:
-    from petrobot.coordinator.forecast.registered import register, write
-    from petrobot.coordinator.forecast.tables import forecast_text
+    from petrobot.coordinator.studies.forecast.registered import register, write
+    from petrobot.coordinator.studies.forecast.tables import forecast_text
 
     task = load_task(options.task)
     trainings, estimates, about = _trainings(task, options.estimates)
@@ -142,11 +142,14 @@ def _forecast(options: argparse.Namespace) -> int:
 def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
     """Training throws by regime, the estimates, and what the forecast says about where they come
     from."""
-    from petrobot.coordinator.campaign.observed import estimates_of
-    from petrobot.coordinator.campaign.plan import digest, read_manifest
-    from petrobot.coordinator.campaign.table import TABLE, read_table
-    from petrobot.coordinator.forecast.history import by_regime
-    from petrobot.coordinator.forecast.summed import read_estimates, trainings_of
+    from petrobot.coordinator.studies.campaign.observed import estimates_of
+    from petrobot.coordinator.studies.campaign.plan import digest, read_manifest
+    from petrobot.coordinator.studies.campaign.table import TABLE, read_table
+    from petrobot.coordinator.studies.forecast.history import (
+        by_regime,
+        read_estimates,
+        trainings_of,
+    )
 
     if not path.is_dir():
         known = read_estimates(path)
@@ -177,7 +180,7 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
 
 def _refuse_other_task(task: Task, plan: Plan, path: Path) -> None:
     """Raises CommandError when a campaign ran a task of another name, where its file still is."""
-    from petrobot.coordinator.campaign.plan import MANIFEST
+    from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
     if not Path(plan.task).is_file():
         return
@@ -193,7 +196,7 @@ def _refuse_other_task(task: Task, plan: Plan, path: Path) -> None:
 def _refuse_other_runs(task: Task, rows: Iterable[Row], path: Path) -> None:
     """Raises CommandError for runs in places or of actions that the task does not have (any
     more)."""
-    from petrobot.coordinator.campaign.table import TABLE
+    from petrobot.coordinator.studies.campaign.table import TABLE
 
     actions: dict[str, dict[str, None]] = {}
     for row in rows:
@@ -235,9 +238,9 @@ def _refuse_other_names(task: Task, path: Path, found: Mapping[str, Iterable[str
 def _request(
     task: Task, trainings: Mapping[str, Training], regime: str, options: argparse.Namespace
 ) -> Any:
-    from petrobot.coordinator.campaign.policies import learned_choices
-    from petrobot.coordinator.forecast.choices import choices_of
-    from petrobot.coordinator.forecast.predict import Request
+    from petrobot.coordinator.studies.campaign.policies import learned_choices
+    from petrobot.coordinator.studies.forecast.choices import choices_of
+    from petrobot.coordinator.studies.forecast.predict import Request
 
     if regime not in trainings:
         raise CommandError(2, f"--regime {regime}: not measured; there are {', '.join(trainings)}")
@@ -276,7 +279,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int:
-    from petrobot.coordinator.forecast.tables import agreement_markdown, agreement_text
+    from petrobot.coordinator.studies.forecast.tables import agreement_markdown, agreement_text
 
     found = compared(registered, folder)
     if options.markdown is not None:
@@ -312,7 +315,7 @@ def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
 def _planned(plan: Plan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
     """By regime: how a campaign that learns nothing will choose; empty where its file of services
     is not here."""
-    from petrobot.coordinator.campaign.policies import learns, policy_of
+    from petrobot.coordinator.studies.campaign.policies import learns, policy_of
 
     if learns(plan.selector) or not Path(plan.services).is_file():
         return {}
@@ -342,7 +345,7 @@ def _refuse_other_choices(
     counts: Mapping[str, Mapping[str, float]],
 ) -> None:
     """Raises CommandError when a regime's runs choose otherwise than their forecast says."""
-    from petrobot.coordinator.forecast.choices import in_words, misfit, remedy
+    from petrobot.coordinator.studies.forecast.choices import in_words, misfit, remedy
 
     said = forecast["regimes"].get(regime)
     names = [] if said is None else misfit(said, counts)
@@ -360,13 +363,12 @@ def _refuse_other_choices(
 def compared(registered: Path, folder: Path) -> dict[str, Any]:
     """A registered forecast beside what a campaign measured. Raises CommandError when they do not
     belong together."""
-    from petrobot.coordinator.campaign.plan import read_manifest
-    from petrobot.coordinator.campaign.spent import began
-    from petrobot.coordinator.campaign.table import TABLE, read_table
-    from petrobot.coordinator.forecast.agreement import agreement
-    from petrobot.coordinator.forecast.choices import choice_counts
-    from petrobot.coordinator.forecast.history import by_regime
-    from petrobot.coordinator.forecast.registered import read
+    from petrobot.coordinator.studies.campaign.plan import read_manifest
+    from petrobot.coordinator.studies.campaign.table import TABLE, began, read_table
+    from petrobot.coordinator.studies.forecast.agreement import agreement
+    from petrobot.coordinator.studies.forecast.choices import choice_counts
+    from petrobot.coordinator.studies.forecast.history import by_regime
+    from petrobot.coordinator.studies.forecast.registered import read
 
     forecast, plan = read(registered), read_manifest(folder)
     task = fitting(registered, forecast, plan)

@@ -11,7 +11,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory
 
 if TYPE_CHECKING:
-    from petrobot.services.comm.directory import Directory
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot keys --tls"
 
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _shared_key(directory: Directory, file: Path) -> str:
-    from petrobot.services.comm.security import KeyFileError, new_key, write_key
+    from petrobot.services.comm.protocol.security import KeyFileError, new_key, write_key
 
     try:
         write_key(file, new_key())
@@ -87,14 +87,18 @@ def _instead(directory: Directory, kind: str, new: str) -> str:
 
 def _certificates(directory: Directory, folder: Path) -> str:
     try:
-        from petrobot.coordinator.certificates import CA_KEY, CertificateError, make_certificates
+        from petrobot.services.comm.tls.certificates import (
+            CA_KEY,
+            CertificateError,
+            make_certificates,
+        )
     except ImportError as fault:
         text = (
             "making certificates needs the package cryptography: pip install "
             f"'petrobot[tls]' ({fault})"
         )
         raise CommandError(2, text) from fault
-    from petrobot.services.comm.credentials import CA_FILE, COORDINATOR
+    from petrobot.services.comm.tls.credentials import CA_FILE, COORDINATOR
 
     try:
         written = make_certificates(folder, [COORDINATOR, *directory.nodes])

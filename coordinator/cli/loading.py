@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.services.comm.json_text import json_text
-from petrobot.services.comm.whole_file import make_folder, write_whole
+from petrobot.services.host.json_text import json_text
+from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Mapping
 
     from petrobot.coordinator.task import Task
-    from petrobot.services.comm.directory import Directory
+    from petrobot.services.comm.location_file import Directory
 
 SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; they are known by their bare names."""
@@ -56,7 +56,7 @@ def task_path(name: str) -> Path:
 
 def load_task(name: str) -> Task:
     """Read a task file."""
-    from petrobot.coordinator.taskfile import TaskFileError, load
+    from petrobot.coordinator.task.file import TaskFileError, load
 
     path = task_path(name)
     try:
@@ -96,14 +96,14 @@ def cell_path(given: Path | None, name: str, task: Task) -> Path:
 
 def file_line(path: Path, key: str) -> str:
     """FILE:LINE of a key of a TOML file."""
-    from petrobot.coordinator.taskfile.errors import key_lines, line_of
+    from petrobot.coordinator.task.file.errors import key_lines, line_of
 
     return f"{path}:{line_of(key, key_lines(path.read_text(encoding='utf-8')))}"
 
 
 def load_directory(given: Path | None) -> Directory:
     """Read services.toml."""
-    from petrobot.services.comm.directory import DirectoryError, load
+    from petrobot.services.comm.location_file import DirectoryError, load
 
     path = services_path(given)
     try:
@@ -126,7 +126,7 @@ def refuse_misplaced(
     `everywhere`: all nodes are launched here, wherever they belong; `scripted`: actions are
     replaced (`--mock`).
     """
-    from petrobot.services.comm.directory_places import misplaced
+    from petrobot.services.comm.location_file.promises import misplaced
 
     faults = misplaced(directory, everywhere=everywhere, actions=not scripted)
     if faults:

@@ -14,12 +14,12 @@ from petrobot.coordinator.cli.loading import file_line
 if TYPE_CHECKING:
     import argparse
 
-    from petrobot.coordinator.cli.replaying import Recorded
+    from petrobot.coordinator.cli.recorded_runs import Recorded
     from petrobot.coordinator.launch import Setting
-    from petrobot.coordinator.mission.mission import Mission
-    from petrobot.coordinator.mission.partners import Observer, Selector, Store
-    from petrobot.coordinator.record.timeline import Timeline
-    from petrobot.services.comm.directory import Directory
+    from petrobot.coordinator.run.interfaces import Observer, Selector, Store
+    from petrobot.coordinator.run.mission import Mission
+    from petrobot.coordinator.run.timeline import Timeline
+    from petrobot.services.comm.location_file import Directory
 
 LONGEST = 10**9
 """Ticks."""
@@ -51,7 +51,7 @@ def begin(
 
 
 def _new_store(directory: Directory, setting: Setting, options: argparse.Namespace) -> Store | None:
-    from petrobot.coordinator.cli.journaling import journal_folder, new_store
+    from petrobot.coordinator.cli.recorded_runs import journal_folder, new_store
     from petrobot.coordinator.launch import lockstep_id, mission_id
 
     folder = journal_folder(options)
@@ -82,9 +82,9 @@ def retrace(found: Recorded, selector: Selector, watch: Watch | None) -> tuple[M
     """Go on with a run whose cell ended with its coordinator: made again from its seed, compared
     with the journal as far as that goes, and written on from there."""
     from petrobot.coordinator.launch import Setting
-    from petrobot.coordinator.operator.departure import departed
-    from petrobot.coordinator.record.journal import JournalWriter
-    from petrobot.coordinator.record.recording import RetracingStore
+    from petrobot.coordinator.operator.start_from import departed
+    from petrobot.coordinator.run.journal import JournalWriter
+    from petrobot.coordinator.run.recording import RetracingStore
 
     header = found.journal.header
     store = RetracingStore(JournalWriter(found.journal.path), found.journal)
@@ -101,7 +101,7 @@ def rejoin(
 ) -> tuple[Mission, Timeline]:
     """Go on with a run whose nodes wait for their coordinator."""
     from petrobot.coordinator.launch import lockstep_member, resumed_mission
-    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.run.timeline import Timeline
 
     timeline = Timeline()
     seen = [timeline, *observers]
@@ -117,8 +117,8 @@ def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callabl
     """The scripted actions of a file, None without one."""
     if mock is None:
         return None
-    from petrobot.coordinator.conditions.wording import nearest
     from petrobot.coordinator.launch import SCRIPTED, load_object
+    from petrobot.coordinator.task.wording import nearest
 
     try:
         scripted: Mapping[str, Callable[..., Any]] = load_object(SCRIPTED)(mock)
@@ -140,7 +140,7 @@ def substitutes(mock: Path | None, directory: Directory) -> Mapping[str, Callabl
 
 
 def _timed(mission: Mission) -> Timeline:
-    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.run.timeline import Timeline
 
     timeline = Timeline()
     mission.executor.observers.append(timeline)
@@ -151,7 +151,7 @@ async def _launched(
     directory: Directory, mock: Path | None, member: Any, until: Callable[[], bool]
 ) -> None:
     from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.supervisor import Supervisor
+    from petrobot.coordinator.run.supervisor import Supervisor
 
     programs = local_programs(directory, lockstep=True, mock=mock)
     async with Supervisor(programs, Path("runs/logs"), respawn=False):

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.replaying import Recorded, recorded
-from petrobot.services.comm.whole_file import write_whole
+from petrobot.coordinator.cli.recorded_runs import Recorded, recorded
+from petrobot.services.host.whole_file import write_whole
 
 EXAMPLE = "petrobot log last --format xes --out run.xes"
 
@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print or export."""
-    from petrobot.coordinator.record.journal import JournalError
-    from petrobot.coordinator.record.recording import ReplayError
+    from petrobot.coordinator.run.journal import JournalError
+    from petrobot.coordinator.run.recording import ReplayError
 
     found = recorded(options.run)
     try:
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _write_mcap(path: Path, found: Recorded) -> None:
-    from petrobot.coordinator.record.mcap_export import McapMissingError, write_mcap
+    from petrobot.coordinator.run.export import McapMissingError, write_mcap
 
     try:
         count = write_mcap(path, found.journal, found.engine.compiled.net, found.steps())
@@ -69,7 +69,7 @@ def _write_mcap(path: Path, found: Recorded) -> None:
 
 
 def _exported(form: str, found: Recorded) -> Iterator[str]:
-    from petrobot.coordinator.record.export import jsonl, xes
+    from petrobot.coordinator.run.export import jsonl, xes
 
     return (jsonl if form == "jsonl" else xes)(found.journal, found.steps())
 

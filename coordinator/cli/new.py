@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.services.comm.whole_file import make_folder, write_whole
+from petrobot.services.host.whole_file import make_folder, write_whole
 
 EXAMPLE = "petrobot new action close_gripper --folder mylab"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from petrobot.coordinator.cli.becoming import become
+from petrobot.coordinator.cli.exec import become
 from petrobot.coordinator.cli.loading import add_services_argument, services_path
 
 EXAMPLE = "petrobot node vision --services services.toml"

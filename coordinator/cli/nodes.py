@@ -9,11 +9,11 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory, write_json
-from petrobot.services.comm.expiry import SOON
-from petrobot.services.comm.quantities import number
+from petrobot.services.comm.tls.expiry import SOON
+from petrobot.services.host.command_line import number
 
 if TYPE_CHECKING:
-    from petrobot.services.comm.directory import Directory
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot nodes --json -"
 
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Ask; 0 when all are up, that is take calls, 3 otherwise."""
-    from petrobot.coordinator.mission.asking import ask_all
+    from petrobot.coordinator.run.node_status import ask_all
 
     directory = load_directory(options.services)
     answers = asyncio.run(ask_all(directory, options.timeout))
@@ -69,8 +69,8 @@ def _troubles(status: Mapping[str, Any]) -> dict[str, str]:
 def _stopped(directory: Directory, answers: Mapping[str, Any]) -> dict[str, list[str]]:
     """By node the devices that an emergency stop holds: as it says itself, or as this host says of
     one that does not run."""
-    from petrobot.coordinator.operator.emergency import still_stopped
-    from petrobot.services.comm.latch import ALL, latch_of
+    from petrobot.coordinator.operator.emergency_stop import still_stopped
+    from petrobot.services.comm.calls.latch import ALL, latch_of
 
     told = {
         node: list(answer["status"].get("emergency", ()))

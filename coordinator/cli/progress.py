@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.mission.mission import Mission
+    from petrobot.coordinator.run.mission import Mission
 
 COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
 REFRESH = 0.1

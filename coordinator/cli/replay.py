@@ -7,7 +7,7 @@ import argparse
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import write_json
-from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.cli.recorded_runs import recorded
 
 EXAMPLE = "petrobot replay last"
 
@@ -22,8 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Replay; 0 when all is the same, 1 at a difference."""
-    from petrobot.coordinator.record.journal import JournalError
-    from petrobot.coordinator.record.recording import ReplayError
+    from petrobot.coordinator.run.journal import JournalError
+    from petrobot.coordinator.run.recording import ReplayError
 
     found = recorded(options.run)
     count, firings = 0, 0

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import load_task, pictures_of, write_json
-from petrobot.services.comm.whole_file import make_folder, write_whole
+from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from petrobot.coordinator.campaign.plan import Plan
-    from petrobot.coordinator.campaign.rows import Row
-    from petrobot.coordinator.cli.replaying import Recorded
-    from petrobot.coordinator.record.recording import Step
-    from petrobot.coordinator.report.observed_run import ObservedRun
+    from petrobot.coordinator.cli.recorded_runs import Recorded
+    from petrobot.coordinator.run.recording import Step
+    from petrobot.coordinator.studies.campaign.plan import Plan
+    from petrobot.coordinator.studies.campaign.rows import Row
+    from petrobot.coordinator.studies.report.run_page import ObservedRun
     from petrobot.coordinator.task import Task
 
 EXAMPLE = (
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write page and pictures."""
-    from petrobot.coordinator.campaign.plan import MANIFEST, CampaignError
+    from petrobot.coordinator.studies.campaign.plan import MANIFEST, CampaignError
 
     folder = Path(options.subject)
     try:
@@ -81,8 +81,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -> None:
-    from petrobot.coordinator.report.colours import standalone
-    from petrobot.coordinator.report.raster import unavailable
+    from petrobot.coordinator.studies.report.page import standalone
+    from petrobot.coordinator.studies.report.raster import unavailable
 
     beside = page.with_name(f"{page.stem}_pictures")
     missing = unavailable()
@@ -104,7 +104,7 @@ def _write(page: Path, html: str, pictures: Mapping[str, str], *, quiet: bool) -
 
 def _draw(path: Path, svg: str, *, raster: bool) -> None:
     """A picture's files. A task's own picture that only browsers understand stays an SVG."""
-    from petrobot.coordinator.report.raster import RasterError, png
+    from petrobot.coordinator.studies.report.raster import RasterError, png
 
     write_whole(path.with_name(f"{path.name}.svg"), svg)
     if raster:
@@ -118,7 +118,7 @@ def _draw(path: Path, svg: str, *, raster: bool) -> None:
 
 
 def _campaign(folder: Path, options: argparse.Namespace) -> tuple[str, dict[str, str], Path]:
-    from petrobot.coordinator.report.campaign_page import (
+    from petrobot.coordinator.studies.report.campaign_page import (
         CampaignReport,
         comparison_pictures,
         comparison_section,
@@ -149,8 +149,8 @@ def _names(one: Path, other: Path) -> tuple[str, str]:
 
 def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
     """Plan, task and rows of a campaign. Raises CampaignError, and CommandError without rows."""
-    from petrobot.coordinator.campaign.plan import read_manifest
-    from petrobot.coordinator.campaign.table import TABLE, read_table
+    from petrobot.coordinator.studies.campaign.plan import read_manifest
+    from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 
     plan = read_manifest(folder)
     rows = list(read_table(folder / TABLE))
@@ -162,7 +162,7 @@ def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
 def compared(one: Path, other: Path, rho_of: Path | None = None) -> dict[str, Any]:
     """The numbers of a comparison of two campaigns' folders; rho is that of a third one's actions,
     if given."""
-    from petrobot.coordinator.report.comparing import Weighting, compare
+    from petrobot.coordinator.studies.report.comparing import Weighting, compare
 
     _, task, rows = opened(one)
     _, _, others = opened(other)
@@ -185,11 +185,11 @@ def _plots(folder: Path) -> dict[str, Any]:
 
 
 def _run(name: str) -> tuple[str, dict[str, str], Path]:
-    from petrobot.coordinator.cli.replaying import recorded
+    from petrobot.coordinator.cli.recorded_runs import recorded
     from petrobot.coordinator.drawing import draw
-    from petrobot.coordinator.record.runfolder import RESULT
-    from petrobot.coordinator.record.timeline import Timeline
-    from petrobot.coordinator.report.run_page import gantt_svg, own_pictures, report_html
+    from petrobot.coordinator.run.folder import RESULT
+    from petrobot.coordinator.run.timeline import Timeline
+    from petrobot.coordinator.studies.report.run_page import gantt_svg, own_pictures, report_html
 
     found = recorded(name)
     timeline, observed = Timeline(), _observer(found)
@@ -228,9 +228,9 @@ def _run(name: str) -> tuple[str, dict[str, str], Path]:
 def _observer(found: Recorded) -> ObservedRun:
     """What sees the run's actions; with the selector that learned in it, as far as its estimates
     file is still there."""
-    from petrobot.coordinator.experience.estimates_file import EstimatesError
-    from petrobot.coordinator.experience.learning_session import session_of
-    from petrobot.coordinator.report.observed_run import ObservedRun
+    from petrobot.coordinator.learning.estimates_file import EstimatesError
+    from petrobot.coordinator.learning.session import session_of
+    from petrobot.coordinator.studies.report.run_page import ObservedRun
 
     try:
         session = session_of(found.task, found.journal.header)
@@ -241,8 +241,8 @@ def _observer(found: Recorded) -> ObservedRun:
 
 
 def _steps(found: Recorded) -> Iterator[Step]:
-    from petrobot.coordinator.record.journal import JournalError
-    from petrobot.coordinator.record.recording import ReplayError
+    from petrobot.coordinator.run.journal import JournalError
+    from petrobot.coordinator.run.recording import ReplayError
 
     try:
         yield from found.steps()

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import write_json
-from petrobot.coordinator.cli.replaying import Recorded, recorded
+from petrobot.coordinator.cli.recorded_runs import Recorded, recorded
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.mission.mission import Mission
-    from petrobot.coordinator.mission.partners import Observer
-    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.run.interfaces import Observer
+    from petrobot.coordinator.run.mission import Mission
+    from petrobot.coordinator.run.timeline import Timeline
 
 EXAMPLE = "petrobot resume last --json out.json"
 
@@ -41,12 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Resume."""
-    from petrobot.coordinator.cli.giving import give
-    from petrobot.coordinator.mission.mission import MissionError
-    from petrobot.coordinator.record.journal import JournalError
-    from petrobot.coordinator.record.recording import ReplayError
-    from petrobot.coordinator.record.runfolder import RESULT
-    from petrobot.services.comm.cell import CellError
+    from petrobot.coordinator.cli.output import give
+    from petrobot.coordinator.run.folder import RESULT
+    from petrobot.coordinator.run.journal import JournalError
+    from petrobot.coordinator.run.mission import MissionError
+    from petrobot.coordinator.run.recording import ReplayError
+    from petrobot.services.comm.lockstep.cell import CellError
 
     found = recorded(options.run)
     folder, mode = found.journal.path.parent, found.journal.header["mode"]
@@ -97,9 +97,9 @@ def _resume_lockstep(
 ) -> tuple[Mission, Timeline, dict[str, Any]]:
     """Nodes that wait for their coordinator are joined; a cell that ended with it is made again
     from its seed."""
-    from petrobot.coordinator.cli.giving import progress
-    from petrobot.coordinator.cli.learning import resumed_selector, saved
+    from petrobot.coordinator.cli.learning_options import resumed_selector, saved
     from petrobot.coordinator.cli.lockstep import JOINED, rejoin, retrace
+    from petrobot.coordinator.cli.output import progress
 
     selector, session = resumed_selector(found.task, found.journal.header)
     with saved(session) as learned, progress(options) as watch:
@@ -115,10 +115,10 @@ def _resume_lockstep(
 async def _resume(
     found: Recorded, options: argparse.Namespace
 ) -> tuple[Mission, Timeline, dict[str, Any]]:
-    from petrobot.coordinator.cli.learning import resumed_selector, saved
+    from petrobot.coordinator.cli.learning_options import resumed_selector, saved
     from petrobot.coordinator.cli.run import drive
     from petrobot.coordinator.launch import resumed_mission
-    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.run.timeline import Timeline
 
     timeline = Timeline()
     now = asyncio.get_running_loop().time()

@@ -14,15 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.departing import add_departing_arguments, depart
-from petrobot.coordinator.cli.giving import give, progress
-from petrobot.coordinator.cli.journaling import (
-    add_journal_arguments,
-    journal_folder,
-    new_store,
-    tidy,
-)
-from petrobot.coordinator.cli.learning import add_learning_arguments, opened, saved
+from petrobot.coordinator.cli.learning_options import add_learning_arguments, opened, saved
 from petrobot.coordinator.cli.loading import (
     add_services_argument,
     cell_path,
@@ -31,17 +23,24 @@ from petrobot.coordinator.cli.loading import (
     refuse_misplaced,
 )
 from petrobot.coordinator.cli.lockstep import substitutes
-from petrobot.coordinator.cli.page_port import add_page_port_argument, named_port
-from petrobot.coordinator.cli.parameters import pairs, parameter_of
-from petrobot.services.comm.quantities import whole
+from petrobot.coordinator.cli.options import add_page_port_argument, named_port, pairs, parameter_of
+from petrobot.coordinator.cli.output import give, progress
+from petrobot.coordinator.cli.recorded_runs import (
+    add_journal_arguments,
+    journal_folder,
+    new_store,
+    tidy,
+)
+from petrobot.coordinator.cli.start_from import add_departing_arguments, depart
+from petrobot.services.host.command_line import whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.launch import Setting
-    from petrobot.coordinator.mission.mission import Mission
-    from petrobot.coordinator.mission.realtime import RealtimeMission
-    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.run.mission import Mission
+    from petrobot.coordinator.run.realtime import RealtimeMission
+    from petrobot.coordinator.run.timeline import Timeline
     from petrobot.coordinator.task import Task
-    from petrobot.services.comm.directory import Directory
+    from petrobot.services.comm.location_file import Directory
 
 MODES = ("realtime", "lockstep")
 SEED = 1
@@ -132,9 +131,9 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
     from petrobot.coordinator.launch import mission_id
-    from petrobot.coordinator.mission.mission import MissionError
-    from petrobot.coordinator.record.journal import JournalError
-    from petrobot.services.comm.directory import DirectoryError
+    from petrobot.coordinator.run.journal import JournalError
+    from petrobot.coordinator.run.mission import MissionError
+    from petrobot.services.comm.location_file import DirectoryError
 
     if options.departs is not None:
         return depart(options)
@@ -186,7 +185,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _refuse_unfit(task: Task, directory: Directory) -> None:
-    from petrobot.coordinator.check import check
+    from petrobot.coordinator.task.check import check
 
     offers = {action: entry.node for action, entry in directory.actions.items()}
     report = check(task, offers, source=str(directory.source))
@@ -199,8 +198,8 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
 def _warn(task: Task, options: argparse.Namespace) -> None:
     """Say what a short look at the state space finds against running it: whoever runs it all the
     same may want to see that."""
+    from petrobot.coordinator.analysis.net.space import Limits
     from petrobot.coordinator.analysis.report import analyse
-    from petrobot.coordinator.analysis.space import Limits
 
     if options.quiet:
         return
@@ -215,7 +214,7 @@ def _warn(task: Task, options: argparse.Namespace) -> None:
 
 def _refuse_stopped(directory: Directory) -> None:
     """A run whose devices obey nobody would end at once, having done nothing."""
-    from petrobot.coordinator.operator.emergency import still_stopped
+    from petrobot.coordinator.operator.emergency_stop import still_stopped
 
     stopped = still_stopped(directory)
     if stopped:
@@ -228,7 +227,7 @@ def _refuse_stopped(directory: Directory) -> None:
 
 def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:
     from petrobot.coordinator.launch import Setting
-    from petrobot.coordinator.mission.partners import FirstAlternative
+    from petrobot.coordinator.run.interfaces import FirstAlternative
 
     given = dict(pairs("--set", options.set))
     if options.regime is not None:
@@ -260,7 +259,7 @@ def _run_lockstep(
     directory: Directory, setting: Setting, options: argparse.Namespace
 ) -> tuple[Mission, Timeline]:
     from petrobot.coordinator.cli.lockstep import begin
-    from petrobot.services.comm.cell import CellError
+    from petrobot.services.comm.lockstep.cell import CellError
 
     with progress(options) as watch:
         try:
@@ -276,7 +275,7 @@ async def _run_realtime(
     directory: Directory, setting: Setting, options: argparse.Namespace
 ) -> tuple[Mission, Timeline]:
     from petrobot.coordinator.launch import realtime_mission
-    from petrobot.coordinator.record.timeline import Timeline
+    from petrobot.coordinator.run.timeline import Timeline
 
     timeline = Timeline()
     identity: str = options.identity
@@ -300,13 +299,9 @@ async def drive(
     begin: Callable[[float], None] | None = None,
 ) -> None:
     """Run a mission in real time over its nodes, launching those of this host first if asked to."""
-    from petrobot.coordinator.mission.realtime import (
-        RealtimeMission,
-        UnreachableError,
-        credentials_of,
-    )
-    from petrobot.coordinator.supervisor import LaunchError
-    from petrobot.services.comm.security import KeyFileError
+    from petrobot.coordinator.run.realtime import RealtimeMission, UnreachableError, credentials_of
+    from petrobot.coordinator.run.supervisor import LaunchError
+    from petrobot.services.comm.protocol.security import KeyFileError
 
     try:
         async with _nodes(directory, options):
@@ -329,12 +324,12 @@ async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIte
     """The operator's page, or with --no-page his protocol alone, while the mission run goes on."""
     from petrobot.coordinator.cli.loading import SHIPPED
     from petrobot.coordinator.cli.serve import OWN_TASKS
-    from petrobot.coordinator.hmi.journals import JournalHistory
-    from petrobot.coordinator.hmi.server import start_page
-    from petrobot.coordinator.mission.partners import FirstAlternative
+    from petrobot.coordinator.operator.commands import Operation
     from petrobot.coordinator.operator.door_file import Door, door_open
-    from petrobot.coordinator.operator.operation import Operation
+    from petrobot.coordinator.operator.history import JournalHistory
     from petrobot.coordinator.operator.station import offered
+    from petrobot.coordinator.page.server import start_page
+    from petrobot.coordinator.run.interfaces import FirstAlternative
 
     selector = shell.mission.executor.selector
     assert isinstance(selector, FirstAlternative)
@@ -375,7 +370,7 @@ def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncCo
     if not getattr(options, "up", False):
         return nullcontext()
     from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.supervisor import Supervisor
+    from petrobot.coordinator.run.supervisor import Supervisor
 
     return Supervisor(local_programs(directory, mock=options.mock), Path("runs/logs"), notice=print)
 

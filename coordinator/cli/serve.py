@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
 from petrobot.coordinator.cli.lockstep import substitutes
-from petrobot.coordinator.cli.page_port import add_page_port_argument, named_port
+from petrobot.coordinator.cli.options import add_page_port_argument, named_port
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.server import Page
     from petrobot.coordinator.operator.station import Station
-    from petrobot.services.comm.directory import Directory
+    from petrobot.coordinator.page.server import Page
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot serve --up"
 OWN_TASKS = Path("tasks")
@@ -70,11 +70,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 async def _serve(directory: Directory, options: argparse.Namespace) -> int:
-    from petrobot.coordinator.hmi.store import TaskStore
-    from petrobot.coordinator.mission.realtime import credentials_of
     from petrobot.coordinator.operator.station import Station
-    from petrobot.coordinator.record.runfolder import DEFAULT
-    from petrobot.coordinator.supervisor import LaunchError
+    from petrobot.coordinator.page.task_store import TaskStore
+    from petrobot.coordinator.run.folder import DEFAULT
+    from petrobot.coordinator.run.realtime import credentials_of
+    from petrobot.coordinator.run.supervisor import LaunchError
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -100,8 +100,8 @@ async def _page(
     station: Station, runs: Path, options: argparse.Namespace, stop: asyncio.Event
 ) -> None:
     """The page, until told to stop; a run that goes on then is aborted before the page goes."""
-    from petrobot.coordinator.hmi.journals import JournalHistory
-    from petrobot.coordinator.hmi.server import start_page
+    from petrobot.coordinator.operator.history import JournalHistory
+    from petrobot.coordinator.page.server import start_page
 
     with named_port(options.page_port):
         page = await start_page(
@@ -136,6 +136,6 @@ def _nodes(
     if not options.up:
         return nullcontext()
     from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.supervisor import Supervisor
+    from petrobot.coordinator.run.supervisor import Supervisor
 
     return Supervisor(local_programs(directory, mock=options.mock), runs / "logs", notice=print)

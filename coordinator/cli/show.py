@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import load_task, task_path
-from petrobot.services.comm.whole_file import write_whole
+from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.drawing import Overlay
@@ -88,7 +88,7 @@ def _heat(task: Task) -> Overlay:
 
 def _graph(name: str) -> str:
     from petrobot.coordinator.analysis.commands import graph_command
-    from petrobot.coordinator.taskfile import load
+    from petrobot.coordinator.task.file import load
 
     outcome = graph_command(task_path(name), load)
     if outcome.code:

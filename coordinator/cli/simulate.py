@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from petrobot.coordinator.cli.loading import task_path
-from petrobot.services.comm.quantities import number, whole
+from petrobot.services.host.command_line import number, whole
 
 EXAMPLE = "petrobot simulate catch_ball --replicas 2000 --seed 1"
 
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
 
     from petrobot.coordinator.analysis.commands import simulate_command
     from petrobot.coordinator.cli.analyse import give
-    from petrobot.coordinator.taskfile import load
+    from petrobot.coordinator.task.file import load
 
     random = np.random.default_rng(options.seed)
     given = {"rates": options.rates, "replicas": options.replicas, "horizon": options.horizon}

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
 from petrobot.coordinator.cli.lockstep import substitutes
-from petrobot.services.comm.quantities import number
+from petrobot.services.host.command_line import number
 
 if TYPE_CHECKING:
-    from petrobot.services.comm.directory import Directory
+    from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot up --services services.toml"
 
@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> int:
 
 async def _up(directory: Directory, options: argparse.Namespace) -> int:
     from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.supervisor import LaunchError, Supervisor
+    from petrobot.coordinator.run.supervisor import LaunchError, Supervisor
 
     programs = local_programs(
         directory, lockstep=options.lockstep, mock=options.mock, awaited=options.await_coordinator

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.services.comm.whole_file import make_folder, write_whole
+from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
+    from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
     from petrobot.coordinator.analysis.report import Analysis
-    from petrobot.coordinator.analysis.verdict import Verdict, Witness
-    from petrobot.coordinator.net import Net
     from petrobot.coordinator.task import Task
+    from petrobot.coordinator.task.net import Net
 
 TOLD = 150
 """Letters of a reason below a picture."""
@@ -60,7 +60,7 @@ def picture(model: Task | Net, name: str, reason: str, witness: Witness) -> str:
     """The net after the witness's firings, with the turns at which each transition fired (a loop
     goes on after them)."""
     from petrobot.coordinator.drawing import Overlay, draw
-    from petrobot.coordinator.net import Net
+    from petrobot.coordinator.task.net import Net
 
     net = model if isinstance(model, Net) else model.net
     marking = tuple(witness.marking.get(place, 0) for place in net.places)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from petrobot.coordinator.drawing.scene import Overlay, scene_of_net, scene_of_task
 from petrobot.coordinator.drawing.svg import render
-from petrobot.coordinator.net import Marking, Net
 from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.net import Marking, Net
 
 __all__ = ["Overlay", "draw"]
 

@@ -1,7 +1,6 @@
 """The interpreted net as a pure machine: stimulus in, instructions out. Its semantics stand in
 docs/semantics.md."""
 
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine.instructions import (
     ORDERS,
     ArmTimer,
@@ -25,7 +24,7 @@ from petrobot.coordinator.engine.instructions import (
     Subject,
 )
 from petrobot.coordinator.engine.machine import Engine
-from petrobot.coordinator.engine.plain import (
+from petrobot.coordinator.engine.serialization import (
     instruction_from_plain,
     point_from_plain,
     state_from_plain,
@@ -63,6 +62,7 @@ from petrobot.coordinator.engine.stimuli import (
     VariableChanged,
     Verdict,
 )
+from petrobot.coordinator.task.wording import Severity
 
 __all__ = [
     "OPERATOR",

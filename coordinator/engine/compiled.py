@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from petrobot.coordinator.conditions import Expression
-from petrobot.coordinator.net import Arcs, Net
 from petrobot.coordinator.task import (
     Counts,
     Early,
@@ -21,8 +19,10 @@ from petrobot.coordinator.task import (
     Task,
     Transition,
 )
-from petrobot.coordinator.task.consistency import faults, is_pulse
-from petrobot.coordinator.task.timeless import endless
+from petrobot.coordinator.task.conditions import Expression
+from petrobot.coordinator.task.instant_firings import endless
+from petrobot.coordinator.task.net import Arcs, Net
+from petrobot.coordinator.task.validation import faults, is_pulse
 
 FIRINGS_OF_A_FINITE_NET: Final = 1_000_000
 """Firings without a stimulus of a net that must come to an end by itself: no laboratory has so many

@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine.compiled import Exit
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Claims, Match, eligible_runs, match
 from petrobot.coordinator.task import End
+from petrobot.coordinator.task.wording import Severity
 
 
 @dataclass(frozen=True, slots=True)

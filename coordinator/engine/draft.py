@@ -3,12 +3,12 @@ be looked at again."""
 
 from __future__ import annotations
 
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine.compiled import Compiled
 from petrobot.coordinator.engine.instructions import Instruction, Report
 from petrobot.coordinator.engine.state import LIVE, Mode, Phase, Run, State
-from petrobot.coordinator.net import Marking
 from petrobot.coordinator.task import Value
+from petrobot.coordinator.task.net import Marking
+from petrobot.coordinator.task.wording import Severity
 
 
 class Draft:

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from itertools import product
 from typing import NamedTuple
 
-from petrobot.coordinator.conditions import ConditionFault
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine.compiled import ActionArc, Exit
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
 from petrobot.coordinator.engine.state import ACTIVE, LIVE, Phase, Run
 from petrobot.coordinator.task import Counts, End, Status, Value
+from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.wording import Severity
 
 
 class Match(NamedTuple):

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from petrobot.coordinator.conditions.wording import Severity as Severity
-from petrobot.coordinator.net import Marking
 from petrobot.coordinator.task import Counts, Executed, Status, Value
+from petrobot.coordinator.task.net import Marking
+from petrobot.coordinator.task.wording import Severity as Severity
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine import operator, runs
 from petrobot.coordinator.engine.compiled import compile_task
-from petrobot.coordinator.engine.departing import set_out
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import awaited
 from petrobot.coordinator.engine.instructions import (
@@ -18,6 +16,7 @@ from petrobot.coordinator.engine.instructions import (
     HoldRun,
     HoldTimer,
     Instruction,
+    Marked,
     StartRun,
     Subject,
 )
@@ -33,6 +32,7 @@ from petrobot.coordinator.engine.stimuli import (
     Hold,
     Override,
     Pause,
+    Point,
     RaiseEvent,
     RemoveTokens,
     Resume,
@@ -41,6 +41,7 @@ from petrobot.coordinator.engine.stimuli import (
     RunRaised,
     RunStarted,
     SetBreakpoints,
+    Standing,
     Step,
     Stimulus,
     StopConfirmed,
@@ -51,6 +52,63 @@ from petrobot.coordinator.engine.stimuli import (
 )
 from petrobot.coordinator.engine.timers import elapse, hold_timers_of
 from petrobot.coordinator.task import Counts, Memory, Scope, Task, VariableType
+from petrobot.coordinator.task.wording import Severity
+
+# Where a mission run sets out that does not begin at the initial marking: tokens, runs that are over, variables, latches.
+
+
+def set_out(draft: Draft, point: Point) -> None:
+    """Stand at the point: its tokens, its ended runs, its variables and latched events. What the
+    task does not know is reported.
+
+    Action places hold as many tokens as runs stand there, whatever the marking says, so that both
+    always agree.
+    """
+    net, before = draft.compiled.net, draft.snapshot()
+    known = {place: n for place, n in point.marking.items() if place in net.place_index and n >= 0}
+    actions = draft.compiled.action_places
+    draft.marking[:] = [0 if place in actions else known.get(place, 0) for place in net.places]
+    for place in sorted(set(point.marking) - set(known)):
+        draft.report(
+            Severity.WARNING,
+            "bad_point",
+            f"{place!r} is no place that can hold its tokens; left out",
+            place,
+        )
+    for standing in point.standing:
+        _stand(draft, standing)
+    draft.emit(Marked("", before, draft.snapshot()))
+    for name, value in point.variables.items():
+        draft.write(name, value)
+    draft.flags.update(name for name in point.flags if _is_latched(draft, name))
+
+
+def _stand(draft: Draft, standing: Standing) -> None:
+    index = draft.compiled.action_places.get(standing.place)
+    if index is None:
+        text = f"{standing.place!r} is no action place; no run stands there"
+        draft.report(Severity.WARNING, "bad_point", text, standing.place)
+        return
+    draft.marking[index] += 1
+    draft.enter(standing.place, index)
+    if standing.status is None:
+        return
+    draft.end_order += 1
+    run = draft.tokens[standing.place][-1]
+    device = draft.compiled.devices.get(standing.action, "")
+    over = {
+        "status": standing.status,
+        "cause": standing.cause,
+        "action": standing.action,
+        "device": device,
+    }
+    draft.put(run, phase=Phase.DONE, ended=draft.end_order, **over)
+
+
+def _is_latched(draft: Draft, name: str) -> bool:
+    event = draft.compiled.task.events.get(name)
+    return event is not None and event.scope is Scope.EXTERNAL and event.memory is not Memory.PULSE
+
 
 _AFTER_THE_END = (RunEnded, StopConfirmed, StopFailed, Verdict)
 _ALWAYS_HEARD = (Abort, Verdict, SetBreakpoints, Override)

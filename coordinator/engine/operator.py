@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from petrobot.coordinator.conditions.wording import Severity, nearest
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Match, arcs_satisfied, fire
 from petrobot.coordinator.engine.instructions import Marked
@@ -19,6 +18,7 @@ from petrobot.coordinator.engine.stimuli import (
     SetBreakpoints,
 )
 from petrobot.coordinator.task import Counts, End, Kind
+from petrobot.coordinator.task.wording import Severity, nearest
 
 
 def add_tokens(draft: Draft, policy: Policy, command: AddTokens) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import verdict_variables
 from petrobot.coordinator.engine.instructions import (
@@ -17,6 +16,7 @@ from petrobot.coordinator.engine.instructions import (
 from petrobot.coordinator.engine.state import ACTIVE, UNSTARTED, Deferred, Early, Phase, Run
 from petrobot.coordinator.engine.stimuli import RunEnded, StopConfirmed, StopFailed, Verdict
 from petrobot.coordinator.task import Counts, Executed, Reference, Start, Status, Value
+from petrobot.coordinator.task.wording import Severity
 
 
 def admit(draft: Draft) -> bool:

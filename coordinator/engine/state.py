@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from petrobot.coordinator.engine.stimuli import Stimulus
-from petrobot.coordinator.net import Marking
 from petrobot.coordinator.task import Counts, Status, Value
+from petrobot.coordinator.task.net import Marking
 
 
 class Mode(StrEnum):

@@ -7,8 +7,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from petrobot.coordinator.conditions import ConditionFault
-from petrobot.coordinator.conditions.wording import Severity
 from petrobot.coordinator.engine.conflicts import Draw, choose_step
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import (
@@ -37,6 +35,8 @@ from petrobot.coordinator.engine.timers import (
     release_timers,
 )
 from petrobot.coordinator.task import Counts, End, Status
+from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.wording import Severity
 
 MOVING = frozenset({Mode.RUNNING, Mode.STEPPING})
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from petrobot.coordinator.learning.estimate import Key, Tally, merge
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
-from petrobot.coordinator.learning.passage import Flow, PassageKey
-from petrobot.coordinator.learning.passage import merge as merge_flows
 from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
 from petrobot.coordinator.learning.selectors import DEFAULT, RuleSelector, make
+from petrobot.coordinator.learning.waits import Flow, PassageKey
+from petrobot.coordinator.learning.waits import merge as merge_flows
 from petrobot.coordinator.task import Task
 
 NOTHING = Tally()

@@ -11,17 +11,37 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.special import ndtri
 
-from petrobot.coordinator.learning.automata import DiscretisedPursuit, NikolicFu, RewardInaction
-from petrobot.coordinator.learning.bandits import UCB1, Thompson
+from petrobot.coordinator.learning.automata import (
+    DiscretisedPursuit,
+    NikolicFu,
+    RewardInaction,
+    Tracking,
+)
 from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Trial
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.rule import Rule
-from petrobot.coordinator.learning.target import eligible
-from petrobot.coordinator.learning.tracking import Tracking
-from petrobot.coordinator.learning.unlearned import Fixed, RoundRobin
+from petrobot.coordinator.learning.rules import UCB1, Fixed, RoundRobin, Rule, Thompson
 from petrobot.coordinator.task import Executed, Status
+
+# Which actions meet a target reliability, for many learners at once: the lower confidence bound decides, with hysteresis.
+
+
+def eligible(batch: Batch, target: float, before: Mask, level: float = 0.95) -> Mask:
+    """Actions that meet the target now, shape (rows, n), given those that did `before`.
+
+    An action comes in when Wilson's lower bound of its R reaches the target and goes out when R
+    itself falls below.
+    """
+    z = float(ndtri(0.5 * (1 + level)))
+    n = np.maximum(batch.runs, 1e-9)
+    share = batch.successes / n
+    half = z * np.sqrt(np.maximum(share * (1 - share), 0.0) / n + z * z / (4 * n * n))
+    lower = (share + z * z / (2 * n) - half) / (1 + z * z / n)
+    out: Mask = (batch.runs > 0) & np.where(before, share >= target, lower >= target)
+    return out
+
 
 RULES: Mapping[str, Callable[[], Rule]] = {
     "nikolic_fu": NikolicFu,

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from petrobot.coordinator.hmi.feed import Feed
+from petrobot.coordinator.operator.feed import Feed
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 """What everybody may say, whoever holds the controls."""

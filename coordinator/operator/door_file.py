@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from petrobot.coordinator.record.runfolder import DEFAULT, NoRunError, journal_of
-from petrobot.services.comm.json_text import json_text
-from petrobot.services.comm.whole_file import make_folder, write_whole
+from petrobot.coordinator.run.folder import DEFAULT, NoRunError, journal_of
+from petrobot.services.host.json_text import json_text
+from petrobot.services.host.whole_file import make_folder, write_whole
 
 DOOR = "operator.json"
 

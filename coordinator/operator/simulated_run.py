@@ -13,16 +13,16 @@ import shutil
 import time
 
 from petrobot.coordinator.engine import Mode
-from petrobot.coordinator.experience.learning_session import LearningSession
-from petrobot.coordinator.hmi.feed import Feed
 from petrobot.coordinator.launch import Setting, Substitutes, lockstep_cell
-from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
-from petrobot.coordinator.mission.partners import FirstAlternative
-from petrobot.coordinator.operator.departure import Departure
-from petrobot.coordinator.operator.led_run import LedRun
-from petrobot.coordinator.record.recording import JournalStore
-from petrobot.services.comm.cell import Cell
-from petrobot.services.comm.directory import Directory
+from petrobot.coordinator.learning.session import LearningSession
+from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.live_run import LedRun
+from petrobot.coordinator.operator.start_from import Departure
+from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.run.lockstep import CoordinatorParty
+from petrobot.coordinator.run.recording import JournalStore
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.lockstep.cell import Cell
 
 SLICE = 0.008
 """Seconds of wall time that ticks may take before others have their turn."""

@@ -19,16 +19,16 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import Item
 
-from petrobot.coordinator.analysing import RefusedError
-from petrobot.coordinator.experience.learner import usual_contexts
-from petrobot.coordinator.experience.learning_session import LearningSession, LearningSetting
-from petrobot.coordinator.hmi.store import StoreError, TaskStore
+from petrobot.coordinator.background import RefusedError
+from petrobot.coordinator.learning.learner import usual_contexts
 from petrobot.coordinator.learning.selectors import DEFAULT, RULES
-from petrobot.coordinator.operator.departure import AGAIN
+from petrobot.coordinator.learning.session import LearningSession, LearningSetting
+from petrobot.coordinator.operator.start_from import AGAIN
+from petrobot.coordinator.page.task_store import StoreError, TaskStore
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.taskfile import loads
-from petrobot.services.comm.directory import Directory
-from petrobot.services.comm.whole_file import make_folder
+from petrobot.coordinator.task.file import loads
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.host.whole_file import make_folder
 
 REALTIME, LOCKSTEP = "realtime", "lockstep"
 MODES: Final = (REALTIME, LOCKSTEP)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from petrobot.coordinator.conditions import Expression
+from petrobot.coordinator.task.conditions import Expression
 
 Value = Any
 """Plain data: None, bool, int, float, str, or lists and string-keyed mappings of them."""

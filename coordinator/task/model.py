@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-from petrobot.coordinator.conditions import Expression
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.task.conditions import Expression
 from petrobot.coordinator.task.elements import (
     End,
     Event,
@@ -26,7 +25,8 @@ from petrobot.coordinator.task.elements import (
     Value,
     Variable,
 )
-from petrobot.coordinator.task.subnets import unfolded
+from petrobot.coordinator.task.macros import unfolded
+from petrobot.coordinator.task.net import Net
 
 
 @dataclass(frozen=True)

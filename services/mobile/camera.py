@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 
 from petrobot.services.action import Context
-from petrobot.services.comm.image import Image
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import Ports
 from petrobot.services.mobile.model import NOMINAL, nominal_rover, read_rover
 from petrobot.services.mobile.watching import FloorWatch

@@ -10,10 +10,21 @@ from __future__ import annotations
 
 from typing import Final
 
-from petrobot.services.comm import canopen
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import Mapped, SdoClient, Transfer, Type
-from petrobot.services.comm.canopen_master import (
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import Mapped, SdoClient, Transfer, Type
+from petrobot.services.comm.canopen.cia402 import (
+    SENT,
+    VELOCITY_RECEIVED,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    from_units,
+    state_of,
+    to_units,
+)
+from petrobot.services.comm.canopen.master import (
     CanopenMaster,
     Companion,
     Manner,
@@ -24,17 +35,6 @@ from petrobot.services.comm.canopen_master import (
     pdo_transfers,
     unfit,
     usual_transfers,
-)
-from petrobot.services.comm.cia402 import (
-    SENT,
-    VELOCITY_RECEIVED,
-    Mode,
-    Object,
-    State,
-    StatusBit,
-    from_units,
-    state_of,
-    to_units,
 )
 from petrobot.services.mobile.reflectors import ECHOES
 

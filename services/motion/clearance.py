@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from petrobot.services.comm.compiled import kernel
+from petrobot.services.host.numba_kernels import kernel
 from petrobot.services.motion.trajectory import Six, braked_for, braking_times, rest_of, toward
 
 Point = tuple[float, float, float]

@@ -6,11 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from petrobot.services.comm import canopen
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import SdoClient, Transfer, Type
-from petrobot.services.comm.canopen_master import Power, pdo_transfers, unfit, usual_transfers
-from petrobot.services.comm.cia402 import (
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import SdoClient, Transfer, Type
+from petrobot.services.comm.canopen.cia402 import (
     ENABLING,
     RECEIVED,
     SENT,
@@ -22,6 +21,7 @@ from petrobot.services.comm.cia402 import (
     state_of,
     to_units,
 )
+from petrobot.services.comm.canopen.master import Power, pdo_transfers, unfit, usual_transfers
 
 HEARTBEAT_PATIENCE: Final = 0.2
 """s of silence after which a node counts as lost (both ways)."""

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import Mapped, Type
-from petrobot.services.comm.canopen_master import (
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import Mapped, Type
+from petrobot.services.comm.canopen.cia402 import Fault
+from petrobot.services.comm.canopen.master import (
     CanopenMaster,
     Companion,
     Manner,
@@ -20,7 +21,6 @@ from petrobot.services.comm.canopen_master import (
     Trouble,
     companion_transfers,
 )
-from petrobot.services.comm.cia402 import Fault
 from petrobot.services.motion.drive_link import HEARTBEAT_PATIENCE, DriveLink, DriveSettings
 
 SILENT_CYCLES: Final = 10

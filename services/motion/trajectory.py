@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from petrobot.services.comm.compiled import kernel
+from petrobot.services.host.numba_kernels import kernel
 from petrobot.services.motion.model import Vector
 
 Six = tuple[float, float, float, float, float, float]

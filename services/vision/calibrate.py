@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.comm.camera import open_images
-from petrobot.services.comm.image import ImageSource
-from petrobot.services.comm.whole_file import write_whole
+from petrobot.services.comm.streams.camera import open_images
+from petrobot.services.comm.streams.image import ImageSource
+from petrobot.services.host.whole_file import write_whole
 from petrobot.services.vision.calibration import (
     Calibration,
     CalibrationError,

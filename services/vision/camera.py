@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from petrobot.services.action import Context
-from petrobot.services.comm.image import Image
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import Ports, refuse_unknown_keys
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
 from petrobot.services.vision.location import Background, Detector

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
-from petrobot.services.comm.image import Image
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
 from petrobot.services.vision.confirmation import Confirmation, Track
 from petrobot.services.vision.location import Detector, MixtureOfGaussians

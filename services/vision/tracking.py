@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
-from petrobot.services.comm.image import Image
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
 from petrobot.services.vision.location import Window
 from petrobot.services.vision.prediction import Exit, Predictor, Surface, Way

@@ -3,7 +3,7 @@ nets."""
 
 from __future__ import annotations
 
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.task.net import Net
 
 Weights = dict[str, int]
 

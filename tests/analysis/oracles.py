@@ -8,7 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.task.net import Net
 
 
 def snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None:

@@ -7,8 +7,8 @@ from collections import deque
 
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.gspn import Gspn
-from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.task.net import Marking, Net
 
 Weights = dict[str, int]
 

@@ -10,15 +10,15 @@ from xml.etree import ElementTree
 
 import pytest
 
-from petrobot.coordinator.analysis.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.robot import one_run_each
-from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.robot import one_run_each
+from petrobot.coordinator.analysis.net.space import Limits, explore
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.witnesses import draw_witnesses, refused
 from petrobot.coordinator.drawing import Overlay, draw
-from petrobot.coordinator.net import Net
 from petrobot.coordinator.task import Kind, Task
-from petrobot.coordinator.taskfile import dumps, load
+from petrobot.coordinator.task.file import dumps, load
+from petrobot.coordinator.task.net import Net
 from tests.analysis.broken import TASKS, VARIANTS, damaged, judged
 from tests.analysis.random_nets import brute_force
 from tests.waiting import Limit

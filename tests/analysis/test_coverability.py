@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from hypothesis import assume, given, settings
 
-from petrobot.coordinator.analysis.coverability import coverability
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.analysis.net.coverability import coverability
+from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 

@@ -14,15 +14,14 @@ from petrobot.coordinator.analysis.commands import (
     convert_command,
     simulate_command,
 )
-from petrobot.coordinator.analysis.coverability import coverability
 from petrobot.coordinator.analysis.formats import read_net
-from petrobot.coordinator.analysis.netfile import FormatError
-from petrobot.coordinator.analysis.pumping import find_pump
-from petrobot.coordinator.analysis.qualitative import examine
-from petrobot.coordinator.analysis.space import Limits, explore
+from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.net.coverability import coverability, find_pump
+from petrobot.coordinator.analysis.net.qualitative import examine
+from petrobot.coordinator.analysis.net.space import Limits, explore
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.net import Net
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import philosophers
 
 HEAD = (

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 
 from petrobot.coordinator.analysis.formats import read_net, written
-from petrobot.coordinator.analysis.greatspn import parse_pnpro
-from petrobot.coordinator.analysis.gspn import Chain, Gspn
-from petrobot.coordinator.analysis.netfile import FormatError, NetFile
-from petrobot.coordinator.analysis.pnml_reading import parse_pnml
-from petrobot.coordinator.analysis.pnml_writing import losses, write_pnml
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.analysis.tina import parse_tina, write_tina
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.analysis.formats.greatspn import parse_pnpro
+from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
+from petrobot.coordinator.analysis.formats.pnml_writing import losses, write_pnml
+from petrobot.coordinator.analysis.formats.tina import parse_tina, write_tina
+from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue
 from tests.analysis.random_nets import gspns, nets
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.analysis.netfile import NetFile
-from petrobot.coordinator.analysis.pnml_writing import write_pnml
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.analysis.formats.netfile import NetFile
+from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.waiting import Limit
 

@@ -12,22 +12,27 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import erlang
 
-from petrobot.coordinator.analysis.completion import completion, law
-from petrobot.coordinator.analysis.forecast import forecast
-from petrobot.coordinator.analysis.graph import Mask
-from petrobot.coordinator.analysis.gspn import Chain, Gspn, TimelessTrap, Values
-from petrobot.coordinator.analysis.linear import stationary
-from petrobot.coordinator.analysis.markov import Generator, long_run, poisson_weights, transient
-from petrobot.coordinator.analysis.sensitivity import (
+from petrobot.coordinator.analysis.net.graph import Mask
+from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.time.completion import completion, law
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, TimelessTrap, Values
+from petrobot.coordinator.analysis.time.linear import stationary
+from petrobot.coordinator.analysis.time.markov import (
+    Generator,
+    long_run,
+    poisson_weights,
+    transient,
+)
+from petrobot.coordinator.analysis.time.sensitivity import (
     reliability_slopes,
     reward_slopes,
     throughput_slopes,
     time_slopes,
 )
-from petrobot.coordinator.analysis.space import Limits
-from petrobot.coordinator.analysis.stochastic import stochastic_view
-from petrobot.coordinator.net import Net
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast
+from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, repairman, stages
 from tests.analysis.random_nets import gspns
 

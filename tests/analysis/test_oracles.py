@@ -9,14 +9,14 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.completion import completion
 from petrobot.coordinator.analysis.formats import written
-from petrobot.coordinator.analysis.gspn import Chain, Gspn
-from petrobot.coordinator.analysis.markov import long_run
-from petrobot.coordinator.analysis.netfile import NetFile
-from petrobot.coordinator.analysis.pnml_writing import write_pnml
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.analysis.formats.netfile import NetFile
+from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
+from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.time.completion import completion
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.time.markov import long_run
+from petrobot.coordinator.task.net import Net
 from tests.analysis import oracles
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines

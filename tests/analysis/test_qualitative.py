@@ -11,11 +11,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.graph import Graph, _tarjan
-from petrobot.coordinator.analysis.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.analysis.stubborn import hunt_deadlock
-from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.net.graph import Graph, _tarjan
+from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
+from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.stubborn import hunt_deadlock
+from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
 

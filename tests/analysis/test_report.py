@@ -17,19 +17,19 @@ from petrobot.coordinator.analysis.commands import (
     graph_command,
     simulate_command,
 )
-from petrobot.coordinator.analysis.forecast import forecast
 from petrobot.coordinator.analysis.formats import read_net
-from petrobot.coordinator.analysis.gspn import Gspn
-from petrobot.coordinator.analysis.netfile import FormatError, NetFile
-from petrobot.coordinator.analysis.picture import graph_svg
-from petrobot.coordinator.analysis.pnml_writing import write_pnml
-from petrobot.coordinator.analysis.rates import read_rates, unit_rates
+from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
+from petrobot.coordinator.analysis.net.picture import graph_svg
+from petrobot.coordinator.analysis.net.space import Limits, explore
 from petrobot.coordinator.analysis.report import analyse, heat
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.analysis.stochastic import stochastic_view
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.rates import read_rates, unit_rates
+from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.task import Estimate, Status
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, philosophers, queue
 
 CATCH = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.graph import Graph
-from petrobot.coordinator.analysis.robot import Flow, Recovery, Roles, judge, legal_exits
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.net import Marking, Net
+from petrobot.coordinator.analysis.net.graph import Graph
+from petrobot.coordinator.analysis.net.robot import Flow, Recovery, Roles, judge, legal_exits
+from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.random_nets import state_machines
 
 

@@ -9,14 +9,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
 
-from petrobot.coordinator.analysis.completion import completion, law
-from petrobot.coordinator.analysis.gspn import Chain, Gspn
-from petrobot.coordinator.analysis.markov import long_run, transient
-from petrobot.coordinator.analysis.phase_type import fit, fit_samples, gamma_quantile
-from petrobot.coordinator.analysis.simulate import Estimate, goal_by_marking, simulate, token_game
-from petrobot.coordinator.analysis.simulate_kernel import Tables, play
-from petrobot.coordinator.net import Net
-from petrobot.services.comm.compiled import COMPILED
+from petrobot.coordinator.analysis.time.completion import completion, law
+from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
+from petrobot.coordinator.analysis.time.markov import long_run, transient
+from petrobot.coordinator.analysis.time.phase_type import fit, fit_samples, gamma_quantile
+from petrobot.coordinator.analysis.time.simulate import (
+    Estimate,
+    goal_by_marking,
+    simulate,
+    token_game,
+)
+from petrobot.coordinator.analysis.time.simulate_kernel import Tables, play
+from petrobot.coordinator.task.net import Net
+from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import KANBAN_RATES, kanban, queue, stages
 from tests.analysis.random_nets import gspns
 

@@ -10,14 +10,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis import explore_numba
-from petrobot.coordinator.analysis.explore import Engine, Explored
-from petrobot.coordinator.analysis.explore_integers import IntegerEngine
-from petrobot.coordinator.analysis.explore_numpy import NumpyEngine
-from petrobot.coordinator.analysis.pack import Layout, TooManyTokens
-from petrobot.coordinator.analysis.space import EngineName, Limits, Space, explore
-from petrobot.coordinator.net import Net
-from petrobot.services.comm.compiled import COMPILED
+from petrobot.coordinator.analysis.net import explore_compiled as explore_numba
+from petrobot.coordinator.analysis.net.explore import Engine, Explored, IntegerEngine
+from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
+from petrobot.coordinator.analysis.net.pack import Layout, TooManyTokens
+from petrobot.coordinator.analysis.net.space import EngineName, Limits, Space, explore
+from petrobot.coordinator.task.net import Net
+from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 from tests.waiting import Limit

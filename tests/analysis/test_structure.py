@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 
-from petrobot.coordinator.analysis import structure
-from petrobot.coordinator.analysis.siphons import (
+from petrobot.coordinator.analysis.net import structure
+from petrobot.coordinator.analysis.net.siphons import (
     controlled_siphons,
     empty_siphon,
     largest_trap,
     minimal_siphons,
     minimal_traps,
 )
-from petrobot.coordinator.analysis.space import explore
-from petrobot.coordinator.analysis.structure import (
+from petrobot.coordinator.analysis.net.space import explore
+from petrobot.coordinator.analysis.net.structure import (
     Vector,
     conflict_sets,
     exclusive_places,
@@ -30,7 +30,7 @@ from petrobot.coordinator.analysis.structure import (
     place_semiflows,
     transition_semiflows,
 )
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
 

@@ -12,21 +12,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.booleans import boolean_view
-from petrobot.coordinator.analysis.completion import Completion, completion
-from petrobot.coordinator.analysis.gspn import Chain
-from petrobot.coordinator.analysis.markov import visits_before
-from petrobot.coordinator.analysis.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.qualitative import examine
-from petrobot.coordinator.analysis.robot import judge
-from petrobot.coordinator.analysis.space import Limits, explore
-from petrobot.coordinator.analysis.stochastic import (
+from petrobot.coordinator.analysis.net.booleans import boolean_view
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.qualitative import examine
+from petrobot.coordinator.analysis.net.robot import judge
+from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.time.completion import Completion, completion
+from petrobot.coordinator.analysis.time.gspn import Chain
+from petrobot.coordinator.analysis.time.markov import visits_before
+from petrobot.coordinator.analysis.time.stochastic import (
     Measured,
     NoEstimate,
     StochasticView,
     stochastic_view,
 )
-from petrobot.coordinator.conditions import parse
 from petrobot.coordinator.task import (
     Counts,
     End,
@@ -46,7 +45,8 @@ from petrobot.coordinator.task import (
     Variable,
     VariableType,
 )
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.conditions import parse
+from petrobot.coordinator.task.file import load
 
 SHIPPED = sorted((Path(__file__).parents[2] / "coordinator" / "tasks").glob("*.toml"))
 EXPONENTIAL = {

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
-from petrobot.coordinator.analysis.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import FormatError
 from petrobot.coordinator.analysis.report import analyse
-from petrobot.coordinator.analysis.stochastic import Measured
-from petrobot.coordinator.analysis.whatif import change_net, change_task, read_change
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.analysis.time.stochastic import Measured
+from petrobot.coordinator.analysis.time.whatif import change_net, change_task, read_change
 from petrobot.coordinator.task import Estimate, Status
-from petrobot.coordinator.taskfile import dumps, load
+from petrobot.coordinator.task.file import dumps, load
+from petrobot.coordinator.task.net import Net
 from tests.analysis.broken import TASKS
 
 CATCH = TASKS / "catch_ball.toml"

@@ -13,8 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm import directory
-from petrobot.services.comm.directory import Directory
+from petrobot.services.comm import location_file as directory
+from petrobot.services.comm.location_file import Directory
 
 NODES = ("left", "right")
 

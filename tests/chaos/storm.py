@@ -25,15 +25,15 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.cli.loading import load_task
-from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.coordinator.engine import Finished, Fired, RunRecorded, StartRun
 from petrobot.coordinator.launch import local_programs, with_runs
-from petrobot.coordinator.record.journal import JournalError, read_journal
-from petrobot.coordinator.record.recording import STIMULUS
-from petrobot.coordinator.record.runfolder import JOURNAL, RESULT
-from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.run.folder import JOURNAL, RESULT
+from petrobot.coordinator.run.journal import JournalError, read_journal
+from petrobot.coordinator.run.recording import STIMULUS
+from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Status
-from petrobot.services.comm.directory import load
+from petrobot.services.comm.location_file import load
 from tests.chaos.by_proxy import NODES
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 from tests.ports import free_ports

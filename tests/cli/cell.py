@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.services.action import Context, Result, success
-from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.device import Ports
-from petrobot.services.node import Node
-from petrobot.services.place import InlinePlace
+from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.node import Node
 from tests.in_loop import NodeInLoop
 from tests.ports import free_ports
 

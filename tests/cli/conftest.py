@@ -14,15 +14,15 @@ import pytest
 import pytest_asyncio
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.hmi.server import Page, start_page
 from petrobot.coordinator.launch import Setting, realtime_mission
-from petrobot.coordinator.mission.mission import Mission
-from petrobot.coordinator.mission.partners import FirstAlternative
-from petrobot.coordinator.mission.realtime import RealtimeMission
+from petrobot.coordinator.operator.commands import Operation
 from petrobot.coordinator.operator.door_file import Door, door_open
-from petrobot.coordinator.operator.operation import Operation
-from petrobot.coordinator.record.runfolder import JOURNAL
-from petrobot.coordinator.taskfile import loads
+from petrobot.coordinator.page.server import Page, start_page
+from petrobot.coordinator.run.folder import JOURNAL
+from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.realtime import RealtimeMission
+from petrobot.coordinator.task.file import loads
 from tests.cli.cell import TASK, Arm, RobotNode, directory_in
 from tests.waiting import beat
 

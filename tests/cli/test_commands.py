@@ -434,7 +434,7 @@ def test_a_task_may_name_its_own_location_file(
     """`services` of the task file is found from anywhere and gives way to --services; it survives
     writing and reading."""
     from petrobot.coordinator.cli.loading import SHIPPED, cell_path
-    from petrobot.coordinator.taskfile import dumps, load, loads
+    from petrobot.coordinator.task.file import dumps, load, loads
 
     monkeypatch.chdir(tmp_path)
     task = load(SHIPPED / "follow_track.toml")
@@ -457,7 +457,7 @@ def test_a_task_may_draw_its_own_pictures() -> None:
 
     from petrobot.coordinator.cli import CommandError
     from petrobot.coordinator.cli.loading import SHIPPED, pictures_of
-    from petrobot.coordinator.taskfile import load
+    from petrobot.coordinator.task.file import load
 
     task = load(SHIPPED / "follow_track.toml")
     assert pictures_of(task, {"task": "follow_track"}) == {}, "nothing was scored"

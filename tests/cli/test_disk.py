@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.record.runfolder import RESULT
+from petrobot.coordinator.run.folder import RESULT
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]

@@ -13,9 +13,9 @@ import pytest
 import pytest_asyncio
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.directory import Directory
-from petrobot.services.node import GENERAL, Node
-from petrobot.services.place import InlinePlace
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.node import GENERAL, Node
 from tests.cli.cell import Arm, directory_in
 from tests.in_loop import NodeInLoop
 

@@ -13,9 +13,9 @@ import pytest
 
 from petrobot.coordinator.cli import COMMANDS, main
 from petrobot.coordinator.engine import Mode
-from petrobot.coordinator.hmi import house
 from petrobot.coordinator.operator.door_file import DOOR, Door, door_open, find_door
-from petrobot.coordinator.record.runfolder import JOURNAL, NoRunError
+from petrobot.coordinator.page import app_state as house
+from petrobot.coordinator.run.folder import JOURNAL, NoRunError
 from tests.cli.conftest import RUN, Terminal
 from tests.waiting import beat
 

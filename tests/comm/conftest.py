@@ -9,13 +9,12 @@ from typing import Any, get_args
 import pytest
 from hypothesis import strategies as st
 
-from petrobot.services.comm.codec import LIMITS
-from petrobot.services.comm.link import Limits
-from petrobot.services.comm.messages import Executed, Hello, Message, Tick, Welcome
-from petrobot.services.comm.wire import Connection, Side
+from petrobot.services.comm.calls.link import Limits
+from petrobot.services.comm.protocol.codec import LIMITS
+from petrobot.services.comm.protocol.messages import Executed, Hello, Message, Tick, Welcome
+from petrobot.services.comm.protocol.wire import Connection, Side
+from tests.comm.ends import Node
 from tests.waiting import Limit
-
-from .ends import Node
 
 KEY = bytes(range(32))
 SERVER = "vision"

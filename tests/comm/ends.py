@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.callee import Callee, Offer, Order
-from petrobot.services.comm.caller import Caller, Notice
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.codec import encode
-from petrobot.services.comm.link import Link, Timing
-from petrobot.services.comm.server import Server
-from petrobot.services.comm.wire import Connection, Side
+from petrobot.services.comm.calls.callee import Callee, Offer, Order
+from petrobot.services.comm.calls.caller import Caller, Notice
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.link import Link, Timing
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import encode
+from petrobot.services.comm.protocol.wire import Connection, Side
 
 QUICK = Timing(heartbeat=0.05, silence=0.2, handshake=0.3, backoff=(0.01, 0.05))
 HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 1)

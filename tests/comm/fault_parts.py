@@ -21,9 +21,9 @@ from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 
-from petrobot.services.comm.callee import Callee, CancelRun, Offer, Order
-from petrobot.services.comm.server import Server
-from petrobot.services.comm.stream import StreamSender
+from petrobot.services.comm.calls.callee import Callee, CancelRun, Offer, Order
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.streams.stream import StreamSender
 
 HOST = "127.0.0.1"
 ROOT = Path(__file__).parents[2]

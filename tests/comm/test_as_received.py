@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from petrobot.services.comm.cell import as_received
-from petrobot.services.comm.plain import NotPlainError, pack_array, unpack_array
+from petrobot.services.comm.lockstep.cell import as_received
+from petrobot.services.comm.protocol.plain import NotPlainError, pack_array, unpack_array
 
 
 def _image() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:

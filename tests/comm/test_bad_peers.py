@@ -10,14 +10,13 @@ import random
 
 import pytest
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import PeerLost
-from petrobot.services.comm.codec import LIMITS
-from petrobot.services.comm.link import Timing
-from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.calls.caller import PeerLost
+from petrobot.services.comm.calls.link import Timing
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import LIMITS
+from petrobot.services.comm.protocol.messages import Executed
+from tests.comm.ends import HELLO, Coordinator, Node, frame, read_all, until, welcome
 from tests.waiting import Limit
-
-from .ends import HELLO, Coordinator, Node, frame, read_all, until, welcome
 
 
 async def test_a_peer_that_is_silent_is_cut(open_node: Node) -> None:

@@ -7,10 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.callee import Callee, CancelRun, Commanded, Keeping, Offer, StartRun
-from petrobot.services.comm.messages import Executed
-from petrobot.services.comm.results import FinishedIds
+from petrobot.services.comm.calls.callee import (
+    Callee,
+    CancelRun,
+    Commanded,
+    Keeping,
+    Offer,
+    StartRun,
+)
+from petrobot.services.comm.calls.results import FinishedIds
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Executed
 
 COORD = m.Hello(2, 2, "coordinator", "coord", "c1", 3, "d1")
 

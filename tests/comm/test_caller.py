@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import (
+from petrobot.services.comm.calls.caller import (
     Accepted,
     Answered,
     Caller,
@@ -19,9 +18,10 @@ from petrobot.services.comm.caller import (
     PeerLost,
     Progress,
 )
-from petrobot.services.comm.codec import LIMITS, encode
-from petrobot.services.comm.messages import Executed
-from petrobot.services.comm.plain import NotPlainError
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import LIMITS, encode
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.plain import NotPlainError
 
 
 class _Waiter:

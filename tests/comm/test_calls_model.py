@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.callee import Callee, CancelRun, Keeping, Offer, StartRun
-from petrobot.services.comm.caller import Caller, Ended, Late, PeerBack
-from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.calls.callee import Callee, CancelRun, Keeping, Offer, StartRun
+from petrobot.services.comm.calls.caller import Caller, Ended, Late, PeerBack
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Executed
 
 COORD = "coord"
 DEVICES = 2

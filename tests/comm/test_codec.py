@@ -11,16 +11,28 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from petrobot.services.comm import codec
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.codec import LIMITS, MAX_CONTAINERS, MIB, ProtocolError, decode, encode
-from petrobot.services.comm.frequent import NAME_LENGTH
-from petrobot.services.comm.messages import Executed
-from petrobot.services.comm.party import Envelope, Posted
-from petrobot.services.comm.plain import DEPTH, NotPlainError, pack_array, plain, unpack_array
-
-from .conftest import KINDS, messages_of
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.lockstep.party import Envelope, Posted
+from petrobot.services.comm.protocol import codec
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import (
+    LIMITS,
+    MAX_CONTAINERS,
+    MIB,
+    NAME_LENGTH,
+    ProtocolError,
+    decode,
+    encode,
+)
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.plain import (
+    DEPTH,
+    NotPlainError,
+    pack_array,
+    plain,
+    unpack_array,
+)
+from tests.comm.conftest import KINDS, messages_of
 
 ENVELOPE = Envelope("arm", "bus", "arm", "can", Frame(0x181, b"\x01\x02"))
 FRAMES = [

@@ -5,10 +5,10 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.callee import Callee, Offer
-from petrobot.services.comm.caller import Caller, EventArrived
-from petrobot.services.comm.events import KEPT, EventBoard
+from petrobot.services.comm.calls.callee import Callee, Offer
+from petrobot.services.comm.calls.caller import Caller, EventArrived
+from petrobot.services.comm.calls.events import KEPT, EventBoard
+from petrobot.services.comm.protocol import messages as m
 
 
 def _node(*names: str, role: str = "coordinator") -> Callee:

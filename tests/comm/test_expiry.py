@@ -18,19 +18,24 @@ from cryptography import x509
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.coordinator.certificates import CA_LIFE, LIFE, CertificateError, make_certificates
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.mission.asking import ask_all
-from petrobot.services.comm import expiry
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.callee import Callee, Offer
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.credentials import Credentials
-from petrobot.services.comm.directory import parse
-from petrobot.services.comm.expiry import SOON, ending, ends_of
-from petrobot.services.comm.orders import Order
-from petrobot.services.comm.server import Server
+from petrobot.coordinator.run.node_status import ask_all
+from petrobot.services.comm.calls.callee import Callee, Offer
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.orders import Order
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.location_file import parse
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.tls import expiry
+from petrobot.services.comm.tls.certificates import (
+    CA_LIFE,
+    LIFE,
+    CertificateError,
+    make_certificates,
+)
+from petrobot.services.comm.tls.credentials import Credentials
+from petrobot.services.comm.tls.expiry import SOON, ending, ends_of
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 DAY = timedelta(days=1)
@@ -220,7 +225,7 @@ async def node(folder: Path) -> AsyncIterator[Server]:
 async def test_a_node_that_lives_long_looks_each_day(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("petrobot.services.comm.server.DAY", 0.001)
+    monkeypatch.setattr("petrobot.services.comm.calls.server.DAY", 0.001)
     looked: list[datetime] = []
     again = asyncio.Event()
 
@@ -229,7 +234,7 @@ async def test_a_node_that_lives_long_looks_each_day(
         if len(looked) == 3:
             again.set()
 
-    monkeypatch.setattr("petrobot.services.comm.server.look_again", look)
+    monkeypatch.setattr("petrobot.services.comm.calls.server.look_again", look)
     async with asyncio.timeout(60.0), node(made(tmp_path, LIFE)):
         await again.wait()
 

@@ -1,7 +1,7 @@
 """Real processes killed (kill -9), frozen (SIGSTOP) and cut off: what is known of them, in which
 order, and what holds.
 
-How long it takes stands in tests/bench/faults.py; here is what must be so however busy the machine
+How long it takes stands in tools/bench/faults.py; here is what must be so however busy the machine
 is.
 """
 
@@ -16,14 +16,21 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import Accepted, Caller, Ended, Late, Notice, PeerBack, PeerLost
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.messages import Executed
-from petrobot.services.comm.stream import Incoming, StreamReceiver
-from petrobot.services.comm.under_way import Patience
-
-from .fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
+from petrobot.services.comm.calls.active import Patience
+from petrobot.services.comm.calls.caller import (
+    Accepted,
+    Caller,
+    Ended,
+    Late,
+    Notice,
+    PeerBack,
+    PeerLost,
+)
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
+from tests.comm.fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
 
 pytestmark = pytest.mark.processes
 LIMIT = 60.0

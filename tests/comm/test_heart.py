@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from petrobot.services.comm.link import Beat, Heart, Timing
+from petrobot.services.comm.calls.link import Beat, Heart, Timing
 from tests.waiting import Limit
 
 

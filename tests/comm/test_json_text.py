@@ -15,23 +15,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm.json_text import finite, json_text
+from petrobot.services.host.json_text import finite, json_text
 
 ROOT = Path(__file__).parents[2]
 BETWEEN_OWN_PROCESSES = {
-    "coordinator/campaign/cluster.py",
-    "coordinator/campaign/pool.py",
-    "coordinator/campaign/worker.py",
-    "coordinator/experience/estimates_tables.py",
-    "coordinator/learning/joining.py",
+    "coordinator/studies/campaign/cluster.py",
+    "coordinator/studies/campaign/pool.py",
+    "coordinator/studies/campaign/worker.py",
+    "coordinator/learning/estimates_tables.py",
 }
 """Only Python reads these, which knows infinity."""
 FOR_A_HASH = {
-    "coordinator/campaign/plan.py",
-    "coordinator/forecast/registered.py",
-    "services/comm/directory_file.py",
+    "coordinator/studies/campaign/plan.py",
+    "coordinator/studies/forecast/registered.py",
+    "services/comm/location_file/reading.py",
 }
-WRITER = "services/comm/json_text.py"
+WRITER = "services/host/json_text.py"
 
 
 def strict(text: str) -> Any:

@@ -18,14 +18,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.cell import Cell, CellError, Delays
-from petrobot.services.comm.lockstep import Member, PartyLostError
-from petrobot.services.comm.party import TICK, Envelope, Party, Posted
+from petrobot.services.comm.lockstep.cell import Cell, CellError, Delays
+from petrobot.services.comm.lockstep.mesh import Member, PartyLostError
+from petrobot.services.comm.lockstep.party import TICK, Envelope, Party, Posted
+from petrobot.services.comm.protocol import messages as m
+from tests.comm.ends import frame
+from tests.comm.toy_party import Toy
 from tests.waiting import Limit
-
-from .ends import frame
-from .toy_party import Toy
 
 TOY = Path(__file__).parent / "toy_party.py"
 NAMES = ["coordinator", "motion", "sim", "vision"]

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.codec import LIMITS
-from petrobot.services.comm.link import Timing
-from petrobot.services.comm.results import Keeping
-from petrobot.services.comm.under_way import Patience
-
-from .conftest import KINDS
-from .ends import frame
+from petrobot.services.comm.calls.active import Patience
+from petrobot.services.comm.calls.link import Timing
+from petrobot.services.comm.calls.results import Keeping
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import LIMITS
+from tests.comm.conftest import KINDS
+from tests.comm.ends import frame
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 ROWS = {

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.lockstep import Member, PartyLostError
-from petrobot.services.comm.party import TICK
+from petrobot.services.comm.lockstep.mesh import Member, PartyLostError
+from petrobot.services.comm.lockstep.party import TICK
 from tests.comm.toy_party import Toy
 from tests.ports import free_ports
 

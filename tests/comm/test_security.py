@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm.security import (
+from petrobot.services.comm.protocol.security import (
     KeyFileError,
     KeyNeededError,
     Seal,

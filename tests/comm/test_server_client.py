@@ -7,13 +7,12 @@ import asyncio
 
 import pytest
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.callee import CancelRun, StartRun
-from petrobot.services.comm.caller import Answered, Ended, PeerBack, PeerLost
-from petrobot.services.comm.messages import Executed
-from petrobot.services.comm.security import KeyNeededError
-
-from .ends import Coordinator, Node, until
+from petrobot.services.comm.calls.callee import CancelRun, StartRun
+from petrobot.services.comm.calls.caller import Answered, Ended, PeerBack, PeerLost
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.security import KeyNeededError
+from tests.comm.ends import Coordinator, Node, until
 
 
 async def test_a_service_and_an_action(node: Node, key: bytes | None) -> None:

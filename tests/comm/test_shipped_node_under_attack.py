@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm import messages as m
+from petrobot.services.comm.protocol import messages as m
 from tests.comm import foreign as f
 from tests.comm.ends import frame, framed, head
 from tests.comm.foreign import Foreign, pack

@@ -13,12 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.security import KeyNeededError
-from petrobot.services.comm.stream import Incoming, Inlet, StreamReceiver, StreamSender
-from petrobot.services.comm.stream_line import Lateness
-
-from .ends import frame, framed
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.security import KeyNeededError
+from petrobot.services.comm.streams.line import Lateness
+from petrobot.services.comm.streams.stream import Incoming, Inlet, StreamReceiver, StreamSender
+from tests.comm.ends import frame, framed
 
 
 class Sink:

@@ -11,14 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.codec import LIMITS, decode, encode
-from petrobot.services.comm.security import Keys
-from petrobot.services.comm.wire import Connection, ProtocolError, Side, State, negotiate
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import LIMITS, decode, encode
+from petrobot.services.comm.protocol.security import Keys
+from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side, State, negotiate
+from tests.comm.conftest import KEY, KINDS, NONCES, SERVER, greet, messages_of, new_pair
+from tests.comm.ends import framed, head
 from tests.waiting import Limit
-
-from .conftest import KEY, KINDS, NONCES, SERVER, greet, messages_of, new_pair
-from .ends import framed, head
 
 Pair = Callable[[bytes | None], tuple[Connection, Connection]]
 HELLO = m.Hello(2, 2, "coordinator", "coord", "b0", 1)

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.lockstep import Delays, Member
-from petrobot.services.comm.messages import Call
-from petrobot.services.comm.party import TICK, Envelope
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.lockstep.mesh import Delays, Member
+from petrobot.services.comm.lockstep.party import TICK, Envelope
+from petrobot.services.comm.protocol.messages import Call
 
 Script = Mapping[str, Sequence[tuple[str, str]]]
 """What to say, by tick: (party, channel)."""

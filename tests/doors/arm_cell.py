@@ -10,11 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from petrobot.services.comm import canopen
-from petrobot.services.comm.can_stream import connect
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.cia402 import RECEIVED, SENT, Command, State, command_of, state_of
-from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.byte_stream import connect
+from petrobot.services.comm.canopen.cia402 import (
+    RECEIVED,
+    SENT,
+    Command,
+    State,
+    command_of,
+    state_of,
+)
+from petrobot.services.comm.location_file import Directory, parse
 from tests.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +34,7 @@ schema = 1
 [nodes.laboratory]
 host = "127.0.0.1"
 port = {laboratory}
-sim = "petrobot.sim.laboratory:make_laboratory"
+sim = "petrobot.sim.catching.laboratory:make_laboratory"
 [nodes.motion]
 host = "127.0.0.1"
 port = {motion}

@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.certificates import make_certificates
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.codec import decode, encode
-from petrobot.services.comm.credentials import Credentials
-from petrobot.services.comm.wire import Connection, Side
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import decode, encode
+from petrobot.services.comm.protocol.wire import Connection, Side
+from petrobot.services.comm.tls.certificates import make_certificates
+from petrobot.services.comm.tls.credentials import Credentials
 from tests.comm.ends import framed
 from tests.waiting import Limit, beat
 

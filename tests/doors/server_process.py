@@ -15,11 +15,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from petrobot.services.comm.callee import Callee, Keeping, Offer
-from petrobot.services.comm.credentials import Credentials
-from petrobot.services.comm.link import Limits, Timing
-from petrobot.services.comm.messages import Call, Outcome
-from petrobot.services.comm.server import Server
+from petrobot.services.comm.calls.callee import Callee, Keeping, Offer
+from petrobot.services.comm.calls.link import Limits, Timing
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.protocol.messages import Call, Outcome
+from petrobot.services.comm.tls.credentials import Credentials
 
 
 def echo(now: float, call: Call) -> Outcome:

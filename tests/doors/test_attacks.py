@@ -21,8 +21,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.wire import Connection, ProtocolError, Side
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side
 from tests.comm.ends import head
 from tests.doors.conftest import HELLO, KEY, MIB, GoodClient, Stranger, Victim, frame
 from tests.waiting import Limit, beat

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.launch import local_programs
-from petrobot.coordinator.supervisor import Supervisor
-from petrobot.services.comm.cia402 import Fault, State, state_of
+from petrobot.coordinator.run.supervisor import Supervisor
+from petrobot.services.comm.canopen.cia402 import Fault, State, state_of
 from tests.doors.arm_cell import DRIVES, cell_in, ear_on
 from tests.doors.test_estop import LIMIT, Cell
 
 pytestmark = pytest.mark.processes
-DRIVE_EDS = str(files("petrobot.services.comm.eds").joinpath("joint_drive.eds"))
+DRIVE_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("joint_drive.eds"))
 STATUSWORD, ERROR_CODE, POSITION = 0x6041, 0x603F, 0x6064
 
 

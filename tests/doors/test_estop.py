@@ -19,12 +19,12 @@ import pytest
 
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.operator.door_file import find_door
-from petrobot.coordinator.operator.emergency import still_stopped
-from petrobot.coordinator.record.runfolder import NoRunError
-from petrobot.coordinator.supervisor import Supervisor
-from petrobot.services.comm.canopen import NmtState
-from petrobot.services.comm.cia402 import State
-from petrobot.services.comm.directory import Directory
+from petrobot.coordinator.operator.emergency_stop import still_stopped
+from petrobot.coordinator.run.folder import NoRunError
+from petrobot.coordinator.run.supervisor import Supervisor
+from petrobot.services.comm.canopen.cia301 import NmtState
+from petrobot.services.comm.canopen.cia402 import State
+from petrobot.services.comm.location_file import Directory
 from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.certificates import make_certificates
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.operator.door_file import DOOR
-from petrobot.coordinator.supervisor import Supervisor
-from petrobot.services.comm.directory import parse
-from petrobot.services.comm.security import new_key, write_key
+from petrobot.coordinator.run.supervisor import Supervisor
+from petrobot.services.comm.location_file import parse
+from petrobot.services.comm.protocol.security import new_key, write_key
+from petrobot.services.comm.tls.certificates import make_certificates
 from tests.doors.arm_cell import ROOT, cell_in
 from tests.doors.conftest import KEY, Victim
 from tests.waiting import Limit, beat

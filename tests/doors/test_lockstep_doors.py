@@ -9,10 +9,10 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.launch import Setting, lockstep_member, lockstep_mission
-from petrobot.coordinator.taskfile import load as load_task
-from petrobot.services.comm.directory import Directory, parse
-from petrobot.services.comm.lockstep_process import cell_key
-from petrobot.services.comm.security import KeyNeededError, new_key, write_key
+from petrobot.coordinator.task.file import load as load_task
+from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.comm.lockstep.process import cell_key
+from petrobot.services.comm.protocol.security import KeyNeededError, new_key, write_key
 from tests.chaos.shuttle_cell import SERVICES, TASK
 from tests.ports import free_ports
 

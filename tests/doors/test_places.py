@@ -9,19 +9,19 @@ from typing import Any
 import pytest
 
 from petrobot.services.action import Status, success
-from petrobot.services.comm.directory import ActionEntry
-from petrobot.services.comm.messages import Executed
+from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.comm.protocol.messages import Executed
 from petrobot.services.device import stop_at_once
-from petrobot.services.remote import (
+from petrobot.services.worker.process import COMMAND
+from petrobot.services.worker.remote import (
     CLEAR_EMERGENCY,
     EMERGENCY_STOP,
     IN_EMERGENCY,
     CyclicDriver,
     DeviceCommand,
 )
-from petrobot.services.runner import GRACE, Runner
-from petrobot.services.runs import Begin, Ended, Hold, Stop, Told, flat
-from petrobot.services.worker import COMMAND
+from petrobot.services.worker.runner import GRACE, Runner
+from petrobot.services.worker.runs import Begin, Ended, Hold, Stop, Told, flat
 from tests.node.conftest import Clock, Device
 from tests.node.test_worker_place import Bench
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.certificates import make_certificates
-from petrobot.services.comm.directory import DirectoryError, parse
-from petrobot.services.comm.security import new_key, write_key
+from petrobot.services.comm.location_file import DirectoryError, parse
+from petrobot.services.comm.protocol.security import new_key, write_key
+from petrobot.services.comm.tls.certificates import make_certificates
 from tests.doors.test_streams import GuardedOperator
 from tests.node.test_processes import CELL, PATIENCE, start_node
 from tests.ports import free_ports

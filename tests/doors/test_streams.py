@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from petrobot.coordinator.certificates import make_certificates
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.camera import ImageServer, StreamImages
-from petrobot.services.comm.can_hub import Hub
-from petrobot.services.comm.can_ports import StreamPort
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.credentials import credentials
-from petrobot.services.comm.messages import Hello
-from petrobot.services.comm.security import new_key, write_key
-from petrobot.services.comm.stream import StreamReceiver, StreamSender
-from petrobot.services.comm.stream_line import Incoming
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.canopen.ports import StreamPort
+from petrobot.services.comm.protocol.messages import Hello
+from petrobot.services.comm.protocol.security import new_key, write_key
+from petrobot.services.comm.streams.camera import ImageServer, StreamImages
+from petrobot.services.comm.streams.line import Incoming
+from petrobot.services.comm.streams.stream import StreamReceiver, StreamSender
+from petrobot.services.comm.tls.certificates import make_certificates
+from petrobot.services.comm.tls.credentials import credentials
 from tests.node.test_processes import CELL, Nodes, Operator
 from tests.waiting import Limit
 

@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.certificates import CertificateError, make_certificates
 from petrobot.coordinator.cli import main
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.credentials import Credentials, may_speak_as
-from petrobot.services.comm.directory import DirectoryError, parse
-from petrobot.services.comm.security import KeyFileError
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.location_file import DirectoryError, parse
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.security import KeyFileError
+from petrobot.services.comm.tls.certificates import CertificateError, make_certificates
+from petrobot.services.comm.tls.credentials import Credentials, may_speak_as
 from tests.doors.conftest import HELLO, Victim
 from tests.waiting import beat
 

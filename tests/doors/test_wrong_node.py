@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.security import new_key, write_key
+from petrobot.services.comm.protocol.security import new_key, write_key
 from tests.doors.test_estop import finished, petrobot
 from tests.node.test_processes import Nodes
 from tests.ports import free_ports

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from petrobot.coordinator.net import Net
+from petrobot.coordinator.task.net import Net
 
 
 class _Growing:

@@ -11,11 +11,10 @@ import pytest
 
 from petrobot.coordinator.cli import CommandError, show
 from petrobot.coordinator.drawing import Overlay, draw
-from petrobot.coordinator.drawing.scene import scene_of_task
-from petrobot.coordinator.drawing.sheet import sheet_of
-from petrobot.coordinator.hmi.picture import picture
+from petrobot.coordinator.drawing.scene import scene_of_task, sheet_of
+from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.taskfile import TaskFileError, dumps, loads
+from petrobot.coordinator.task.file import TaskFileError, dumps, loads
 
 TEXT = """
 schema = 1

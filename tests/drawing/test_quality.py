@@ -16,7 +16,7 @@ from petrobot.coordinator.drawing.layout import Point
 from petrobot.coordinator.drawing.routing import Box, Way, Words, place_words, route
 from petrobot.coordinator.drawing.scene import Node, Scene, scene_of_net, scene_of_task
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.file import load
 from tests.drawing.conftest import random_task
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.conditions import parse
 from petrobot.coordinator.engine import (
     Begin,
     Engine,
@@ -38,7 +37,8 @@ from petrobot.coordinator.task import (
     Variable,
     VariableType,
 )
-from petrobot.coordinator.taskfile.arcs import read_input, read_output
+from petrobot.coordinator.task.conditions import parse
+from petrobot.coordinator.task.file.arcs import read_input, read_output
 
 
 def make_task(

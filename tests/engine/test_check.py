@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.check import Severity, check
-from petrobot.coordinator.conditions import parse
 from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.check import Severity, check
+from petrobot.coordinator.task.conditions import parse
 
 Tasks = Callable[..., Task]
 A = {"n": {"in": "a:normal", "out": "y"}, "e": {"in": "a:error", "out": "y"}}

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.conditions import (
+from petrobot.coordinator.task.conditions import (
     Answer,
     ConditionError,
     ConditionFault,

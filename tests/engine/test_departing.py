@@ -23,7 +23,7 @@ from petrobot.coordinator.engine import (
     point_from_plain,
     to_plain,
 )
-from petrobot.coordinator.operator.departure import point_of
+from petrobot.coordinator.operator.start_from import point_of
 from petrobot.coordinator.task import Status, Task
 from tests.engine.conftest import make_task
 from tests.engine.test_properties import DEVICES, Journal, tasks

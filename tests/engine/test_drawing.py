@@ -15,7 +15,7 @@ from petrobot.coordinator.drawing.layout import lay_out
 from petrobot.coordinator.drawing.routing import Words, place_words, route
 from petrobot.coordinator.drawing.scene import scene_of_task
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.file import load
 
 SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 Tasks = Callable[..., Task]

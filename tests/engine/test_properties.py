@@ -12,8 +12,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.check import check
-from petrobot.coordinator.conditions import parse
 from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
@@ -81,8 +79,10 @@ from petrobot.coordinator.task import (
     Variable,
     VariableType,
 )
-from petrobot.coordinator.task.consistency import faults
-from petrobot.coordinator.taskfile import dumps, loads
+from petrobot.coordinator.task.check import check
+from petrobot.coordinator.task.conditions import parse
+from petrobot.coordinator.task.file import dumps, loads
+from petrobot.coordinator.task.validation import faults
 
 CONDITIONS = (
     "b",

@@ -2,7 +2,7 @@
 and tokens stay whole.
 
 Where other coordination systems got one of them wrong, the name of the trouble is in the test; all
-of them by name, over a node, in tests/mission/test_named_races.py.
+of them by name, over a node, in tests/run/test_named_races.py.
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.conditions import parse
 from petrobot.coordinator.engine import (
     ArmTimer,
     Begin,
@@ -28,6 +27,7 @@ from petrobot.coordinator.engine import (
     Verdict,
 )
 from petrobot.coordinator.task import Executed, Reference, Status, Task
+from petrobot.coordinator.task.conditions import parse
 
 Plays = Callable[..., Any]
 OK, FAIL, ERR = Status.SUCCESS, Status.FAILURE, Status.ERROR

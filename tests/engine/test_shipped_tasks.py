@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.check import Severity, check
 from petrobot.coordinator.engine import (
     AddTokens,
     ArmTimer,
@@ -28,9 +27,10 @@ from petrobot.coordinator.engine import (
     StopConfirmed,
     TimerFired,
 )
-from petrobot.coordinator.net import Marking
 from petrobot.coordinator.task import Status, Task
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.check import Severity, check
+from petrobot.coordinator.task.file import load
+from petrobot.coordinator.task.net import Marking
 
 PATH = Path(__file__).parents[2] / "coordinator" / "tasks" / "catch_ball.toml"
 OK, FAIL, ERR = Status.SUCCESS, Status.FAILURE, Status.ERROR

@@ -22,7 +22,7 @@ from typing import Any
 
 from petrobot.coordinator import launch
 from petrobot.coordinator.cli.loading import load_task
-from petrobot.coordinator.cli.replaying import recorded
+from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.coordinator.engine import Engine, Fired, Instruction, RunRecorded, State, Stimulus
 from petrobot.coordinator.launch import (
     Setting,
@@ -31,14 +31,14 @@ from petrobot.coordinator.launch import (
     resumed_mission,
     with_runs,
 )
-from petrobot.coordinator.mission.lockstep_party import NAME, CoordinatorParty
-from petrobot.coordinator.mission.mission import Mission
-from petrobot.coordinator.record.journal import JournalWriter, read_journal
-from petrobot.coordinator.record.recording import JournalStore
-from petrobot.coordinator.record.runfolder import header
-from petrobot.services.comm.cell import Delays
-from petrobot.services.comm.directory import Directory, load, resolve
-from petrobot.services.comm.lockstep import Member
+from petrobot.coordinator.run.folder import header
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.lockstep import NAME, CoordinatorParty
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.recording import JournalStore
+from petrobot.services.comm.location_file import Directory, load, resolve
+from petrobot.services.comm.lockstep.cell import Delays
+from petrobot.services.comm.lockstep.mesh import Member
 from tests.ports import free_ports
 
 CELL = "cell"

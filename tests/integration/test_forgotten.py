@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.record.journal import MAGIC, PREFIX, read_journal
-from petrobot.coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.run.folder import JOURNAL
+from petrobot.coordinator.run.journal import MAGIC, PREFIX, read_journal
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.directory import load
-from petrobot.services.comm.messages import Call, Hello
-from petrobot.services.comm.notice import Ended, Notice
-from petrobot.services.comm.results import Keeping
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.notices import Ended, Notice
+from petrobot.services.comm.calls.results import Keeping
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.protocol.messages import Call, Hello
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
 from tests.integration.test_resume_processes import (
     NEVER_BEGUN,

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.record.journal import read_journal
-from petrobot.coordinator.record.runfolder import JOURNAL
+from petrobot.coordinator.run.folder import JOURNAL
+from petrobot.coordinator.run.journal import read_journal
 from tests.chaos.shuttle_cell import ROOT, TASK, moves, shuttle_services
 from tests.integration.test_resume_processes import (
     NEVER_BEGUN,

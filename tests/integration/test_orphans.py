@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.directory import load
-from petrobot.services.comm.messages import Call, Hello
-from petrobot.services.comm.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.protocol.messages import Call, Hello
+from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from tests.integration.test_resume_processes import nodes
 from tests.ports import free_ports
 from tests.waiting import beat

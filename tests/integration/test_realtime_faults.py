@@ -15,13 +15,13 @@ import pytest
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine import Fired, Instruction, RunRecorded, StartRun, State, Stimulus
 from petrobot.coordinator.launch import Setting, local_programs, mission_id, realtime_mission
-from petrobot.coordinator.mission.mission import Mission
-from petrobot.coordinator.mission.realtime import RealtimeMission
-from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.realtime import RealtimeMission
+from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.directory import load
-from petrobot.services.comm.messages import Command
-from petrobot.services.comm.notice import Progress
+from petrobot.services.comm.calls.notices import Progress
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.protocol.messages import Command
 from tests.integration.cell_files import services_file
 
 pytestmark = pytest.mark.processes

@@ -11,11 +11,11 @@ import pytest
 from petrobot.coordinator.cli.loading import load_task
 from petrobot.coordinator.engine import RunRecorded
 from petrobot.coordinator.launch import Setting, local_programs, mission_id, realtime_mission
-from petrobot.coordinator.mission.mission import Mission
-from petrobot.coordinator.mission.realtime import RealtimeMission
-from petrobot.coordinator.supervisor import Supervisor
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.realtime import RealtimeMission
+from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.directory import Directory, load
+from petrobot.services.comm.location_file import Directory, load
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
 from tests.waiting import beat
 

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.coordinator.engine import Stimulus
-from petrobot.coordinator.experience.learner import LearningSelector
 from petrobot.coordinator.launch import Setting, lockstep_cell
-from petrobot.coordinator.mission.mission import Mission
-from petrobot.coordinator.mission.partners import FirstAlternative, Store
+from petrobot.coordinator.learning.learner import LearningSelector
+from petrobot.coordinator.run.interfaces import FirstAlternative, Store
+from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.task import Task
-from petrobot.coordinator.taskfile import load
+from petrobot.coordinator.task.file import load
 from petrobot.services.action import Status
-from petrobot.services.comm.directory import Directory, parse
+from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.scripted import Line, Scripted
 
 TASK_FILE = Path(__file__).parent / "sorting.toml"

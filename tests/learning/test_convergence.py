@@ -1,7 +1,7 @@
 """Convergence on Bernoulli worlds: the fast variant's floor, the textbook gain beside it, negative
 controls that stick.
 
-The full study, with figures for every selector, is tests/bench/learning.py; these are its floors.
+The full study, with figures for every selector, is tools/bench/learning.py; these are its floors.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from petrobot.coordinator.learning.automata import NikolicFu
+from petrobot.coordinator.learning.automata import NikolicFu, Tracking
 from petrobot.coordinator.learning.batch import Trial
-from petrobot.coordinator.learning.rule import Rule
+from petrobot.coordinator.learning.rules import Rule
 from petrobot.coordinator.learning.selectors import RULES
-from petrobot.coordinator.learning.tracking import Tracking
 from tests.learning.worlds import Played, World, gapped, play
 
 SEEDS = 1000

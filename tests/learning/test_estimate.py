@@ -14,11 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from petrobot.coordinator.learning.estimate import Observation, Tally, merge
-from petrobot.coordinator.learning.intervals import clopper_pearson, wilson
-from petrobot.coordinator.learning.moments import Moments
-from petrobot.coordinator.learning.sample import SIZE, Sample, quantile
+from petrobot.coordinator.learning.estimate import SIZE, Observation, Sample, Tally, merge, quantile
 from petrobot.coordinator.learning.selectors import cost_of
+from petrobot.coordinator.learning.statistics import Moments, clopper_pearson, wilson
 from petrobot.coordinator.task import Executed, Status
 from tests.learning.conftest import COUNTED, OBSERVATIONS, tally_of
 

@@ -15,12 +15,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.experience.estimates_file import EstimatesError, EstimatesFile, Kept
 from petrobot.coordinator.learning.estimate import Key, Observation
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, Kept
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.passage import Flow, PassageKey
 from petrobot.coordinator.learning.selectors import make
+from petrobot.coordinator.learning.waits import Flow, PassageKey
 from petrobot.coordinator.task import Status
 from tests.learning.conftest import OBSERVATIONS, tally_of
 

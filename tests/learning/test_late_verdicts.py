@@ -11,16 +11,12 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.experience.estimates_file import EstimatesFile
-from petrobot.coordinator.experience.learning_session import (
-    LearningSession,
-    LearningSetting,
-    session_of,
-)
 from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.records import Correction, End, Record, of_plain, to_plain
+from petrobot.coordinator.learning.session import LearningSession, LearningSetting, session_of
 from petrobot.coordinator.task import Task
-from tests.mission.judged_parts import LEARNED, PARTS, directory, learned, sorting
+from tests.run.judged_parts import LEARNED, PARTS, directory, learned, sorting
 
 SELECTOR = "round_robin"
 

@@ -11,18 +11,14 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import Engine
-from petrobot.coordinator.experience.estimates_file import EstimatesFile
-from petrobot.coordinator.experience.learning_session import (
-    LearningSession,
-    LearningSetting,
-    session_of,
-)
 from petrobot.coordinator.launch import resumed_mission, with_runs
 from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.record.journal import JournalWriter, read_journal
-from petrobot.coordinator.record.recording import JournalStore
+from petrobot.coordinator.learning.session import LearningSession, LearningSetting, session_of
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Status
 from tests.learning.cell import TASK_FILE, directory, run, sorting
 from tests.learning.conftest import tally_of

@@ -15,14 +15,14 @@ import pytest
 
 from petrobot.coordinator.engine import Engine, Override, State
 from petrobot.coordinator.engine.instructions import Corrected, RunRecorded, StartRun
-from petrobot.coordinator.experience.learner import (
+from petrobot.coordinator.launch import Setting, lockstep_cell, with_runs
+from petrobot.coordinator.learning.estimate import Key
+from petrobot.coordinator.learning.learner import (
     ContextError,
     Contexts,
     LearningSelector,
     usual_contexts,
 )
-from petrobot.coordinator.launch import Setting, lockstep_cell, with_runs
-from petrobot.coordinator.learning.estimate import Key
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import (
     Choice,
@@ -33,10 +33,10 @@ from petrobot.coordinator.learning.records import (
     to_plain,
 )
 from petrobot.coordinator.learning.selectors import RULES
-from petrobot.coordinator.mission.realtime import RealtimeMission
-from petrobot.coordinator.operator.operation import Operation
-from petrobot.coordinator.record.journal import JournalWriter, read_journal
-from petrobot.coordinator.record.recording import JournalStore, replay
+from petrobot.coordinator.operator.commands import Operation
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.realtime import RealtimeMission
+from petrobot.coordinator.run.recording import JournalStore, replay
 from petrobot.coordinator.task import Executed, Status, Task
 from tests.learning.cell import directory, run, scripts, sorting
 

@@ -11,18 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.analysis.completion import completion
-from petrobot.coordinator.analysis.forecast import forecast
-from petrobot.coordinator.analysis.gspn import Chain
-from petrobot.coordinator.analysis.stochastic import Measured, stochastic_view
-from petrobot.coordinator.experience.learner import LearningSelector
-from petrobot.coordinator.experience.propagation import measured_from, propagate
+from petrobot.coordinator.analysis.time.completion import completion
+from petrobot.coordinator.analysis.time.gspn import Chain
+from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.launch import with_runs
-from petrobot.coordinator.learning.competing import incidences
 from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Estimates, Learning
+from petrobot.coordinator.learning.propagation import incidences, measured_from, propagate
 from petrobot.coordinator.task import Estimate, Executed, Status, Task
-from petrobot.coordinator.taskfile import loads
+from petrobot.coordinator.task.file import loads
 from tests.learning.cell import run, sorting
 
 SERIES = """

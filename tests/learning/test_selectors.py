@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.cli.learning import SELECTORS
+from petrobot.coordinator.cli.learning_options import SELECTORS
 from petrobot.coordinator.learning.batch import SUMS, Batch, Trial, drawn, restricted
 from petrobot.coordinator.learning.estimate import Observation, Tally
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.selectors import RULES, RuleSelector, make
-from petrobot.coordinator.learning.target import eligible
+from petrobot.coordinator.learning.selectors import RULES, RuleSelector, eligible, make
 from petrobot.coordinator.task import Executed, Status
 from tests.waiting import Limit
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from petrobot.coordinator.learning.batch import Array, Batch, Index, Trial
-from petrobot.coordinator.learning.rule import Rule
+from petrobot.coordinator.learning.rules import Rule
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.launch import Setting, lockstep_cell
-from petrobot.coordinator.mission.partners import FirstAlternative
-from petrobot.coordinator.taskfile import load
-from petrobot.services.comm.directory import load as load_directory
+from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.task.file import load
+from petrobot.services.comm.location_file import load as load_directory
 from petrobot.services.mobile.detection import (
     Detector,
     TemplateBank,

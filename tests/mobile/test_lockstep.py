@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.launch import Setting, lockstep_mission, lockstep_party
-from petrobot.coordinator.mission.lockstep_party import CoordinatorParty
-from petrobot.coordinator.mission.partners import FirstAlternative
-from petrobot.coordinator.taskfile import load
-from petrobot.services.comm.cell import Cell, Delays
-from petrobot.services.comm.directory import load as load_directory
+from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.run.lockstep import CoordinatorParty
+from petrobot.coordinator.task.file import load
+from petrobot.services.comm.location_file import load as load_directory
+from petrobot.services.comm.lockstep.cell import Cell, Delays
 
 ROOT = Path(__file__).parents[2]
 TASK = ROOT / "coordinator" / "tasks" / "follow_track.toml"

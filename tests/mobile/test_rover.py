@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.cia402 import Fault
+from petrobot.services.comm.canopen.cia402 import Fault
 from petrobot.services.mobile import driving
 from petrobot.services.mobile.odometry import Pose as Odo
 from petrobot.services.mobile.odometry import turned

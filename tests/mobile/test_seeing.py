@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.camera import MemoryImages
-from petrobot.services.comm.image import Image
+from petrobot.services.comm.streams.camera import MemoryImages
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.mobile import seeing
 from petrobot.services.mobile.camera import CameraError, FloorCamera
 from petrobot.services.mobile.sight import TrackAhead, TrackEnd

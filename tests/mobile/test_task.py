@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.analysis.commands import analyse_command
-from petrobot.coordinator.analysis.space import Limits
-from petrobot.coordinator.check import check
+from petrobot.coordinator.analysis.net.space import Limits
 from petrobot.coordinator.task import Scope, Task
-from petrobot.coordinator.taskfile import load
-from petrobot.services.comm.directory import Directory
-from petrobot.services.comm.directory import load as load_directory
+from petrobot.coordinator.task.check import check
+from petrobot.coordinator.task.file import load
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.location_file import load as load_directory
 
 ROOT = Path(__file__).parents[2]
 PATH = ROOT / "coordinator" / "tasks" / "follow_track.toml"

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import EMCY_BASE, HEARTBEAT_BASE, TPDO1_BASE, emergency
-from petrobot.services.comm.canopen_master import Phase, Power
-from petrobot.services.comm.cia402 import Command, Fault, State
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import EMCY_BASE, HEARTBEAT_BASE, TPDO1_BASE, emergency
+from petrobot.services.comm.canopen.cia402 import Command, Fault, State
+from petrobot.services.comm.canopen.master import Phase, Power
 from petrobot.services.mobile.wheel_drives import SILENT_CYCLES, WheelMaster
 from tests.mobile.conftest import Floor, Pose
 from tests.mobile.yard import Yard

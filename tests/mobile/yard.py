@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.party import TICK
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.mobile.rover import Rover
 from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
-from petrobot.services.setpoints import SetpointReceiver
-from petrobot.sim.rover import Rover as Body
-from petrobot.sim.rover_drives import RoverBus
-from petrobot.sim.rover_sensor import Echo, ReflectorSensor, look
-from petrobot.sim.track_truth import read_track_site
+from petrobot.services.worker.setpoints import SetpointReceiver
+from petrobot.sim.track.drives import RoverBus
+from petrobot.sim.track.rover import Rover as Body
+from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
+from petrobot.sim.track.truth import read_track_site
 from tests.mobile.conftest import Floor, Pose
 
 ROVER_FILE = Path(__file__).parents[2] / "services" / "mobile" / "rover.toml"

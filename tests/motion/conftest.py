@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from petrobot.services.action import Cancelled, Result, Wait
-from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.motion.arm import PERIOD, Arm
 from petrobot.services.motion.model import nominal_arm
-from petrobot.sim.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import DriveBus, ratings
 
 TABLE = tomllib.loads(
     files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")

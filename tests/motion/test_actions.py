@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.action import Status
-from petrobot.services.comm.cia402 import Fault
+from petrobot.services.comm.canopen.cia402 import Fault
 from petrobot.services.motion import actions
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.limits import Guard

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.cia402 import Fault
+from petrobot.services.comm.canopen.cia402 import Fault
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.limits import Guard
 from petrobot.services.motion.model import nominal_arm, nominal_cell

@@ -15,9 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm.can_hub import Hub
-from petrobot.services.comm.can_ports import PythonCanBus, StreamPort, open_can
-from petrobot.services.comm.can_stream import (
+from petrobot.services.comm.canopen.bus import CanBus, Frame
+from petrobot.services.comm.canopen.byte_stream import (
     EXTENDED,
     GREETING,
     REMOTE,
@@ -27,7 +26,8 @@ from petrobot.services.comm.can_stream import (
     encode,
     parse_channel,
 )
-from petrobot.services.comm.canbus import CanBus, Frame
+from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.canopen.ports import PythonCanBus, StreamPort, open_can
 from tests.waiting import Limit
 
 PATIENCE = 5.0

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm import canopen, cia402
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import (
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen import cia402
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import (
     Abort,
     Mapped,
     NmtCommand,
@@ -20,7 +21,7 @@ from petrobot.services.comm.canopen import (
     Transfer,
     Type,
 )
-from petrobot.services.comm.cia402 import Command, State
+from petrobot.services.comm.canopen.cia402 import Command, State
 from tests.waiting import Limit
 
 WRITTEN_OUT = [

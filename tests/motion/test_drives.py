@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm import canopen
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import (
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import (
     Abort,
     NmtCommand,
     NmtState,
@@ -20,7 +20,7 @@ from petrobot.services.comm.canopen import (
     Transfer,
     Type,
 )
-from petrobot.services.comm.cia402 import (
+from petrobot.services.comm.canopen.cia402 import (
     RECEIVED,
     SENT,
     Command,
@@ -32,7 +32,7 @@ from petrobot.services.comm.cia402 import (
     to_units,
 )
 from petrobot.services.motion.drive_link import DriveLink, DriveSettings
-from petrobot.sim.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import DriveBus, ratings
 from tests.waiting import Limit
 
 TPDO, RPDO = canopen.pdo_struct(SENT), canopen.pdo_struct(RECEIVED)

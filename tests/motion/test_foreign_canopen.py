@@ -14,17 +14,24 @@ from typing import Any
 import can
 import pytest
 
-from petrobot.services.comm.can_hub import Hub
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.cia402 import Command, Fault, Object, State, command_of, from_units
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia402 import (
+    Command,
+    Fault,
+    Object,
+    State,
+    command_of,
+    from_units,
+)
+from petrobot.services.comm.canopen.hub import Hub
 from petrobot.services.motion.drive_link import DriveSettings
 from petrobot.services.motion.drive_master import DriveMaster, Phase
-from petrobot.sim.drives import DriveBus, ratings
+from petrobot.sim.catching.drives import DriveBus, ratings
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
-EDS = str(files("petrobot.services.comm.eds").joinpath("joint_drive.eds"))
-INPUTS_EDS = str(files("petrobot.services.comm.eds").joinpath("digital_inputs.eds"))
+EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("joint_drive.eds"))
+INPUTS_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("digital_inputs.eds"))
 PATIENCE = 10.0
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.compiled import COMPILED, plain
+from petrobot.services.host.numba_kernels import COMPILED, plain
 from petrobot.services.motion.clearance import Point, clear, clear_step
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.limits import LOOKS, NEAR, Guard

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.directory import ActionEntry
-from petrobot.services.comm.party import TICK
-from petrobot.services.runner import Runner
-from petrobot.services.runs import Answered, Begin, Ended, Order, Report
+from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.worker.runner import Runner
+from petrobot.services.worker.runs import Answered, Begin, Ended, Order, Report
 
 OUTSIDE = Path(__file__).parent / "outside"
 """Stands for the folder of a laboratory's own packages."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.directory import (
+from petrobot.services.comm.location_file import (
     MEMORY_CALLS,
     Directory,
     DirectoryError,
@@ -29,7 +29,7 @@ port = 7302
 [nodes.world]
 host = "127.0.0.1"
 port = 7300
-sim = "petrobot.sim.laboratory:make_laboratory"
+sim = "petrobot.sim.catching.laboratory:make_laboratory"
 [devices.eye]
 node = "vision"
 driver = "json:JSONDecoder"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.cell import Cell
-from petrobot.services.comm.directory import load, verify_imports
-from petrobot.services.comm.notice import Ended
-from petrobot.services.lockstep_node import LockstepNode
+from petrobot.services.comm.calls.notices import Ended
+from petrobot.services.comm.location_file import load, verify_imports
+from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.node.lockstep import LockstepNode
 from petrobot.services.scripted import load as load_script
 from tests.node.test_lockstep import Coordinator
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.caller import PeerLost
+from petrobot.services.comm.calls.caller import PeerLost
 from tests.node.test_processes import Nodes, Operator, operator_of, pids
 
 pytestmark = pytest.mark.processes

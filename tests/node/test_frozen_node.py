@@ -17,11 +17,11 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.latch import ALL, Latch, latch_of
-from petrobot.services.device_process import DeviceLoop
-from petrobot.services.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
-from petrobot.services.pipe import Pipe
-from petrobot.services.remote import EMERGENCY_STOP, NODE_SILENT
+from petrobot.services.comm.calls.latch import ALL, Latch, latch_of
+from petrobot.services.node.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
+from petrobot.services.worker.device_process import DeviceLoop
+from petrobot.services.worker.pipe import Pipe
+from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
 from tests.node.test_heard import OneNode, cell
 from tests.node.test_parts import Moving, Process, states
 from tests.node.test_parts import Ports as NoPorts

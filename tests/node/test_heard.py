@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.directory import Directory, parse
-from petrobot.services.comm.messages import Call
-from petrobot.services.comm.notice import Accepted
+from petrobot.services.comm.calls.notices import Accepted
+from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.comm.protocol.messages import Call
 from tests.node.conftest import OUTSIDE
 from tests.node.test_processes import PATIENCE, ROOT, Operator, operator_of
 from tests.ports import free_ports

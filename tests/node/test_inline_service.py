@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.directory import ServiceEntry
-from petrobot.services.comm.messages import Call, Executed
-from petrobot.services.inline_service import inline_service
-from petrobot.services.runs import Judged
+from petrobot.services.comm.location_file import ServiceEntry
+from petrobot.services.comm.protocol.messages import Call, Executed
+from petrobot.services.node.node import inline_service
+from petrobot.services.worker.runs import Judged
 
 EVENTS: list[tuple[str, str, Mapping[str, Any]]] = []
 VERDICTS: list[tuple[str, Judged]] = []

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.caller import (
+from petrobot.services.comm.calls.caller import (
     Accepted,
     Answered,
     Caller,
@@ -22,13 +22,18 @@ from petrobot.services.comm.caller import (
     Notice,
     Progress,
 )
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.cell import Cell, Delays
-from petrobot.services.comm.channels import can_body, image_body, read_can, read_images_wanted
-from petrobot.services.comm.directory import Directory, DirectoryError, parse
-from petrobot.services.comm.messages import Call, Command, Hello
-from petrobot.services.comm.party import TICK, Envelope
-from petrobot.services.lockstep_node import LockstepNode
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.comm.lockstep.cell import Cell, Delays
+from petrobot.services.comm.lockstep.channels import (
+    can_body,
+    image_body,
+    read_can,
+    read_images_wanted,
+)
+from petrobot.services.comm.lockstep.party import TICK, Envelope
+from petrobot.services.comm.protocol.messages import Call, Command, Hello
+from petrobot.services.node.lockstep import LockstepNode
 
 CELL = """\
 schema = 1
@@ -41,7 +46,7 @@ port = 7402
 [nodes.world]
 host = "127.0.0.1"
 port = 7400
-sim = "petrobot.sim.laboratory:make_laboratory"
+sim = "petrobot.sim.catching.laboratory:make_laboratory"
 [devices.slide]
 node = "left"
 driver = "toy_cell.drivers:Slide"

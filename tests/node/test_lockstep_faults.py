@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from petrobot.services import watchdog
-from petrobot.services.comm.directory import ActionEntry
-from petrobot.services.place import InlinePlace
-from petrobot.services.runs import Begin, Ended, Told
+from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.node import watchdog
+from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.worker.runs import Begin, Ended, Told
 from tests.node.conftest import OUTSIDE, Clock
 from tests.node.test_heard import FAULTS
 from tests.node.test_processes import PATIENCE, ROOT
@@ -30,8 +30,8 @@ class Ports:
     now = 0.0
 
     def raise_event(self, name: str, **data: Any) -> None:
-        from petrobot.services.comm.messages import Event
-        from petrobot.services.context import checked
+        from petrobot.services.comm.protocol.messages import Event
+        from petrobot.services.worker.context import checked
 
         checked(Event(name, "it", 1, data))
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.directory import DirectoryError, load, parse
-from petrobot.services.comm.directory_places import is_loopback, misplaced
+from petrobot.services.comm.location_file import DirectoryError, load, parse
+from petrobot.services.comm.location_file.promises import is_loopback, misplaced
 
 SHIPPED = Path(__file__).parents[2] / "services.toml"
 VISION = 'host = "127.0.0.1"\nport = 7301'
@@ -107,7 +107,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "laboratory:make_laboratory",
         "laboratory:make_lab",
-        ":16: nodes.laboratory.sim: 'petrobot.sim.laboratory' has no 'make_lab'",
+        ":16: nodes.laboratory.sim: 'petrobot.sim.catching.laboratory' has no 'make_lab'",
     ),
     (
         "deadline = 10.0",

@@ -21,21 +21,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from petrobot.services import memory as memory_module
 from petrobot.services.action import Context, Result, Status, failure, provisional, success
-from petrobot.services.comm.directory import ActionEntry
-from petrobot.services.comm.parentage import until_ended
-from petrobot.services.device_process import LINKED, DeviceLoop
-from petrobot.services.memory import Memory, event_name
-from petrobot.services.outlets import Outlets
-from petrobot.services.pipe import Counter, NewestLink, Pipe, counter_memory, link_pair
-from petrobot.services.place import InlinePlace
+from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.host.parent_death import until_ended
+from petrobot.services.node import memory as memory_module
+from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.memory import Memory, event_name
+from petrobot.services.node.node import Timers
 from petrobot.services.rehearsal import StillRunningError, rehearse
-from petrobot.services.remote import CyclicDriver, DeviceCommand, RemoteDriver
-from petrobot.services.runs import Answered, Begin, Ended, Hold, Sent, Stop, Told, flat, record
 from petrobot.services.scripted import ScriptError, load
-from petrobot.services.setpoints import SetpointReceiver
-from petrobot.services.timers import Timers
+from petrobot.services.worker.device_process import LINKED, DeviceLoop
+from petrobot.services.worker.outlets import Outlets
+from petrobot.services.worker.pipe import Counter, NewestLink, Pipe, counter_memory, link_pair
+from petrobot.services.worker.remote import CyclicDriver, DeviceCommand, RemoteDriver
+from petrobot.services.worker.runs import (
+    Answered,
+    Begin,
+    Ended,
+    Hold,
+    Sent,
+    Stop,
+    Told,
+    flat,
+    record,
+)
+from petrobot.services.worker.setpoints import SetpointReceiver
 from tests.node.conftest import Clock
 from tests.waiting import Limit
 

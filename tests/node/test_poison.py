@@ -18,13 +18,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from petrobot.services.action import Result, Status, success
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.codec import ProtocolError, decode, encode
-from petrobot.services.comm.directory import parse
-from petrobot.services.comm.notice import PeerLost
-from petrobot.services.context import checked, checked_result
-from petrobot.services.pipe import Pipe
-from petrobot.services.runs import Ended, flat, record
+from petrobot.services.comm.calls.notices import PeerLost
+from petrobot.services.comm.location_file import parse
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.codec import ProtocolError, decode, encode
+from petrobot.services.worker.context import checked, checked_result
+from petrobot.services.worker.pipe import Pipe
+from petrobot.services.worker.runs import Ended, flat, record
 from tests.node.conftest import Bench
 from tests.node.test_heard import OneNode
 from tests.node.test_processes import Operator, operator_of
@@ -271,8 +271,8 @@ def test_a_run_that_returns_anything_ends_once_and_alone(value: Any) -> None:
         await ctx.sleep(0.02)
         return success()
 
-    from petrobot.services.comm.directory import ActionEntry
-    from petrobot.services.runner import Runner
+    from petrobot.services.comm.location_file import ActionEntry
+    from petrobot.services.worker.runner import Runner
     from tests.node.conftest import Clock
 
     clock = Clock()

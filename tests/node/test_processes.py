@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.directory import Directory, parse
-from petrobot.services.comm.lockstep import Member
-from petrobot.services.comm.messages import Answer, Call, Command, Hello, Outcome
-from petrobot.services.comm.notice import Accepted, Answered, EventArrived, Notice
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.notices import Accepted, Answered, EventArrived, Notice
+from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.comm.lockstep.mesh import Member
+from petrobot.services.comm.protocol.messages import Answer, Call, Command, Hello, Outcome
 from tests.node.conftest import OUTSIDE
 from tests.node.test_lockstep import CALLS, Coordinator, World, trace_of
 from tests.node.test_lockstep import CELL as LOCKSTEP

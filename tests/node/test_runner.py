@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
-from petrobot.services.comm.party import TICK
-from petrobot.services.context import CallFailed
-from petrobot.services.runner import GRACE, STOP_LIMIT, Runner
-from petrobot.services.runs import (
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.worker.context import CallFailed
+from petrobot.services.worker.runner import GRACE, STOP_LIMIT, Runner
+from petrobot.services.worker.runs import (
     Asked,
     Begin,
     Dropped,
@@ -380,7 +380,7 @@ def test_never_two_runs_on_a_device_and_each_ends_once(
 
 
 def _entry(name: str) -> Any:
-    from petrobot.services.comm.directory import ActionEntry
+    from petrobot.services.comm.location_file import ActionEntry
 
     return ActionEntry(name, "tests:none", "task", "here", "it")
 

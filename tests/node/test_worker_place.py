@@ -13,22 +13,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.pipe import NewestLink
-from petrobot.services.remote import EMERGENCY_STOP
-from petrobot.services.runner import GRACE, STOP_LIMIT
-from petrobot.services.runs import (
-    Answered,
-    Begin,
-    Ended,
-    Hold,
-    Order,
-    Raised,
-    Stop,
-    Told,
-    flat,
-    record,
+from petrobot.services.node.worker_host import (
+    MARGIN,
+    NEXT,
+    NOT_READY,
+    PAUSES,
+    SILENT,
+    START_LIMIT,
+    Happening,
+    Stage,
+    WorkerPlace,
 )
-from petrobot.services.worker import (
+from petrobot.services.worker.pipe import NewestLink
+from petrobot.services.worker.process import (
     COMMAND,
     FAILED,
     LINK_LOST,
@@ -39,16 +36,19 @@ from petrobot.services.worker import (
     WANTED,
     Setup,
 )
-from petrobot.services.worker_place import (
-    MARGIN,
-    NEXT,
-    NOT_READY,
-    PAUSES,
-    SILENT,
-    START_LIMIT,
-    Happening,
-    Stage,
-    WorkerPlace,
+from petrobot.services.worker.remote import EMERGENCY_STOP
+from petrobot.services.worker.runner import GRACE, STOP_LIMIT
+from petrobot.services.worker.runs import (
+    Answered,
+    Begin,
+    Ended,
+    Hold,
+    Order,
+    Raised,
+    Stop,
+    Told,
+    flat,
+    record,
 )
 from tests.node.conftest import Clock
 from tests.waiting import Limit

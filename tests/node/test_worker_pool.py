@@ -8,9 +8,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
-from petrobot.services.worker import COMMAND, STREAM_AT, WANTED, Setup
-from petrobot.services.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
+from petrobot.services.node.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
+from petrobot.services.worker.process import COMMAND, STREAM_AT, WANTED, Setup
+from petrobot.services.worker.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
 from tests.node.conftest import Clock
 from tests.node.test_worker_place import FakeChild
 from tests.waiting import Limit

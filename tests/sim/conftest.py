@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import NmtCommand, Type, map_pdo, nmt, sdo_write_request
-from petrobot.services.comm.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
-from petrobot.sim.laboratory import Laboratory
-from petrobot.sim.puma_model import ArmModel
-from petrobot.sim.site import Site, read_site
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import NmtCommand, Type, map_pdo, nmt, sdo_write_request
+from petrobot.services.comm.canopen.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
+from petrobot.sim.catching.laboratory import Laboratory
+from petrobot.sim.catching.puma_model import ArmModel
+from petrobot.sim.catching.site import Site, read_site
 from tests.sim.laboratory_bench import LaboratoryBench
 
 REPOSITORY = Path(__file__).parents[2]

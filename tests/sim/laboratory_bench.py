@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.channels import can_body, images_wanted, read_can
-from petrobot.services.comm.messages import Call, Hello, Outcome
-from petrobot.services.comm.party import TICK, Envelope, Party
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.lockstep.channels import can_body, images_wanted, read_can
+from petrobot.services.comm.lockstep.party import TICK, Envelope, Party
+from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
 
 
 class BusMaster(Protocol):

@@ -14,13 +14,13 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.cell import Delays
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.directory import Directory, load
-from petrobot.services.comm.lockstep import Member
-from petrobot.services.comm.messages import Call, Hello, Outcome
-from petrobot.services.comm.party import Envelope
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.location_file import Directory, load
+from petrobot.services.comm.lockstep.cell import Delays
+from petrobot.services.comm.lockstep.mesh import Member
+from petrobot.services.comm.lockstep.party import Envelope
+from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
 from petrobot.sim.realtime import LaboratoryShell
 
 REPOSITORY = Path(__file__).parents[2]

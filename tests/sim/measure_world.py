@@ -55,7 +55,7 @@ def measure(regime: str, rate: float, parts: bool) -> None:
     """One line of figures."""
     from conftest import CELL_FILE, Bench  # type: ignore[import-not-found]
 
-    from petrobot.sim.site import read_site
+    from petrobot.sim.catching.site import read_site
 
     bench, meter = Bench(read_site(CELL_FILE), seed=1, regime=regime), Meter()
     lab = bench.lab

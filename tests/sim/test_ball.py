@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from petrobot.sim.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
 
 MODEL = BallModel(radius=0.02, mass=0.0027, inertia_factor=2.0 / 3.0, gravity=9.81, friction=0.2)
 RESISTANCE = 0.006

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm import canopen
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import NmtCommand, NmtState
-from petrobot.services.comm.cia402 import RECEIVED, Command, to_units
-from petrobot.sim.drives import DriveBus
-from petrobot.sim.puma import ArmPlant
-from petrobot.sim.site import Site
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import NmtCommand, NmtState
+from petrobot.services.comm.canopen.cia402 import RECEIVED, Command, to_units
+from petrobot.sim.catching.drives import DriveBus
+from petrobot.sim.catching.puma import ArmPlant
+from petrobot.sim.catching.site import Site
 
 CYCLE, STEP = 0.004, 0.002
 RPDO = canopen.pdo_struct(RECEIVED)

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.sim.ball import BallModel, BallState, TableMotion, fly
-from petrobot.sim.contact import ContactSpace, quaternion, twist
-from petrobot.sim.puma_model import Frame3
-from petrobot.sim.site import Site
-from petrobot.sim.truth import Vector, rotation_from_vector
+from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.catching.contact import ContactSpace, quaternion, twist
+from petrobot.sim.catching.puma_model import Frame3
+from petrobot.sim.catching.site import Site
+from petrobot.sim.catching.truth import Vector, rotation_from_vector
 
 UPRIGHT = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.3, 0.0, 0.4))
 FAR = UPRIGHT._replace(origin=(-2.0, 0.0, 0.5))

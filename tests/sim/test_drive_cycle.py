@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm import canopen
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import NmtCommand, NmtState, SdoClient, Transfer, Type
-from petrobot.services.comm.cia402 import RECEIVED, SENT, Command, Fault, Object, to_units
-from petrobot.sim import drives
-from petrobot.sim.drives import Drive, DriveBus
-from petrobot.sim.servo import DriveRating
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import NmtCommand, NmtState, SdoClient, Transfer, Type
+from petrobot.services.comm.canopen.cia402 import RECEIVED, SENT, Command, Fault, Object, to_units
+from petrobot.sim.catching import drives
+from petrobot.sim.catching.drives import Drive, DriveBus
+from petrobot.sim.catching.servo import DriveRating
 from tests.waiting import Limit
 
 CYCLE = 0.004

@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm import compiled
-from petrobot.services.comm.compiled import COMPILED, SWITCH, packed
-from petrobot.sim import arm_motion, cup_motion
-from petrobot.sim.arm_motion import (
+from petrobot.services.host import numba_kernels as compiled
+from petrobot.services.host.numba_kernels import COMPILED, SWITCH, packed
+from petrobot.sim.catching import arm_motion
+from petrobot.sim.catching import site as cup_motion
+from petrobot.sim.catching.arm_motion import (
     Matrix,
     Six,
     accelerated,
@@ -29,8 +30,8 @@ from petrobot.sim.arm_motion import (
     stepped,
     stepped_packed,
 )
-from petrobot.sim.cup_motion import Triple, carried, numbers_of
-from petrobot.sim.puma_model import ArmModel
+from petrobot.sim.catching.puma_model import ArmModel
+from petrobot.sim.catching.site import Triple, carried, numbers_of
 
 ZERO: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 TALL: Six = (1e9, 1e9, 1e9, 1e9, 1e9, 1e9)
@@ -226,7 +227,7 @@ def test_numba_can_be_left_out() -> None:
     """The switch in the environment: kernels run as they stand, whether numba is installed or
     not."""
     code = (
-        "import sys; import petrobot.sim.arm_motion as m; print(type(m.stepped).__name__, "
+        "import sys; import petrobot.sim.catching.arm_motion as m; print(type(m.stepped).__name__, "
         "'numba' in sys.modules)"
     )
     found = subprocess.run(

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.channels import images_wanted
-from petrobot.services.comm.messages import Executed
-from petrobot.services.comm.party import TICK
-from petrobot.sim.course import Outcome
+from petrobot.services.comm.lockstep.channels import images_wanted
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.sim.catching.course import Outcome
+from petrobot.sim.catching.site import Site
+from petrobot.sim.catching.thrower import draw_throw
 from petrobot.sim.exposures import Exposures
-from petrobot.sim.site import Site
-from petrobot.sim.thrower import draw_throw
 
 REPOSITORY = Path(__file__).parents[2]
 Bench = Any

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.oracle import Oracle, Verdict
-from petrobot.sim.site import CupMount, Site
-from petrobot.sim.thrower import draw_throw
-from petrobot.sim.truth import Truth
+from petrobot.sim.catching.oracle import Oracle, Verdict
+from petrobot.sim.catching.site import CupMount, Site
+from petrobot.sim.catching.thrower import draw_throw
+from petrobot.sim.catching.truth import Truth
 
 THROWS = 60
 
@@ -35,7 +35,7 @@ def test_nearly_every_ball_of_the_regimes_can_be_reached(
 @pytest.mark.parametrize("regime", ["A", "C"])
 def test_its_poses_hold_the_cup_where_the_ball_will_be(site: Site, regime: str) -> None:
     """By the mount's and the arm's own forward kinematics, the ball's course by its closed form."""
-    from petrobot.sim.ball import BallModel, TableMotion, fly
+    from petrobot.sim.catching.ball import BallModel, TableMotion, fly
 
     truth = site.truth(regime)
     oracle, mount = Oracle(site.arm, truth, site.cell), CupMount(site.arm, truth)
@@ -107,7 +107,7 @@ def best_by_closed_form(site: Site, truth: Truth, oracle: Oracle, n: int) -> flo
     closed-form inverse kinematics."""
     from petrobot.services.motion.kinematics import Puma
     from petrobot.services.motion.model import nominal_arm
-    from petrobot.sim.ball import BallModel, TableMotion
+    from petrobot.sim.catching.ball import BallModel, TableMotion
 
     oracle._rules = {
         **oracle._rules,

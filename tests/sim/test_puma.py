@@ -12,12 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.puma import ArmPlant, RigidBody
-from petrobot.sim.puma_model import ArmModel, Link
-from petrobot.sim.puma_urdf import urdf
-from petrobot.sim.servo import JointServo
-from petrobot.sim.site import Site
-from petrobot.sim.truth import Vector
+from petrobot.sim.catching.puma import ArmPlant, RigidBody, urdf
+from petrobot.sim.catching.puma_model import ArmModel, Link
+from petrobot.sim.catching.servo import JointServo
+from petrobot.sim.catching.site import Site
+from petrobot.sim.catching.truth import Vector
 
 GRAVITY = 9.81
 ANGLES = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6)

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.camera import StreamImages
-from petrobot.services.comm.can_ports import StreamPort
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.directory import load
-from petrobot.services.comm.messages import Answer, Call, Command, Hello, Outcome
-from petrobot.services.comm.notice import Answered, Notice
-from petrobot.services.comm.party import TICK
-from petrobot.sim.laboratory import Laboratory
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.notices import Answered, Notice
+from petrobot.services.comm.canopen.ports import StreamPort
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.services.comm.protocol.messages import Answer, Call, Command, Hello, Outcome
+from petrobot.services.comm.streams.camera import StreamImages
+from petrobot.sim.catching.laboratory import Laboratory
+from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
-from petrobot.sim.truth import LaboratoryError
 from tests.ports import free_ports
 from tests.sim.laboratory_shell import (
     PATIENCE,
@@ -42,7 +42,7 @@ schema = 1
 [nodes.laboratory]
 host = "127.0.0.1"
 port = {node}
-sim = "petrobot.sim.laboratory:make_laboratory"
+sim = "petrobot.sim.catching.laboratory:make_laboratory"
 [nodes.robot]
 host = "127.0.0.1"
 port = {coordinator}
@@ -273,7 +273,7 @@ def test_it_is_a_member_of_a_lock_step_cell(tmp_path: Path) -> None:
         ("schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\n", "write sim ="),
         (
             "schema = 1\n[nodes.l]\nhost = '127.0.0.1'\nport = 7999\nsim = "
-            "'petrobot.sim.laboratory:make_laboratory'\n",
+            "'petrobot.sim.catching.laboratory:make_laboratory'\n",
             "[parameters] cell is missing",
         ),
     ],

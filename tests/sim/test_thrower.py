@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from petrobot.sim.ball import BallModel, TableMotion
-from petrobot.sim.site import Site
-from petrobot.sim.thrower import Thrower, draw_throw
+from petrobot.sim.catching.ball import BallModel, TableMotion
+from petrobot.sim.catching.site import Site
+from petrobot.sim.catching.thrower import Thrower, draw_throw
 
 REGIMES = {"A": (0.7, 1.5), "B": (1.5, 2.0), "C": (2.0, 2.5)}
 

@@ -8,10 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from petrobot.sim.catching.puma_model import read_arm
+from petrobot.sim.catching.site import Site, read_site
+from petrobot.sim.catching.truth import (
+    LABORATORY_FILE,
+    LaboratoryError,
+    Truth,
+    read_toml,
+    read_truth,
+)
 from petrobot.sim.exposures import camera_of
-from petrobot.sim.puma_model import read_arm
-from petrobot.sim.site import Site, read_site
-from petrobot.sim.truth import LABORATORY_FILE, LaboratoryError, Truth, read_toml, read_truth
 
 SETTINGS = read_toml(LABORATORY_FILE)
 

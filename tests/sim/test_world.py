@@ -10,13 +10,13 @@ from functools import partial
 
 import pytest
 
-from petrobot.services.comm.party import TICK
-from petrobot.sim.ball import BallState, TableMotion, fly
-from petrobot.sim.course import Course, Outcome
-from petrobot.sim.puma_model import Frame3
-from petrobot.sim.site import Site
-from petrobot.sim.thrower import Throw, draw_throw
-from petrobot.sim.world import Where, World
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.catching.ball import BallState, TableMotion, fly
+from petrobot.sim.catching.course import Course, Outcome
+from petrobot.sim.catching.puma_model import Frame3
+from petrobot.sim.catching.site import Site
+from petrobot.sim.catching.thrower import Throw, draw_throw
+from petrobot.sim.catching.world import Where, World
 
 AWAY = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, 0.0, 0.3))
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.services.action import Cancelled, Result, Status, Wait
-from petrobot.services.comm.camera import MemoryImages
-from petrobot.services.comm.image import Image
-from petrobot.sim.camera import PinholeCamera
-from petrobot.sim.truth import read_truth
+from petrobot.services.comm.streams.camera import MemoryImages
+from petrobot.services.comm.streams.image import Image
+from petrobot.sim.catching.camera import PinholeCamera
+from petrobot.sim.catching.truth import read_truth
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parents[2]

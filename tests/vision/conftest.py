@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from petrobot.services.vision.camera import Camera
-from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import Bench, BenchContext, BenchPorts, read_cell, true_view
 
 

@@ -28,7 +28,7 @@ from petrobot.services.vision.prediction import (
     Predictor,
     Surface,
 )
-from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import (
     ROOT,
     Array,

@@ -12,7 +12,7 @@ import pytest
 from petrobot.services.action import Cancelled, Result, Status
 from petrobot.services.vision import actions
 from petrobot.services.vision.camera import Camera
-from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import Ball, Bench, BenchContext, BenchPorts, draw_ball, run_action
 
 LOCATORS = {

@@ -30,8 +30,8 @@ from petrobot.services.vision.calibration_file import (
     read_views,
 )
 from petrobot.services.vision.optics import Array, Optics
-from petrobot.sim.board import HELD, LAID, board_views, save_board_views
-from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.catching.board import HELD, LAID, board_views, save_board_views
+from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.test_optics import drawn_optics
 
 Views = list[BoardView]
@@ -220,7 +220,7 @@ def test_missing_images_are_taken_from_the_camera(
 ) -> None:
     """A folder with views.toml alone: each image is taken when the operator says so, and again when
     the board is cut off."""
-    from petrobot.services.comm.image import Image
+    from petrobot.services.comm.streams.image import Image
 
     lines = (folder / "views.toml").read_text(encoding="utf-8").split("[[views]]")
     (tmp_path / "views.toml").write_text("[[views]]".join(lines[:3]), encoding="utf-8")

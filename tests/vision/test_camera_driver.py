@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from petrobot.services.action import Result, Status
-from petrobot.services.comm.image import Image
+from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.actions import locate_background, predict_least_squares
 from petrobot.services.vision.calibration_file import DEFAULT, CalibrationFileError
 from petrobot.services.vision.camera import CELL, Camera, CameraError

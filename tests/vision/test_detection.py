@@ -24,7 +24,7 @@ from petrobot.services.vision.location import (
 )
 from petrobot.services.vision.optics import Array
 from petrobot.services.vision.table import TableView
-from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.catching.camera import PinholeCamera
 
 DETECTORS = ("background", "mog2", "hough", "threshold", "compensated")
 IMAGES = 70

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.comm.camera import (
+from petrobot.services.comm.streams.camera import (
     IMAGE_HEADER,
     ImageDecoder,
     ImageFormatError,
@@ -24,8 +24,8 @@ from petrobot.services.comm.camera import (
     encode_image,
     open_images,
 )
-from petrobot.services.comm.capture import CaptureImages
-from petrobot.services.comm.image import Image, ImageSource
+from petrobot.services.comm.streams.capture import CaptureImages
+from petrobot.services.comm.streams.image import Image, ImageSource
 
 
 def grey(level: int, shape: tuple[int, int] = (48, 64)) -> np.ndarray:

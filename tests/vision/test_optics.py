@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from petrobot.services.vision.optics import Optics
 from petrobot.services.vision.table import TableView
-from petrobot.sim.camera import PinholeCamera
+from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import true_view
 
 

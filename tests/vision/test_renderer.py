@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from petrobot.sim.camera import PinholeCamera
-from petrobot.sim.scenery import Chessboard
+from petrobot.sim.catching.camera import PinholeCamera
+from petrobot.sim.catching.scenery import Chessboard
 from tests.vision.bench import true_view
 
 
@@ -52,7 +52,7 @@ def test_a_ball_is_where_opencv_projects_its_centre(
 def test_a_moving_ball_is_a_streak_about_its_place_at_mid_exposure(
     clean: PinholeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("petrobot.sim.camera.SHADOW_DEPTH", 0.0)
+    monkeypatch.setattr("petrobot.sim.catching.camera.SHADOW_DEPTH", 0.0)
     ball = np.array([1.45, 0.10, 0.62])
     empty = clean.background.astype(float)
     still, moving = (
@@ -204,7 +204,7 @@ def test_a_scene_drawn_in_stripes_is_the_scene_drawn_at_once(
         PinholeCamera(cell, true_view(cell), np.random.default_rng(0)) for _ in range(2)
     )
     striped.warm_up()
-    monkeypatch.setattr("petrobot.sim.scenery.STRIPE", whole.height)
+    monkeypatch.setattr("petrobot.sim.catching.scenery.STRIPE", whole.height)
     whole.warm_up()
     assert np.array_equal(striped.background, whole.background) and np.array_equal(
         striped._rays, whole._rays

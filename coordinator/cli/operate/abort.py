@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
 
 EXAMPLE = "petrobot abort"
 

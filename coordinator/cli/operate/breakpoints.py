@@ -11,7 +11,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
 
 EXAMPLE = "petrobot break start"
 
@@ -50,7 +50,7 @@ def _words(breakpoints: list[str]) -> str:
 
 
 async def _list(options: argparse.Namespace) -> int:
-    from petrobot.coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.operator.client import OperatorError
 
     door = hand.find(options)
     try:

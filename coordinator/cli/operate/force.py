@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
 
 EXAMPLE = "petrobot force catch_ball missed"
 

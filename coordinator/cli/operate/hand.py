@@ -16,7 +16,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import write_json
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
     from petrobot.coordinator.operator.door_file import Door
 
 Answer = dict[str, Any]
@@ -81,7 +81,7 @@ async def _give(
     data: Callable[[OperatorClient], dict[str, Any]] | None,
     told: Callable[[OperatorClient, Answer], Awaitable[str]] | None,
 ) -> int:
-    from petrobot.coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.operator.client import OperatorError
 
     door = find(options)
     try:
@@ -111,7 +111,7 @@ def show(options: argparse.Namespace, answer: Mapping[str, Any], text: str) -> N
 def find(options: argparse.Namespace) -> Door:
     """The door of the run that is meant."""
     from petrobot.coordinator.operator.door_file import find_door
-    from petrobot.coordinator.record.runfolder import NoRunError
+    from petrobot.coordinator.run.folder import NoRunError
 
     try:
         return find_door(options.run, options.journal)
@@ -122,7 +122,7 @@ def find(options: argparse.Namespace) -> Door:
 def connect(door: Door, name: str | None) -> OperatorClient:
     """A client of the run. The same name is the same operator at each call: the controls stay his
     for 10 s in between."""
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
 
     name = name or user_name()
     secret = hmac.digest(door.token.encode(), f"operator {name}".encode(), hashlib.sha256).hex()
@@ -153,7 +153,7 @@ async def take_controls(hand: OperatorClient, wait: float | None) -> None:
 
 def named(known: Mapping[str, Any], name: str, what: str) -> str:
     """A name that the task knows. Raises CommandError (2) with the nearest ones."""
-    from petrobot.coordinator.conditions.wording import nearest
+    from petrobot.coordinator.task.wording import nearest
 
     if name not in known:
         raise CommandError(2, f"no {what} is named {name!r}{nearest(name, list(known))}")

@@ -9,7 +9,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.operate import hand
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
 
 EXAMPLE = "petrobot override track_ball predict_kalman"
 

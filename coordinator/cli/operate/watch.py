@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.operate import hand
-from petrobot.services.comm.json_text import json_text
+from petrobot.services.host.json_text import json_text
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.hmi.client import OperatorClient
+    from petrobot.coordinator.operator.client import OperatorClient
 
 EXAMPLE = "petrobot watch --json - | jq .kind"
 ENDED = {"success": 0, "failure": 1, "error": 1, "aborted": 1, "stopped": 1}
@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 async def _watch(options: argparse.Namespace, out: TextIO) -> int:
-    from petrobot.coordinator.hmi.client import OperatorError
+    from petrobot.coordinator.operator.client import OperatorError
 
     door = hand.find(options)
     try:

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import (
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import (
     SYNC,
     NmtCommand,
     Type,
@@ -22,11 +22,11 @@ from petrobot.services.comm.canopen import (
     sdo_read_request,
     sdo_write_request,
 )
-from petrobot.services.comm.channels import can_body
-from petrobot.services.comm.cia402 import SENT, VELOCITY_RECEIVED, Mode, Object, to_units
-from petrobot.services.comm.party import TICK
-from petrobot.sim.track_laboratory import TrackLaboratory
-from petrobot.sim.track_truth import TrackSite, read_track_site
+from petrobot.services.comm.canopen.cia402 import SENT, VELOCITY_RECEIVED, Mode, Object, to_units
+from petrobot.services.comm.lockstep.channels import can_body
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.track.laboratory import TrackLaboratory
+from petrobot.sim.track.truth import TrackSite, read_track_site
 from tests.sim.laboratory_bench import LaboratoryBench
 
 REPOSITORY = Path(__file__).parents[3]

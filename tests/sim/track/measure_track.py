@@ -44,7 +44,7 @@ def measure(regime: str) -> None:
     """One paragraph of figures."""
     from conftest import ROVER_FILE, RoverBench  # type: ignore[import-not-found]
 
-    from petrobot.sim.track_truth import read_track_site
+    from petrobot.sim.track.truth import read_track_site
 
     bench = RoverBench(read_track_site(ROVER_FILE), seed=1, regime=regime)
     begun = time.process_time()

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.rover import Rover
-from petrobot.sim.track_elements import Pose
-from petrobot.sim.track_truth import RoverTruth, TrackSite, WheelTruth
+from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.truth import RoverTruth, TrackSite, WheelTruth
 
 SETTINGS = {
     "placed": 0.0,

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.can_hub import Hub
-from petrobot.services.comm.canbus import Frame
-from petrobot.services.comm.canopen import NmtState as Network
-from petrobot.services.comm.canopen import Type, heartbeat, sdo_write_request
-from petrobot.services.comm.cia402 import (
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import NmtState as Network
+from petrobot.services.comm.canopen.cia301 import Type, heartbeat, sdo_write_request
+from petrobot.services.comm.canopen.cia402 import (
     Fault,
     Mode,
     Object,
@@ -27,15 +26,16 @@ from petrobot.services.comm.cia402 import (
     from_units,
     state_of,
 )
-from petrobot.sim.rover import Rover
-from petrobot.sim.rover_drives import RoverBus
-from petrobot.sim.rover_sensor import Echo, ReflectorSensor
-from petrobot.sim.track_truth import TrackSite
+from petrobot.services.comm.canopen.hub import Hub
+from petrobot.sim.track.drives import RoverBus
+from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.sensor import Echo, ReflectorSensor
+from petrobot.sim.track.truth import TrackSite
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name
 BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
-DRIVE_EDS = str(files("petrobot.services.comm.eds").joinpath("wheel_drive.eds"))
-SENSOR_EDS = str(files("petrobot.services.comm.eds").joinpath("reflector_sensor.eds"))
+DRIVE_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("wheel_drive.eds"))
+SENSOR_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("reflector_sensor.eds"))
 PATIENCE = 10.0
 U16, U32, I32 = Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER32
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.rover_sensor import look
-from petrobot.sim.track_elements import Pose
-from petrobot.sim.track_truth import SensorTruth, TrackSite
+from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.sensor import look
+from petrobot.sim.track.truth import SensorTruth, TrackSite
 
 PERFECT = SensorTruth(
     forward=0.1,

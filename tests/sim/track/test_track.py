@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track import BOARD, KINDS, Track, TrackError
-from petrobot.sim.track_elements import BAR_LENGTH, BAR_MARGIN, HALF_WIDTH, SQUARE, Element, Kind
-from petrobot.sim.track_floor import COARSE, FINE, ORIGIN, Floor
+from petrobot.sim.track.course import BOARD, KINDS, Track, TrackError
+from petrobot.sim.track.elements import BAR_LENGTH, BAR_MARGIN, HALF_WIDTH, SQUARE, Element, Kind
+from petrobot.sim.track.floor import COARSE, FINE, ORIGIN, Floor
 
 tracks = st.builds(
     Track.by_seed,

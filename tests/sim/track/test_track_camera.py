@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track import Track
-from petrobot.sim.track_camera import FloorCamera, Motion, Mount
-from petrobot.sim.track_floor import Floor
-from petrobot.sim.track_light import Hall
-from petrobot.sim.track_truth import LightTruth, TrackSite
+from petrobot.sim.track.camera import FloorCamera, Motion, Mount
+from petrobot.sim.track.course import Track
+from petrobot.sim.track.floor import Floor
+from petrobot.sim.track.laboratory import Hall
+from petrobot.sim.track.truth import LightTruth, TrackSite
 
 NOMINAL = Mount(0.10, 0.60, 0.663, 0.0, 0.0, 140.0, (79.5, 59.5), 160, 120)
 TRACK = Track.of((1, 1), 0, "SSSSS")

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.directory import load
-from petrobot.services.comm.messages import Outcome
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.protocol.messages import Outcome
+from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import SERVICES
-from petrobot.sim.track import Track
-from petrobot.sim.track_faults import ROVER_FAULTS
-from petrobot.sim.track_laboratory import TrackLaboratory, make_laboratory
-from petrobot.sim.track_truth import TrackSite, read_track_site
-from petrobot.sim.truth import LaboratoryError
+from petrobot.sim.track.course import Track
+from petrobot.sim.track.laboratory import ROVER_FAULTS, TrackLaboratory, make_laboratory
+from petrobot.sim.track.truth import TrackSite, read_track_site
 
 Bench = Callable[..., Any]
 REPOSITORY = Path(__file__).parents[3]
@@ -327,8 +326,8 @@ def test_a_seed_gives_one_run_in_another_process(rover_bench: Bench) -> None:
     program = (
         "import json, sys\n"
         "from pathlib import Path\n"
-        "from petrobot.sim.track_truth import read_track_site\n"
-        "from petrobot.sim.track_laboratory import TrackLaboratory\n"
+        "from petrobot.sim.track.truth import read_track_site\n"
+        "from petrobot.sim.track.laboratory import TrackLaboratory\n"
         "lab = TrackLaboratory('l', read_track_site(Path(sys.argv[1])), str, seed=3, "
         "regime='arcs+flash')\n"
         "print([int(lab.picture(t * 0.04).astype(int).sum()) for t in range(20)], "

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from petrobot.sim.track import Track
-from petrobot.sim.track_film import FilmError, View, film, images, main
-from petrobot.sim.track_plan import floor_plan, pictures, summary
+from petrobot.sim.track.course import Track
+from petrobot.sim.track.film import FilmError, View, film, images, main
+from petrobot.sim.track.plan import floor_plan, pictures, summary
 
 ROVER_FILE = Path(__file__).parents[3] / "services" / "mobile" / "rover.toml"
 SVG = "{http://www.w3.org/2000/svg}"

@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.camera import StreamImages
-from petrobot.services.comm.can_ports import StreamPort
-from petrobot.services.comm.directory import load
-from petrobot.services.comm.messages import Call
+from petrobot.services.comm.canopen.ports import StreamPort
+from petrobot.services.comm.location_file import load
+from petrobot.services.comm.protocol.messages import Call
+from petrobot.services.comm.streams.camera import StreamImages
+from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
-from petrobot.sim.track import Track
-from petrobot.sim.track_laboratory import TrackLaboratory
-from petrobot.sim.truth import LaboratoryError
+from petrobot.sim.track.course import Track
+from petrobot.sim.track.laboratory import TrackLaboratory
 from tests.ports import free_ports
 from tests.sim.laboratory_shell import (
     PATIENCE,
@@ -33,7 +33,7 @@ from tests.sim.laboratory_shell import (
 )
 
 
-def services_file(folder: Path, sim: str = "petrobot.sim.track_laboratory:make_laboratory") -> Path:
+def services_file(folder: Path, sim: str = "petrobot.sim.track.laboratory:make_laboratory") -> Path:
     """The shipped location file with free ports, its devices named by hand."""
     node, bus, camera, coordinator = free_ports(4)
     file = folder / "services.toml"

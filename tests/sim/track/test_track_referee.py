@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from petrobot.sim.track import Track
-from petrobot.sim.track_elements import Pose
-from petrobot.sim.track_referee import Referee
+from petrobot.sim.track.course import Track
+from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.referee import Referee
 
 TRACK = Track.of((0, 3), 0, "SSSSSSS", (3,))  # along y = 7 from x = 0; no paint from x = 6 to x = 8
 DT, SPEED = 0.02, 0.5

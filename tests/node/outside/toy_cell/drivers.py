@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from petrobot.services.comm.canbus import Frame
+from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.device import Ports
 
 

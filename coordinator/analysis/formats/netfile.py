@@ -1,0 +1,187 @@
+"""What a foreign net file holds, and the one error that any reader or writer of such files raises.
+
+Nothing is lost in silence: what our nets cannot express is refused (FormatError) if it changes
+behaviour, and listed in `notes` if it does not.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element
+
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.task.net import Net
+
+
+class FormatError(ValueError):
+    """A file that cannot be read or a net that cannot be written: names the file, the element and
+    the remedy."""
+
+    def __init__(self, file: str, element: str, problem: str, remedy: str = "") -> None:
+        """Compose the one-line message."""
+        self.file, self.element, self.problem, self.remedy = file, element, problem, remedy
+        super().__init__(f"{file}: {element}: {problem}" + (f"; {remedy}" if remedy else ""))
+
+
+@dataclass(frozen=True)
+class NetFile:
+    """A net with everything else that its file says about it. Places and transitions are named by
+    the file's own ids."""
+
+    net: Net
+    name: str = ""
+    gspn: Gspn | None = None
+    """Present if the file says rates or weights."""
+    labels: Mapping[str, str] = field(default_factory=dict)
+    """Names for people, where they differ from the ids."""
+    positions: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Drawing positions by id (drawing units of the file, y downwards)."""
+    notes: tuple[str, ...] = ()
+    """What the file says beyond the net and that does not change its behaviour."""
+    document: Element | None = field(default=None, compare=False, repr=False)
+    """A PNML file's own tree, so that writing keeps its graphics, pages and tool-specific data."""
+
+
+class NetDraft:
+    """A net being read, place by place and arc by arc, in the file's order."""
+
+    def __init__(self, file: str) -> None:
+        """`file` is named in errors."""
+        self.file = file
+        self.places: dict[str, int] = {}
+        self.capacity: dict[str, int] = {}
+        self.transitions: dict[str, int] = {}
+        self.consume: dict[str, dict[str, int]] = {}
+        self.produce: dict[str, dict[str, int]] = {}
+        self.inhibit: dict[str, dict[str, int]] = {}
+        self.rates: dict[str, float] = {}
+        self.weights: dict[str, float] = {}
+        self.servers: dict[str, int | None] = {}
+        self.notes: list[str] = []
+
+    def place(self, name: str, tokens: int, capacity: int | None = None) -> None:
+        """A place. Raises FormatError if the id is taken."""
+        self._fresh(name)
+        if tokens < 0:
+            raise FormatError(
+                self.file, f"place {name}", f"{tokens} tokens", "a marking counts from 0"
+            )
+        self.places[name] = tokens
+        if capacity is not None:
+            self.capacity[name] = capacity
+
+    def transition(self, name: str, priority: int = 0) -> None:
+        """A transition. Raises FormatError if the id is taken."""
+        self._fresh(name)
+        self.transitions[name] = priority
+        self.consume[name], self.produce[name], self.inhibit[name] = {}, {}, {}
+
+    def _fresh(self, name: str) -> None:
+        if name in self.places or name in self.transitions:
+            raise FormatError(
+                self.file, name, "this id stands there twice", "ids are unique in a file"
+            )
+
+    def arc(
+        self, source: str, target: str, weight: int, what: str = "normal", element: str = "arc"
+    ) -> None:
+        """An arc of kind normal, inhibitor or test. Several normal arcs between two nodes add
+        up."""
+        place, transition = (source, target) if source in self.places else (target, source)
+        if place not in self.places or transition not in self.transitions:
+            remedy = "an arc joins a place and a transition of the file"
+            raise FormatError(self.file, element, f"it leads from {source!r} to {target!r}", remedy)
+        if weight < 1:
+            raise FormatError(self.file, element, f"a weight of {weight}", "a weight counts from 1")
+        into = source == place
+        if what == "inhibitor":
+            if not into:
+                raise FormatError(
+                    self.file,
+                    element,
+                    "an inhibitor arc out of a transition",
+                    "it leads from a place",
+                )
+            known = self.inhibit[transition].get(place, weight)
+            self.inhibit[transition][place] = min(known, weight)
+        elif what == "test":
+            self._test(place, transition, weight)
+        else:
+            table = (self.consume if into else self.produce)[transition]
+            if place in table:
+                self.notes.append(
+                    f"{element}: parallel arcs between {source} and {target} are added up"
+                )
+            table[place] = table.get(place, 0) + weight
+
+    def _test(self, place: str, transition: str, weight: int) -> None:
+        """A test arc needs its tokens beside none that are consumed: take and give back what is
+        missing."""
+        missing = weight - self.consume[transition].get(place, 0)
+        if missing > 0:
+            for table in (self.consume[transition], self.produce[transition]):
+                table[place] = table.get(place, 0) + missing
+
+    def net(self) -> Net:
+        """The net. Raises FormatError for one that is malformed."""
+        try:
+            return Net.build(
+                self.places,
+                {t: (self.consume[t], self.produce[t]) for t in self.transitions},
+                inhibitors=self.inhibit,
+                capacity=self.capacity,
+                priority=self.transitions,
+            )
+        except ValueError as error:
+            raise FormatError(self.file, "net", str(error)) from error
+
+    def gspn(self, net: Net) -> Gspn | None:
+        """The stochastic net if the file said any rate or weight."""
+        if not self.rates and not self.weights:
+            return None
+        try:
+            return Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
+        except ValueError as error:
+            raise FormatError(self.file, "rates", str(error)) from error
+
+
+def arithmetic(file: str, element: str, text: str, names: Mapping[str, float]) -> float:
+    """The value of an expression of numbers, names, + - * / and parentheses. Raises FormatError."""
+    try:
+        return _value(ast.parse(text.strip(), mode="eval").body, names)
+    except (SyntaxError, KeyError, TypeError, ZeroDivisionError) as error:
+        remedy = "use numbers and declared constants with + - * / ( )"
+        raise FormatError(file, element, f"{text!r} has no value", remedy) from error
+
+
+def _value(node: ast.expr, names: Mapping[str, float]) -> float:
+    match node:
+        case ast.Constant(value=int() | float() as number):
+            return float(number)
+        case ast.Name(id=name):
+            return names[name]
+        case ast.UnaryOp(op=ast.USub(), operand=inner):
+            return -_value(inner, names)
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _value(left, names) + _value(right, names)
+        case ast.BinOp(left=left, op=ast.Sub(), right=right):
+            return _value(left, names) - _value(right, names)
+        case ast.BinOp(left=left, op=ast.Mult(), right=right):
+            return _value(left, names) * _value(right, names)
+        case ast.BinOp(left=left, op=ast.Div(), right=right):
+            return _value(left, names) / _value(right, names)
+    raise TypeError(type(node).__name__)
+
+
+def whole_number(
+    file: str, element: str, text: str, names: Mapping[str, float] | None = None
+) -> int:
+    """A whole number, also by an expression. Raises FormatError."""
+    value = arithmetic(file, element, text, names or {})
+    if value != int(value):
+        raise FormatError(
+            file, element, f"{text!r} is no whole number", "tokens and weights are counted"
+        )
+    return int(value)

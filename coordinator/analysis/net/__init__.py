@@ -1,0 +1,1 @@
+"""What a net can do: state space, structure, and the verdicts on them; pure."""

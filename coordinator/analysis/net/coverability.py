@@ -1,0 +1,318 @@
+"""Boundedness of nets whose markings have no end: the Karp-Miller tree, compared with ancestors
+only.
+
+A new marking that is larger than one of its own ancestors gets omega where it is larger. Comparing
+with markings of other branches would call bounded nets unbounded (p0 -> p1 and p0 -> 2 p1 with one
+token in p0: p1 holds at most 2). Inhibitors make omega unsound, so inhibited places with a proven
+bound are complemented away first, and without a bound the answer is unknown. Capacities are bounds
+and are complemented in the same way. Priorities only remove behaviour: bounds found without them
+hold, an unbounded place found without them may yet be bounded.
+
+Source: R. M. Karp, R. E. Miller, Parallel program schemata, J. Comput. Syst. Sci. 3 (1969).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from petrobot.coordinator.analysis.net.pack import effect, thresholds
+from petrobot.coordinator.analysis.net.space import Space
+from petrobot.coordinator.analysis.net.structure import place_bounds
+from petrobot.coordinator.task.net import Marking, Net
+
+OMEGA = -1
+"""Stands for arbitrarily many tokens in a marking of the tree."""
+EFFORT = 20_000
+"""Nodes of the tree at most."""
+COMPARISONS = 100
+"""Comparisons with ancestors at most, for each node that the effort allows: long chains of
+ancestors end the tree sooner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coverability:
+    """How many tokens each place can hold, as far as it could be settled.
+
+    `bounded` None means unknown; `reason` says why. `bounds[p]` is exact for a net without
+    priorities and a complete tree, None for an unbounded (or unsettled) place. For a witness of
+    unboundedness: firing `pump` after `prefix` can be repeated for ever and leaves more tokens in
+    the places `grows` each time.
+    """
+
+    bounded: bool | None
+    bounds: tuple[int | None, ...]
+    reason: str
+    nodes: int
+    complete: bool
+    prefix: tuple[str, ...] = ()
+    pump: tuple[str, ...] = ()
+    grows: tuple[str, ...] = ()
+    never: tuple[str, ...] = ()
+    """Transitions that a complete tree never fires: they are dead, priorities or not."""
+    exact: bool = False
+    """Whether every transition that is not in `never` can fire: the tree is complete and the net
+    has no priorities."""
+
+
+def settle_bounds(
+    net: Net, bounds: Sequence[int | None] | None = None, *, effort: int = EFFORT
+) -> Coverability:
+    """The complete tree where the effort suffices, else the first place that can grow without
+    end."""
+    whole = coverability(net, effort=effort, bounds=bounds)
+    return (
+        whole
+        if whole.complete
+        else coverability(net, effort=effort, bounds=bounds, first_omega=True)
+    )
+
+
+def coverability(
+    net: Net,
+    *,
+    effort: int = EFFORT,
+    bounds: Sequence[int | None] | None = None,
+    first_omega: bool = False,
+) -> Coverability:
+    """The bounds of all places by the coverability tree.
+
+    `bounds` are proven bounds of places (by default those of the P-invariants), needed where places
+    are inhibited. With `first_omega` the search ends with the first unbounded place (then only
+    `bounded` is settled, not each bound).
+    """
+    proven = list(bounds) if bounds is not None else place_bounds(net)
+    limits = [thresholds(net, t) for t in range(len(net.transitions))]
+    restricting = [p for below in limits for p in below]
+    unproven = sorted({p for p in restricting if proven[p] is None})
+    if unproven:
+        names = ", ".join(net.places[p] for p in unproven)
+        unknown = tuple(b if n not in unproven else None for n, b in enumerate(proven))
+        return Coverability(
+            None, unknown, f"no bound is known for the inhibited place {names}", 0, False
+        )
+    plain = _complemented(net, limits, proven)
+    tree = _Tree(plain, len(net.places))
+    if not tree.grow(effort, first_omega):
+        return Coverability(
+            None, tuple(proven), f"effort of {effort} nodes", len(tree.nodes), False
+        )
+    return _verdict(net, tree, first_omega)
+
+
+def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
+    bounds = tree.bounds()
+    prefix, pump, grows = tree.witness(net)
+    unbounded, ranked = tree.omega is not None, len(set(net.priority)) > 1
+    complete = not (unbounded and first_omega)
+    never = (
+        tuple(name for t, name in enumerate(net.transitions) if t not in tree.fired)
+        if complete
+        else ()
+    )
+    if unbounded and ranked:
+        reason = "unbounded without its priorities; with them it may be bounded"
+        return Coverability(
+            None, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never
+        )
+    reason = (
+        f"{', '.join(grows)} can grow without end"
+        if unbounded
+        else "no marking covers one of its ancestors"
+    )
+    exact = complete and not ranked
+    return Coverability(
+        not unbounded, bounds, reason, len(tree.nodes), complete, prefix, pump, grows, never, exact
+    )
+
+
+def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[int | None]) -> Net:
+    """The net with every inhibitor and capacity told by a complement place that holds the bound
+    minus the tokens."""
+    places = sorted({p for below in limits for p in below})
+    names = [*net.places, *(f"not {net.places[p]}" for p in places)]
+    number = {p: len(net.places) + i for i, p in enumerate(places)}
+    total = {p: max(bounds[p] or 0, net.initial[p]) for p in places}
+    consume, produce = [], []
+    for t, below in enumerate(limits):
+        need, give = dict(net.consume[t]), dict(net.produce[t])
+        for p, change in effect(net, t).items():
+            if p in number:
+                side = need if change > 0 else give
+                side[number[p]] = abs(change)
+        for p, k in below.items():
+            held = max(need.get(number[p], 0), total[p] - k + 1)
+            extra = held - need.get(number[p], 0)
+            if extra > 0:
+                need[number[p]] = held
+                give[number[p]] = give.get(number[p], 0) + extra
+        consume.append(tuple(sorted(need.items())))
+        produce.append(tuple(sorted(give.items())))
+    initial = (*net.initial, *(total[p] - net.initial[p] for p in places))
+    count = len(net.transitions)
+    return Net(
+        tuple(names), net.transitions, tuple(consume), tuple(produce), ((),) * count, initial,
+        (None,) * len(names), (0,) * count,
+    )  # fmt: skip
+
+
+@dataclass(slots=True)
+class _Node:
+    marking: Marking
+    parent: int
+    fired: int
+    ancestor: int = -1
+    """The nearest ancestor that this node's marking strictly covers, if omega came in here."""
+    grown: tuple[int, ...] = ()
+    """Places in which it does."""
+
+
+class _Tree:
+    """The Karp-Miller tree, breadth first, so that chains of ancestors stay short.
+
+    A marking that any node has already expanded is not expanded again: the same marking roots the
+    same subtree, so leaving it out loses no bound; omega itself is only ever introduced by
+    comparison with ancestors.
+    """
+
+    def __init__(self, net: Net, real: int) -> None:
+        self.net, self.real = net, real
+        self.nodes = [_Node(net.initial, -1, -1)]
+        self.omega: int | None = None
+        self.fired: set[int] = set()
+        self.compared = 0
+
+    def grow(self, effort: int, first_omega: bool) -> bool:
+        """Build the tree; False if the effort ran out."""
+        expanded: set[Marking] = set()
+        queue = deque([0])
+        while queue:
+            i = queue.popleft()
+            if self.nodes[i].marking in expanded:
+                continue
+            expanded.add(self.nodes[i].marking)
+            for t in range(len(self.net.transitions)):
+                after = self._fire(self.nodes[i].marking, t)
+                if after is None:
+                    continue
+                if len(self.nodes) >= effort or self.compared > COMPARISONS * effort:
+                    return False
+                self.fired.add(t)
+                self._add(i, t, after)
+                if self.omega is not None and first_omega:
+                    return True
+                queue.append(len(self.nodes) - 1)
+        return True
+
+    def _fire(self, marking: Marking, t: int) -> Marking | None:
+        if any(marking[p] != OMEGA and marking[p] < w for p, w in self.net.consume[t]):
+            return None
+        after = list(marking)
+        for p, change in effect(self.net, t).items():
+            if after[p] != OMEGA:
+                after[p] += change
+        return tuple(after)
+
+    def _add(self, parent: int, fired: int, after: Marking) -> None:
+        node, covered, up = _Node(after, parent, fired), after, parent
+        while up >= 0:
+            older = self.nodes[up].marking
+            self.compared += 1
+            if older != covered and all(
+                _at_least(a, b) for a, b in zip(covered, older, strict=True)
+            ):
+                wider = tuple(OMEGA if a != b else a for a, b in zip(covered, older, strict=True))
+                if wider != covered:
+                    if node.ancestor < 0:
+                        node.ancestor = up
+                        node.grown = tuple(
+                            p for p, (a, b) in enumerate(zip(covered, older, strict=True)) if a != b
+                        )
+                    covered = wider
+            up = self.nodes[up].parent
+        node.marking = covered
+        self.nodes.append(node)
+        if node.ancestor >= 0 and self.omega is None:
+            self.omega = len(self.nodes) - 1
+
+    def bounds(self) -> tuple[int | None, ...]:
+        """The most tokens of each real place over the tree, None for omega."""
+        out: list[int | None] = []
+        for p in range(self.real):
+            seen = {node.marking[p] for node in self.nodes}
+            out.append(None if OMEGA in seen else max(seen))
+        return tuple(out)
+
+    def witness(self, net: Net) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+        """(prefix, pump, places that grow) of the first omega; empty for a bounded net."""
+        if self.omega is None:
+            return (), (), ()
+        node = self.nodes[self.omega]
+        grows = tuple(net.places[p] for p in node.grown if p < self.real)
+        prefix = self._fired(0, node.ancestor)
+        return prefix, self._fired(node.ancestor, self.omega), grows
+
+    def _fired(self, first: int, last: int) -> tuple[str, ...]:
+        names = []
+        while last != first:
+            names.append(self.net.transitions[self.nodes[last].fired])
+            last = self.nodes[last].parent
+        return tuple(reversed(names))
+
+
+def _at_least(a: int, b: int) -> bool:
+    return a == OMEGA or (b != OMEGA and a >= b)
+
+
+# Unboundedness by a pump among the markings found: a sequence that ends with more tokens than it began with, for ever.
+
+MARKINGS, LEVELS = 10_000, 400
+"""Markings of the space that are compared with their ancestors, and ancestors that each is compared
+with, at most."""
+CANDIDATES, EACH = 1_000, 25
+"""Pairs that are looked at closely, in all and at one distance, at most."""
+
+Pump = tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]
+"""(prefix, pump, places that grow)."""
+
+
+def find_pump(space: Space) -> Pump | None:
+    """The first pump from an ancestor to a marking found, along the breadth-first tree; None if
+    there is none so far."""
+    count = min(MARKINGS, space.expanded, len(space))
+    tokens = space.layout.unpack_many(space.words[:count])
+    parent = np.zeros(count, dtype=np.int64)
+    parent[1:] = space.source[space.parent_edge[1:count]]
+    older, left = parent, CANDIDATES
+    for _ in range(LEVELS):
+        change = tokens - tokens[older]
+        hits = np.flatnonzero((change >= 0).all(axis=1) & (change > 0).any(axis=1))
+        for last in hits[: min(left, EACH)].tolist():
+            left -= 1
+            found = _judged(
+                space, last, int(older[last]), set(np.flatnonzero(change[last]).tolist())
+            )
+            if found is not None:
+                return found
+        if not left or not older.any():
+            return None
+        older = parent[older]
+    return None
+
+
+def _judged(space: Space, last: int, first: int, grown: set[int]) -> Pump | None:
+    """The pump between two markings, unless what grows may bar it: by an inhibitor, a capacity or a
+    higher priority."""
+    net, before = space.net, space.path(first)
+    pump = space.path(last)[len(before) :]
+    fired = [net.transition_index[name] for name in pump]
+    if any(grown & thresholds(net, t).keys() for t in fired):
+        return None
+    least = min(net.priority[t] for t in fired)
+    above = (t for t in range(len(net.transitions)) if net.priority[t] > least)
+    if any(p in grown for t in above for p, _ in net.consume[t]):
+        return None
+    return tuple(before), tuple(pump), tuple(net.places[p] for p in sorted(grown))

@@ -1,0 +1,455 @@
+"""Boundedness, liveness, deadlocks, reversibility, home markings and soundness of a net, from one
+pass over its space.
+
+Definitions after T. Murata (1989): a transition is L0 (dead) if it never fires, L1 if it can fire,
+L2 if for every k some sequence fires it k times, L3 if some infinite sequence fires it for ever, L4
+(live) if from every reachable marking a sequence fires it. In a finite graph L2 and L3 are the
+same: it labels an edge on a cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.graph import Graph, Mask
+from petrobot.coordinator.analysis.net.pack import thresholds
+from petrobot.coordinator.analysis.net.siphons import controlled_siphons, empty_siphon
+from petrobot.coordinator.analysis.net.space import Space
+from petrobot.coordinator.analysis.net.structure import place_bounds
+from petrobot.coordinator.analysis.net.stubborn import Hunt, hunt_deadlock
+from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
+from petrobot.coordinator.task.net import Marking, Net
+
+SAFETY = ""
+"""Every marking of the executed task is one of the ordinary net, so what never happens here never
+happens there."""
+FAIRNESS = (
+    "every awaited event eventually occurs, and every status of an action is possible "
+    "again and again"
+)
+"""What liveness and progress need beyond the ordinary net."""
+HUNT = 10_000
+"""Markings that the hunt for a deadlock looks at where the space is not complete."""
+GROUPS = 100
+"""Groups of deadlocks that are told one by one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Deadlock:
+    """Dead markings with the same marked places: how many, a shortest way to the nearest, and what
+    can never refill."""
+
+    marked: tuple[str, ...]
+    count: int
+    witness: Witness
+    emptied: tuple[str, ...]
+    """Places of the largest empty siphon there: no firing can ever mark them again."""
+
+
+@dataclass(frozen=True)
+class Qualitative:
+    """All verdicts on one net. Levels, bounds and counts are those of the space found if it is not
+    complete."""
+
+    space: Space
+    graph: Graph
+    bounds: tuple[int | None, ...]
+    """Proven; by place. They are reached where the space is complete."""
+    most: int | None
+    """The most tokens that any place ever holds; None if unknown or without end."""
+    bounded: Verdict
+    safe: Verdict
+    deadlock_free: Verdict
+    deadlocks: tuple[Deadlock, ...]
+    dead_markings: int
+    """Among the markings found."""
+    quasi_live: Verdict
+    live: Verdict
+    levels: tuple[int | None, ...]
+    """Liveness level 0 to 4 of each transition (2 never appears: see above); None if unknown."""
+    reversible: Verdict
+    home_states: int | None
+    """Number of markings that can be reached from every reachable marking."""
+    sound: Verdict | None
+    """Only with a `final` predicate."""
+
+    @property
+    def dead_transitions(self) -> tuple[str, ...]:
+        """Transitions that never fire."""
+        return tuple(
+            t
+            for t, level in zip(self.space.net.transitions, self.levels, strict=True)
+            if level == 0
+        )
+
+
+def examine(
+    space: Space,
+    *,
+    final: Callable[[Marking], bool] | None = None,
+    cover: Coverability | None = None,
+    in_haste: bool = False,
+) -> Qualitative:
+    """All verdicts on the net behind a space.
+
+    `final` tells the designed ends: a dead marking that is not final is a deadlock. `cover` is a
+    coverability result if one is at hand; it is computed when the space is not complete. `in_haste`
+    leaves out what takes long: then only what the markings found say at a glance is told.
+    """
+    graph = Graph(len(space), space.source, space.target)
+    if in_haste and cover is None:
+        cover = Coverability(None, (None,) * len(space.net.places), space.reason, 0, False)
+    bounds, bounded, safe, cover = _boundedness(space, cover)
+    ends = space.where(final) if final else np.zeros(len(space), dtype=np.bool_)
+    dead = space.dead[~ends[space.dead]]
+    settled = space.complete or len(dead) or in_haste
+    hunt = None if settled else hunt_deadlock(space.net, final=final, effort=HUNT)
+    levels = _levels(space, graph, cover)
+    return Qualitative(
+        space,
+        graph,
+        bounds,
+        _most(space, bounds),
+        bounded,
+        safe,
+        _deadlock_free(space, dead, final is not None, hunt),
+        _grouped(space, dead) + _hunted(space.net, hunt),
+        len(dead),
+        _quasi_live(space, levels, cover),
+        _live(space, graph, levels, hunt),
+        levels,
+        _reversible(space, graph, hunt),
+        _home_states(space, graph),
+        _sound(space, graph, ends, levels) if final else None,
+    )
+
+
+def _most(space: Space, bounds: tuple[int | None, ...]) -> int | None:
+    """The most tokens in any place: known where a bound is reached by a marking found and no other
+    is above it."""
+    if None in bounds:
+        return None
+    highest = max((b for b in bounds if b is not None), default=0)
+    return highest if space.complete or highest == max(space.bounds, default=0) else None
+
+
+def witness(space: Space, i: int, loop: tuple[str, ...] = ()) -> Witness:
+    """A shortest firing sequence to marking i."""
+    marked = {p: n for p, n in zip(space.net.places, space.marking(i), strict=True) if n}
+    return Witness(tuple(space.path(i)), marked, loop)
+
+
+def _unknown(space: Space, question: str = "") -> Verdict:
+    text = f"not known: the search stopped early ({space.reason})"
+    return Verdict(None, f"{text}; {question}" if question else text, complete=False)
+
+
+def _boundedness(
+    space: Space, cover: Coverability | None
+) -> tuple[tuple[int | None, ...], Verdict, Verdict, Coverability | None]:
+    """(bounds, bounded, safe, the coverability result that was used, if any)."""
+    if space.complete:
+        bounds: tuple[int | None, ...] = space.bounds
+        most = max(space.bounds, default=0)
+        bounded = Verdict(
+            True,
+            f"no place ever holds more than {most} token{'s' * (most != 1)}",
+            assumption=SAFETY,
+        )
+        return bounds, bounded, _safe(space, True), None
+    proven = place_bounds(space.net)
+    if all(b is not None for b in proven):
+        bounded = Verdict(
+            True,
+            f"bounded by invariants and capacities, although {space.reason}",
+            assumption=SAFETY,
+        )
+        return (
+            tuple(proven),
+            bounded,
+            _safe(space, max((b or 0 for b in proven), default=0) <= 1),
+            cover,
+        )
+    cover = cover or settle_bounds(space.net, proven)
+    pump = (cover.prefix, cover.pump, cover.grows) if cover.bounded is False else find_pump(space)
+    known = tuple(_lower(b, c) for b, c in zip(proven, cover.bounds, strict=True))
+    if pump is not None:
+        prefix, again, grows = pump
+        shown = Witness(prefix, _marked(space.net, prefix), again)
+        reason = (
+            f"{', '.join(grows)} can grow without end: {' '.join(again)} can be repeated for ever"
+        )
+        settled = known if cover.complete else tuple(proven)
+        return settled, Verdict(False, reason, shown), Verdict(False, reason, shown), cover
+    if cover.bounded:
+        bounded = Verdict(
+            True, f"bounded by the coverability tree, although {space.reason}", assumption=SAFETY
+        )
+        return known, bounded, _safe(space, max((b or 0 for b in known), default=0) <= 1), cover
+    return known, _unknown(space, cover.reason), _safe(space, False), cover
+
+
+def _lower(one: int | None, other: int | None) -> int | None:
+    """The lower of two bounds; None is none."""
+    return other if one is None else one if other is None else min(one, other)
+
+
+def _marked(net: Net, firings: tuple[str, ...]) -> dict[str, int]:
+    *_, last = net.replay(firings)
+    return {p: n for p, n in zip(net.places, last, strict=True) if n}
+
+
+def _safe(space: Space, proven: bool) -> Verdict:
+    for p, most in enumerate(space.bounds):
+        if most > 1:
+            first = int(np.argmax(space.tokens(p) > 1))
+            reason = f"{space.net.places[p]} can hold {most} tokens"
+            return Verdict(False, reason, witness(space, first), complete=space.complete)
+    if proven:
+        return Verdict(
+            True,
+            "no place ever holds more than one token",
+            assumption=SAFETY,
+            complete=space.complete,
+        )
+    return _unknown(space)
+
+
+def _hunted(net: Net, hunt: Hunt | None) -> tuple[Deadlock, ...]:
+    """The deadlock found through stubborn sets, if there is one."""
+    if hunt is None or hunt.firings is None:
+        return ()
+    marked = _marked(net, hunt.firings)
+    *_, last = net.replay(hunt.firings)
+    emptied = tuple(net.places[p] for p in sorted(empty_siphon(net, last)))
+    return (Deadlock(tuple(marked), 1, Witness(hunt.firings, marked), emptied),)
+
+
+def _deadlock_free(
+    space: Space, dead: NDArray[np.int64], has_final: bool, hunt: Hunt | None
+) -> Verdict:
+    other = " that is not a designed end" if has_final else ""
+    if len(dead):
+        first = int(dead[0])
+        reason = f"nothing can happen any more in {space.net.describe(space.marking(first))}"
+        return Verdict(False, reason, witness(space, first), complete=space.complete)
+    for found in _hunted(space.net, hunt):
+        reason = (
+            f"nothing can happen any more with {', '.join(found.marked) or 'nothing'} "
+            "marked (found by stubborn sets)"
+        )
+        return Verdict(False, reason, found.witness, complete=False)
+    always = _never_barred(space.net)
+    if not space.complete and always is not None:
+        return Verdict(
+            True,
+            f"{always} needs nothing and nothing bars it: it can always fire",
+            assumption=FAIRNESS,
+        )
+    if hunt is not None and not hunt.complete and not has_final and _siphons_suffice(space.net):
+        reason = (
+            "every siphon holds a trap that is marked at first, so some transition is "
+            "always enabled"
+        )
+        return Verdict(True, reason, assumption=FAIRNESS)
+    if hunt is not None and hunt.complete:
+        reason = (
+            f"no reachable marking{other} is dead: {hunt.states} markings along "
+            "stubborn sets stand for all"
+        )
+        return Verdict(True, reason, assumption=FAIRNESS)
+    if not space.complete:
+        return _unknown(space, f"no dead marking{other} among the {space.expanded} looked at")
+    return Verdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
+
+
+def _never_barred(net: Net) -> str | None:
+    """A transition that is enabled in every marking (or one above it in priority is)."""
+    free = (t for t in range(len(net.transitions)) if not net.consume[t] and not thresholds(net, t))
+    return next((net.transitions[t] for t in free), None)
+
+
+def _siphons_suffice(net: Net) -> bool:
+    """Whether Commoner's condition rules out a dead marking: weights of one and nothing that bars a
+    firing."""
+    plain = (
+        not any(net.inhibit)
+        and len(set(net.priority)) <= 1
+        and all(c is None for c in net.capacity)
+    )
+    single = all(w == 1 for arcs in net.consume for _, w in arcs)
+    return plain and single and bool(net.transitions) and controlled_siphons(net) is True
+
+
+def _grouped(space: Space, dead: NDArray[np.int64]) -> tuple[Deadlock, ...]:
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, marking in zip(
+        dead.tolist(), space.layout.unpack_many(space.words[dead]).tolist(), strict=True
+    ):
+        groups.setdefault(tuple(n > 0 for n in marking), []).append(i)
+    out = []
+    for support, members in list(groups.items())[:GROUPS]:
+        marking = space.marking(members[0])
+        emptied = tuple(space.net.places[p] for p in sorted(empty_siphon(space.net, marking)))
+        marked = tuple(p for p, some in zip(space.net.places, support, strict=True) if some)
+        out.append(Deadlock(marked, len(members), witness(space, members[0]), emptied))
+    return tuple(out)
+
+
+def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int | None, ...]:
+    count = len(space.net.transitions)
+    if not space.complete:
+        never = set(cover.never if cover is not None else ())
+        return tuple(0 if name in never else None for name in space.net.transitions)
+    fired = np.bincount(space.label, minlength=count) > 0
+    cyclic = np.bincount(space.label[graph.inner], minlength=count) > 0
+    everywhere = np.ones(count, dtype=np.bool_)
+    ours = graph.components[space.source]
+    for component in np.flatnonzero(graph.bottom).tolist():
+        everywhere &= np.bincount(space.label[ours == component], minlength=count) > 0
+    return tuple(
+        4 if always else 3 if again else 1 if once else 0
+        for once, again, always in zip(
+            fired.tolist(), cyclic.tolist(), everywhere.tolist(), strict=True
+        )
+    )
+
+
+def _quasi_live(
+    space: Space, levels: tuple[int | None, ...], cover: Coverability | None
+) -> Verdict:
+    fired = np.bincount(space.label, minlength=len(levels)) > 0
+    if fired.all():
+        return Verdict(
+            True, "every transition can fire", assumption=FAIRNESS, complete=space.complete
+        )
+    idle = [space.net.transitions[t] for t in np.flatnonzero(~fired)]
+    dead = [name for name, level in zip(space.net.transitions, levels, strict=True) if level == 0]
+    if not space.complete and dead:
+        return Verdict(
+            False, f"can never fire: {', '.join(dead)} (by the coverability tree)", complete=False
+        )
+    if not space.complete and cover is not None and cover.exact:
+        return Verdict(
+            True,
+            "every transition can fire (by the coverability tree)",
+            assumption=FAIRNESS,
+            complete=False,
+        )
+    if not space.complete:
+        return _unknown(space, f"not seen to fire so far: {', '.join(idle)}")
+    return Verdict(False, f"can never fire: {', '.join(idle)}")
+
+
+def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None) -> Verdict:
+    names = space.net.transitions
+    for found in _hunted(space.net, hunt):
+        return Verdict(
+            False,
+            "a dead marking is reachable (found by stubborn sets)",
+            found.witness,
+            complete=False,
+        )
+    if len(space.dead) and names:
+        first = int(space.dead[0])
+        reason = f"nothing can fire any more in {space.net.describe(space.marking(first))}"
+        return Verdict(False, reason, witness(space, first), complete=space.complete)
+    useless = [name for name, level in zip(names, levels, strict=True) if level == 0]
+    if useless and not space.complete:
+        return Verdict(
+            False,
+            f"can never fire: {', '.join(useless)} (by the coverability tree)",
+            complete=False,
+        )
+    if not space.complete:
+        return _unknown(space)
+    lost = [t for t, level in enumerate(levels) if level != 4]
+    if not lost:
+        return Verdict(
+            True, "from every marking every transition can fire again", assumption=FAIRNESS
+        )
+    ours = graph.components[space.source]
+    for component in np.flatnonzero(graph.bottom).tolist():
+        fired = np.bincount(space.label[ours == component], minlength=len(names)) > 0
+        never = [names[t] for t in lost if not fired[t]]
+        if never:
+            first = int(np.argmax(graph.components == component))
+            reason = (
+                f"after {space.net.describe(space.marking(first))} never again: {', '.join(never)}"
+            )
+            return Verdict(False, reason, witness(space, first))
+    raise AssertionError("a transition that is not live is missing in some bottom component")
+
+
+def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
+    if not space.complete:
+        for found in _hunted(space.net, hunt):
+            if found.witness.firings:
+                return Verdict(
+                    False,
+                    "a dead marking never returns to the start",
+                    found.witness,
+                    complete=False,
+                )
+        stuck = space.dead[space.dead > 0]
+        if len(stuck):
+            first = int(stuck[0])
+            return Verdict(
+                False,
+                "a dead marking never returns to the start",
+                witness(space, first),
+                complete=False,
+            )
+        return _unknown(space)
+    away = np.flatnonzero(~graph.backward([0]))
+    if not len(away):
+        return Verdict(
+            True, "the initial marking can be reached again from everywhere", assumption=FAIRNESS
+        )
+    first = int(away[0])
+    reason = (
+        f"from {space.net.describe(space.marking(first))} the initial marking is never "
+        "reached again"
+    )
+    return Verdict(False, reason, witness(space, first))
+
+
+def _home_states(space: Space, graph: Graph) -> int | None:
+    if not space.complete:
+        return None
+    bottoms = np.flatnonzero(graph.bottom)
+    return int((graph.components == bottoms[0]).sum()) if len(bottoms) == 1 else 0
+
+
+def _sound(space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...]) -> Verdict:
+    """Sound: from every marking an end is reached, nothing goes on at an end, and every transition
+    is of use."""
+    busy = np.flatnonzero(ends[: space.expanded] & (np.diff(space.row[: space.expanded + 1]) > 0))
+    if len(busy):
+        first = int(busy[0])
+        goes_on = space.net.transitions[space.label[space.row[first]]]
+        reason = (
+            f"left over at the end {space.net.describe(space.marking(first))}: "
+            f"{goes_on} can still fire"
+        )
+        return Verdict(False, reason, witness(space, first), complete=space.complete)
+    if not space.complete:
+        return _unknown(space)
+    lost = np.flatnonzero(~graph.backward(ends))
+    if len(lost):
+        first = int(lost[0])
+        reason = f"from {space.net.describe(space.marking(first))} no designed end can be reached"
+        return Verdict(False, reason, witness(space, first))
+    useless = [t for t, level in zip(space.net.transitions, levels, strict=True) if level == 0]
+    if useless:
+        return Verdict(False, f"of no use, never fires: {', '.join(useless)}")
+    reason = (
+        "an end can be reached from everywhere, nothing is left over there, every "
+        "transition is of use"
+    )
+    return Verdict(True, reason, assumption=FAIRNESS)

@@ -1,0 +1,374 @@
+"""Qualitative properties in a robot's words: stability, error recoverability with its index kappa,
+controllability.
+
+The paper leaves open how boundedness, properness and liveness map to these (section 7). Here, with
+G the nominal markings (no error branch active), T_c the controllable transitions (starts, operator)
+and T_u all others (statuses, external events):
+
+- *Stable*: a linear Lyapunov function y.M never grows (structure), and every bottom component meets
+  G (attraction).
+- *Recoverable* from an error exit e, judged from every marking just after e: possible (some way
+  leads to G), almost sure
+  (every bottom component reached from there meets G), and kappa(e): the largest k such that a
+  strategy over T_c reaches G although up to k further errors occur. W_0 = markings from which G is
+  reached almost surely while no error occurs; W_k = the same while visiting only markings all of
+  whose error exits lead into W_(k-1). *Resumed*: the run can still meet its goal before a new run
+  is taken; else *skipped*.
+- *Controllable*: from every reachable marking a strategy over T_c forces each action to start,
+  almost surely under fair T_u
+  (observable liveness: J. Desel, A.-M. Kilinc, Observable liveness of Petri nets, Acta Informatica
+  52, 2015); and no T_u leaves the legal markings (P. J. Ramadge, W. M. Wonham, The control of
+  discrete event systems, Proc. IEEE 77, 1989).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask
+from petrobot.coordinator.analysis.net.qualitative import FAIRNESS, witness
+from petrobot.coordinator.analysis.net.space import Space
+from petrobot.coordinator.analysis.net.structure import Lyapunov, lyapunov
+from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
+from petrobot.coordinator.task.net import Marking
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Which transitions and markings play which part; names are those of the net."""
+
+    nominal: Callable[[Marking], bool]
+    """Whether a marking belongs to G."""
+    error_exits: frozenset[str] = frozenset()
+    controllable: frozenset[str] = frozenset()
+    starts: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    """By action place: the transitions that start it."""
+    run_starts: frozenset[str] = frozenset()
+    """Transitions that take a new run."""
+    goals: frozenset[str] = frozenset()
+    """Transitions that each stand for one met goal."""
+    renewals: frozenset[str] = frozenset()
+    """Transitions that close the net (refill, repair): they end a mission run and begin another
+    one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What follows an error exit. Counts and verdicts are over all markings just after it."""
+
+    error_exit: str
+    possible: Verdict
+    almost_sure: Verdict
+    kappa: int | None
+    """Further errors that are survived for certain; None: any number. -1 if G is not even reached
+    without any."""
+    resumed: bool | None
+    """True: the run can still meet its goal; False: it is lost; None: the net names no runs or
+    goals."""
+    strategy: tuple[str, ...]
+    """From the marking just after the error back to the nominal flow, fewest firings."""
+
+
+@dataclass(frozen=True)
+class RobotVerdicts:
+    """The three notions for one closed net."""
+
+    stable: Verdict
+    lyapunov: Lyapunov | None
+    attracted: Verdict
+    recoveries: tuple[Recovery, ...]
+    controllable: Verdict
+    unforced: tuple[str, ...]
+    """Action places that cannot be forced to start from everywhere."""
+
+
+def one_run_each(space: Space, places: Sequence[str]) -> Verdict:
+    """Whether no action place is entered while its run goes on: each of `places` holds one token at
+    most (design: 1-safe)."""
+    for name in places:
+        crowded = np.flatnonzero(space.tokens(space.net.place_index[name]) > 1)
+        if len(crowded):
+            shown = witness(space, int(crowded[0]))
+            reason = (
+                f"{name} is entered while its run still goes on: {shown.marking[name]} "
+                "tokens, one run at a time"
+            )
+            return Verdict(False, reason, shown, complete=space.complete)
+    if not space.complete:
+        return Verdict(None, f"the search stopped: {space.reason}", complete=False)
+    return Verdict(True, "no action place is entered while its run goes on")
+
+
+def all_returned(space: Space, final: Mask, resources: Sequence[str]) -> Verdict:
+    """Whether every resource place holds at each final marking what it began with: none was lost,
+    none appeared."""
+    for name in resources:
+        p = space.net.place_index[name]
+        began, other = (
+            space.net.initial[p],
+            np.flatnonzero(final & (space.tokens(p) != space.net.initial[p])),
+        )
+        if len(other):
+            shown = witness(space, int(other[0]))
+            left = shown.marking.get(name, 0)
+            word = "lost" if left < began else "made"
+            reason = f"{name} is {word} on the way: {began} at the beginning, {left} at the end"
+            return Verdict(False, reason, shown, complete=space.complete)
+    if not space.complete:
+        return Verdict(None, f"the search stopped: {space.reason}", complete=False)
+    return Verdict(True, "every resource is there again at the end, none was lost or made")
+
+
+class Flow:
+    """A complete space seen through its roles: masks over markings and edges."""
+
+    def __init__(self, space: Space, roles: Roles) -> None:
+        """Raises ValueError for a space that was cut short: nothing can be promised from a part."""
+        if not space.complete:
+            raise ValueError(
+                "the robot's verdicts need all reachable markings; the search stopped: "
+                f"{space.reason}"
+            )
+        self.space, self.roles = space, roles
+        self.graph = Graph(len(space), space.source, space.target)
+        self.nominal: Mask = space.where(roles.nominal)
+        self.error = self.fires(roles.error_exits)
+        self.free = self.fires(roles.controllable)
+        self.renewing = self.fires(roles.renewals)
+
+    def fires(self, names: frozenset[str]) -> Mask:
+        """Which edges fire one of the transitions."""
+        chosen = np.array([name in names for name in self.space.net.transitions] or [False])
+        return chosen[self.space.label]
+
+    def nested(self) -> list[Mask]:
+        """W_0, W_1, ... until they no longer shrink; G belongs to all of them."""
+        graph, calm = self.graph, ~self.error
+        sets: list[Mask] = []
+        allowed: Mask | None = None
+        while True:
+            # While no error occurs, error edges are edges that the play never takes: leave them to
+            # the strategy.
+            reaching = self._calm(calm).almost_sure(self.nominal, self.free[calm], allowed=allowed)
+            if sets and np.array_equal(reaching, sets[-1]):
+                return sets
+            sets.append(reaching)
+            allowed = np.ones(graph.n, dtype=np.bool_)
+            risky = self.error & ~reaching[self.space.target]
+            allowed[self.space.source[risky]] = False
+
+    def _calm(self, kept: Mask) -> Graph:
+        return Graph(self.graph.n, self.space.source[kept], self.space.target[kept])
+
+
+def judge(space: Space, roles: Roles, open_space: Space | None = None) -> RobotVerdicts:
+    """Stability, recoverability of every error exit, and controllability, from complete spaces.
+
+    `space` is that of the closed net, in which progress is judged; `open_space` that of the net
+    itself (by default the same), which gives kappa and the Lyapunov function.
+    """
+    flow = Flow(space, roles)
+    open_space = open_space or space
+    alone = (
+        Flow(open_space, replace(roles, renewals=frozenset())) if open_space is not space else flow
+    )
+    function = lyapunov(open_space.net)
+    attracted = _attracted(flow)
+    controllable, unforced = _controllable(flow)
+    return RobotVerdicts(
+        _stable(open_space, function, attracted),
+        function,
+        attracted,
+        recoveries(flow, alone),
+        controllable,
+        unforced,
+    )
+
+
+def _stable(space: Space, function: Lyapunov | None, attracted: Verdict) -> Verdict:
+    if attracted.holds is False:
+        return attracted
+    if function is not None:
+        terms = " + ".join(
+            f"{w} {space.net.places[p]}" if w > 1 else space.net.places[p]
+            for p, w in function.weights.items()
+        )
+        how = "stays the same" if function.conserved else "never grows"
+        return Verdict(
+            True,
+            f"{terms} {how}, and the nominal flow is always reached again",
+            assumption=attracted.assumption,
+        )
+    reason = (
+        "bounded from this initial marking (not from every one), and the nominal flow "
+        "is always reached again"
+    )
+    return Verdict(True, reason, assumption=attracted.assumption)
+
+
+def _attracted(flow: Flow) -> Verdict:
+    space, components = flow.space, flow.graph.components
+    met = np.zeros(len(flow.graph.bottom), dtype=np.bool_)
+    met[components[flow.nominal]] = True
+    lost = flow.graph.bottom & ~met
+    if not lost.any():
+        reason = (
+            "wherever the task ends up for good, it passes through the nominal flow again and again"
+        )
+        return Verdict(True, reason, assumption=FAIRNESS)
+    first = int(np.argmax(lost[components]))
+    reason = (
+        "the task can get caught for good outside its nominal flow: "
+        f"{space.net.describe(space.marking(first))}"
+    )
+    return Verdict(False, reason, witness(space, first))
+
+
+def recoveries(flow: Flow, alone: Flow | None = None) -> tuple[Recovery, ...]:
+    """Every error exit that can occur, in transition order; kappa and strategy from `alone`, the
+    flow of the open net."""
+    alone = alone or flow
+    nested = alone.nested()
+    way_back = flow.graph.backward(flow.nominal)
+    caught = flow.graph.backward(_outside(flow))
+    found = []
+    for name in flow.space.net.transitions:
+        if name in flow.roles.error_exits:
+            edges = np.flatnonzero(flow.fires(frozenset({name})))
+            if len(edges):
+                found.append(_recovery(flow, alone, name, edges, nested, way_back, caught))
+    return tuple(found)
+
+
+def _outside(flow: Flow) -> Mask:
+    """Markings of bottom components that never meet G."""
+    components = flow.graph.components
+    met = np.zeros(len(flow.graph.bottom), dtype=np.bool_)
+    met[components[flow.nominal]] = True
+    outside: Mask = (flow.graph.bottom & ~met)[components]
+    return outside
+
+
+def _recovery(
+    flow: Flow,
+    alone: Flow,
+    name: str,
+    edges: Index,
+    nested: list[Mask],
+    way_back: Mask,
+    caught: Mask,
+) -> Recovery:
+    back, sure = (
+        f"after {name} there is always a way back to",
+        f"after {name} the task always comes back to",
+    )
+    kappa, strategy = _kappa(alone, name, nested)
+    return Recovery(
+        name,
+        _every(flow, edges, way_back, f"{back} the nominal flow", "no way back"),
+        _every(
+            flow,
+            edges,
+            ~caught,
+            f"{sure} the nominal flow, with probability 1",
+            "may never come back",
+        ),
+        kappa,
+        _resumed(flow, np.unique(flow.space.target[edges]).astype(np.int64)),
+        strategy,
+    )
+
+
+def _kappa(alone: Flow, name: str, nested: list[Mask]) -> tuple[int | None, tuple[str, ...]]:
+    """(index of an error exit, shortest way back inside the set that it guarantees)."""
+    edges = np.flatnonzero(alone.fires(frozenset({name})))
+    first = edges[alone.nominal[alone.space.source[edges]]]
+    after = np.unique(alone.space.target[first if len(first) else edges])
+    held = [bool(w[after].all()) for w in nested]
+    kappa = None if held[-1] else held.index(False) - 1
+    inside = nested[-1 if kappa is None else max(kappa, 0)]
+    usable = inside[alone.space.target] & ~alone.error
+    path = alone.graph.path(int(after[0]), alone.nominal, usable)
+    if path is None:
+        path = alone.graph.path(int(after[0]), alone.nominal) or []
+    return kappa, tuple(alone.space.net.transitions[alone.space.label[e]] for e in path)
+
+
+def _every(flow: Flow, edges: Index, good: Mask, yes: str, no: str) -> Verdict:
+    bad = edges[~good[flow.space.target[edges]]]
+    if not len(bad):
+        return Verdict(True, yes, assumption=FAIRNESS)
+    edge = int(bad[0])
+    shown = _through(flow.space, edge)
+    after = flow.space.net.describe(flow.space.marking(int(flow.space.target[edge])))
+    return Verdict(False, f"{no} to the nominal flow from {after}", shown)
+
+
+def _through(space: Space, edge: int) -> Witness:
+    """A shortest firing sequence that ends with this edge."""
+    before = space.path(int(space.source[edge]))
+    marked = {
+        p: n
+        for p, n in zip(space.net.places, space.marking(int(space.target[edge])), strict=True)
+        if n
+    }
+    return Witness((*before, space.net.transitions[int(space.label[edge])]), marked)
+
+
+def _resumed(flow: Flow, after: Index) -> bool | None:
+    """Whether from every marking after the error a goal can be met before a new run is taken or the
+    task is renewed."""
+    if not flow.roles.goals or not flow.roles.run_starts:
+        return None
+    goal = flow.fires(flow.roles.goals)
+    same_run = ~flow.fires(flow.roles.run_starts) & ~flow.renewing
+    before_goal = np.zeros(flow.graph.n, dtype=np.bool_)
+    before_goal[flow.space.source[goal]] = True
+    return bool(flow.graph.backward(before_goal, same_run)[after].all())
+
+
+def _controllable(flow: Flow) -> tuple[Verdict, tuple[str, ...]]:
+    """Whether every action can be forced to start from every reachable marking."""
+    unforced, first = [], None
+    nowhere = np.zeros(flow.graph.n, dtype=np.bool_)
+    for place, starts in flow.roles.starts.items():
+        winning = flow.graph.almost_sure(nowhere, flow.free, hits=flow.fires(starts))
+        if not winning.all():
+            unforced.append(place)
+            first = first if first is not None else (place, int(np.argmin(winning)))
+    if first is None:
+        reason = (
+            "from every reachable marking each action can be forced to start by the "
+            "starts and the operator's means"
+        )
+        return Verdict(True, reason, assumption=FAIRNESS), ()
+    place, i = first
+    reason = (
+        f"from {flow.space.net.describe(flow.space.marking(i))} nothing forces {place} "
+        "to start ever again"
+    )
+    return Verdict(False, reason, witness(flow.space, i), assumption=FAIRNESS), tuple(unforced)
+
+
+def legal_exits(space: Space, roles: Roles, legal: Callable[[Marking], bool]) -> Verdict:
+    """Whether no uncontrollable transition leads from a legal marking to an illegal one
+    (controllability of the legal set)."""
+    flow = Flow(space, roles)
+    inside = space.where(legal)
+    leaving = np.flatnonzero(inside[space.source] & ~inside[space.target] & ~flow.free)
+    if not len(leaving):
+        return Verdict(
+            True,
+            "only controllable transitions leave the legal markings, and these can be withheld",
+        )
+    edge = int(leaving[0])
+    name = space.net.transitions[int(space.label[edge])]
+    before = space.net.describe(space.marking(int(space.source[edge])))
+    return Verdict(
+        False,
+        f"{name} leaves the legal markings from {before} and cannot be withheld",
+        _through(space, edge),
+    )

@@ -1,0 +1,293 @@
+"""Reachability: all markings of a net in breadth-first order with its edges in compact arrays,
+within stated limits.
+
+Three engines give identical answers, down to the numbering of markings and the order of edges:
+marking i is expanded before marking i + 1, transitions in order, and a new marking gets the next
+number. So an engine can go on where another one stopped: `auto` starts with plain integers, which
+need no set-up, and hands over to numpy when the net proves large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.net.explore import (
+    Engine,
+    Explored,
+    IntegerEngine,
+    Labels,
+    Numbers,
+)
+from petrobot.coordinator.analysis.net.pack import Layout, Tokens, TooManyTokens, Words
+from petrobot.coordinator.analysis.net.structure import place_bounds, place_semiflows
+from petrobot.coordinator.task.net import Marking, Net
+
+EngineName = Literal["auto", "integers", "numpy", "numba"]
+
+HANDOVER = 10_000
+"""Markings after which `auto` leaves plain integers."""
+NARROW = 8
+"""Value bits that plain integers start with for a place without a known bound: width costs them
+little."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """When a search stops early; None means without limit.
+
+    `memory` is in bytes and counts what the engine itself holds. `seconds` needs a `clock` (s),
+    since nothing here reads a clock of its own. `progress` is called now and then with (markings
+    found, markings expanded).
+    """
+
+    states: int | None = None
+    seconds: float | None = None
+    memory: int | None = None
+    clock: Callable[[], float] | None = None
+    progress: Callable[[int, int], None] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a time limit that nobody can measure."""
+        if self.seconds is not None and self.clock is None:
+            raise ValueError("a limit in seconds needs a clock: pass clock=time.monotonic")
+
+
+@dataclass(frozen=True)
+class Space:
+    """The reachable markings found, numbered in breadth-first order (0 is the initial one), and
+    their edges.
+
+    Edge e of marking i, `row[i] <= e < row[i + 1]`, fires transition `label[e]` and leads to
+    marking `target[e]`; the edges of a marking stand in transition order (without kept edges `row`
+    still counts them). If the search was cut short, only the first `expanded` markings have their
+    edges, `complete` is False and `reason` says why.
+    """
+
+    net: Net
+    layout: Layout
+    words: Words
+    """Packed markings, shape (states, layout.words)."""
+    row: NDArray[np.int64]
+    target: Numbers
+    label: Labels
+    expanded: int
+    complete: bool
+    reason: str
+    engine: str
+    _columns: dict[int, Tokens] = field(default_factory=dict, repr=False, compare=False)
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    @property
+    def edges(self) -> int:
+        """Number of edges found, also when only their count was kept."""
+        return int(self.row[-1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return self.words.nbytes + self.row.nbytes + self.target.nbytes + self.label.nbytes
+
+    def marking(self, i: int) -> Marking:
+        """Marking number i."""
+        return self.layout.unpack(self.layout.join_many(self.words[i : i + 1])[0])
+
+    def markings(self, block: int = 1 << 16) -> Iterator[tuple[int, Tokens]]:
+        """All markings as blocks (number of the first, array of shape (n, places))."""
+        for start in range(0, len(self), block):
+            yield start, self.layout.unpack_many(self.words[start : start + block])
+
+    def tokens(self, place: int) -> Tokens:
+        """Tokens of one place in every marking, shape (states,)."""
+        if place not in self._columns:
+            self._columns[place] = self.layout.tokens(self.words, place)
+        return self._columns[place]
+
+    def where(self, predicate: Callable[[Marking], bool]) -> NDArray[np.bool_]:
+        """In which markings the predicate holds, shape (states,)."""
+        found = [predicate(tuple(m)) for _, block in self.markings() for m in block.tolist()]
+        return np.array(found, dtype=np.bool_)
+
+    @cached_property
+    def _numbers(self) -> dict[int, int]:
+        return {packed: i for i, packed in enumerate(self.layout.join_many(self.words))}
+
+    def number(self, marking: Marking) -> int | None:
+        """The number of a marking, None if it was not found."""
+        if any(n >> w for n, w in zip(marking, self.layout.width, strict=True)):
+            return None
+        return self._numbers.get(self.layout.pack(marking))
+
+    @cached_property
+    def source(self) -> NDArray[np.int32]:
+        """The marking that each edge leaves, shape (edges,)."""
+        return np.repeat(np.arange(len(self), dtype=np.int32), np.diff(self.row))
+
+    @cached_property
+    def bounds(self) -> tuple[int, ...]:
+        """The most tokens seen in each place."""
+        return tuple(
+            int(self.layout.tokens(self.words, p).max()) for p in range(len(self.net.places))
+        )
+
+    @cached_property
+    def most_tokens(self) -> int:
+        """The most tokens seen in one marking."""
+        return max(int(block.sum(axis=1).max()) for _, block in self.markings())
+
+    @cached_property
+    def dead(self) -> NDArray[np.int64]:
+        """Numbers of the expanded markings that enable nothing."""
+        return np.flatnonzero(np.diff(self.row[: self.expanded + 1]) == 0)
+
+    def path(self, goal: int) -> list[str]:
+        """A shortest firing sequence from the initial marking to marking number `goal`."""
+        sequence = []
+        while goal:
+            edge = int(self.parent_edge[goal])
+            sequence.append(self.net.transitions[self.label[edge]])
+            goal = int(self.source[edge])
+        return sequence[::-1]
+
+    @cached_property
+    def parent_edge(self) -> NDArray[np.int64]:
+        """The first edge that leads to each marking: breadth-first numbering makes it one of a
+        shortest path."""
+        parent = np.full(len(self), -1, dtype=np.int64)
+        parent[self.target[::-1]] = np.arange(len(self.target) - 1, -1, -1)
+        return parent
+
+
+def explore(
+    net: Net,
+    *,
+    engine: EngineName = "auto",
+    limits: Limits | None = None,
+    edges: bool = True,
+    bounds: Sequence[int | None] | None = None,
+) -> Space:
+    """The reachable markings of a net from its initial one.
+
+    `bounds` (tokens by place, None: unknown; by default from the P-invariants) only size the
+    fields; they need not be right. With `edges=False` the edges are counted, not kept. Ctrl-C,
+    limits and a place that outgrows 63 bits give the partial space found so far, marked incomplete.
+    Raises TooManyTokens if the initial marking has such a place and ImportError if numba is asked
+    for and not installed.
+    """
+    limits = limits or Limits()
+    started = limits.clock() if limits.clock else 0.0
+    if engine in ("auto", "integers"):
+        layout = Layout.for_net(net, bounds, NARROW)
+        name, found = "integers", _plain_engine(net, layout, edges)
+        budget = HANDOVER if engine == "auto" else None
+    else:
+        layout = Layout.for_net(net, bounds, 2)
+        name, found, budget = (
+            engine,
+            _engine(engine, Explored.start(net, layout, edges), bounds),
+            None,
+        )
+    try:
+        reason = _run(found, limits, started, budget)
+        if reason == _HAND_OVER:
+            name, found = "numpy", _engine("numpy", found.explored(), bounds)
+            reason = _run(found, limits, started, None)
+    except KeyboardInterrupt:
+        reason = INTERRUPTED
+    return _space(found.explored(), reason, name)
+
+
+INTERRUPTED = "interrupted"
+"""Reason of a search that Ctrl-C ended."""
+
+
+def _plain_engine(net: Net, layout: Layout, edges: bool) -> Engine:
+    return IntegerEngine(Explored.start(net, layout, edges))
+
+
+_HAND_OVER = "hand over"
+
+
+def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> Engine:
+    """An engine of machine words that goes on from what was begun, in a layout as narrow as is
+    known to suffice."""
+    seen = begun.layout.unpack_many(begun.words).max(axis=0).tolist()
+    known = (
+        bounds
+        if bounds is not None
+        else place_bounds(begun.net, place_semiflows(begun.net, 2 * len(seen)))
+    )
+    guess = [b if b is not None else 2 * top + 1 for b, top in zip(known, seen, strict=True)]
+    begun = begun.relaid(
+        Layout.for_net(begun.net, [max(g, top) for g, top in zip(guess, seen, strict=True)])
+    )
+    if name == "numba":
+        from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine, expand_block
+        from petrobot.services.host.numba_kernels import plain
+
+        if plain(expand_block) is expand_block:
+            raise ImportError(
+                "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
+            )
+        return NumbaEngine(begun)
+    from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
+
+    return NumpyEngine(begun)
+
+
+def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> str:
+    """Expand until done; gives the reason why it stopped early, or an empty text. Lets
+    KeyboardInterrupt through."""
+    cap = min((n for n in (limits.states, budget) if n is not None), default=None)
+    try:
+        while engine.expand(cap):
+            if limits.progress:
+                limits.progress(engine.states, engine.expanded)
+            if cap is not None and engine.states >= cap:
+                break
+            if limits.memory is not None and engine.nbytes > limits.memory:
+                return f"memory limit of {limits.memory} bytes"
+            if (
+                limits.seconds is not None
+                and limits.clock
+                and limits.clock() - started > limits.seconds
+            ):
+                return f"time limit of {limits.seconds:g} s"
+    except TooManyTokens as grown:
+        return str(grown)
+    except MemoryError:
+        return "out of memory"
+    if engine.expanded == engine.states:
+        return ""
+    if limits.states is not None and engine.states >= limits.states:
+        return f"limit of {limits.states} states"
+    return _HAND_OVER
+
+
+def _space(found: Explored, reason: str, engine: str) -> Space:
+    row = np.full(len(found.words) + 1, found.row[-1], dtype=np.int64)
+    row[: len(found.row)] = found.row
+    states = len(found.words)
+    if (
+        reason and found.keep_edges
+    ):  # an interruption may have left markings whose edges are not yet in
+        states = int(found.target.max(initial=0)) + 1
+    return Space(
+        found.net,
+        found.layout,
+        found.words[:states],
+        row[: states + 1],
+        found.target,
+        found.label,
+        len(found.row) - 1,
+        not reason,
+        reason,
+        engine,
+    )

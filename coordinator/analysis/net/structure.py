@@ -1,0 +1,299 @@
+"""What a net's arcs alone prove: invariants, bounds, conservativeness, conflicts; exact integer
+certificates.
+
+All of it reads the incidence matrix C = Post - Pre. An inhibitor, a capacity or a priority only
+removes behaviour, so what holds here for every firing sequence (bounds, P-invariants, exclusion)
+holds in the restricted net as well; T-invariants, siphons and traps are those of the net without
+them. Source of the notions: T. Murata, Petri nets: properties, analysis and applications, Proc.
+IEEE 77 (1989), sections V to VII.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import gcd
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.net.pack import effect
+from petrobot.coordinator.task.net import Net
+
+EFFORT = 2_000
+"""Rows that the enumeration of semiflows may hold at a time."""
+
+SMALL_EFFORT = 300
+"""Rows beyond which a linear program finds a Lyapunov function sooner than an enumeration does."""
+
+Vector = dict[int, int]
+"""A sparse integer vector: entries that are not zero, by index."""
+
+
+@dataclass(frozen=True, slots=True)
+class Semiflows:
+    """Minimal-support non-negative integer solutions; all of them if `complete`."""
+
+    vectors: tuple[Vector, ...]
+    complete: bool
+
+    def covers(self, size: int) -> bool:
+        """Whether every index below `size` stands in some vector."""
+        return len(set().union(*self.vectors)) == size if self.vectors else size == 0
+
+
+def incidence(net: Net) -> NDArray[np.int64]:
+    """C = Post - Pre, shape (places, transitions)."""
+    C = np.zeros((len(net.places), len(net.transitions)), dtype=np.int64)
+    for t in range(len(net.transitions)):
+        for p, change in effect(net, t).items():
+            C[p, t] = change
+    return C
+
+
+def place_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
+    """Minimal y >= 0 with y^T C = 0: weighted token sums that no firing changes."""
+    rows: list[Vector] = [{} for _ in net.places]
+    for t in range(len(net.transitions)):
+        for p, change in effect(net, t).items():
+            rows[p][t] = change
+    return _semiflows(rows, effort)
+
+
+def transition_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
+    """Minimal x >= 0 with C x = 0: firing counts that bring a marking back to itself."""
+    return _semiflows([effect(net, t) for t in range(len(net.transitions))], effort)
+
+
+def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
+    """Minimal-support non-negative combinations of the rows that give zero (Farkas' algorithm, as
+    by Colom & Silva)."""
+    live = [({i: 1}, dict(row)) for i, row in enumerate(rows)]
+    while True:
+        columns = _signs(live)
+        if not columns:
+            return Semiflows(tuple(y for y, _ in live), True)
+        column = min(columns, key=lambda c: columns[c][0] * columns[c][1] - sum(columns[c]))
+        if columns[column][0] * columns[column][1] > effort * 50:
+            break
+        live = _annul(live, column)
+        if len(live) > effort:
+            break
+    return Semiflows(tuple(y for y, rest in live if not rest), False)
+
+
+def _signs(live: list[tuple[Vector, Vector]]) -> dict[int, list[int]]:
+    """For each column that is not yet zero everywhere: how many rows are positive and negative
+    there."""
+    signs: dict[int, list[int]] = {}
+    for _, rest in live:
+        for column, value in rest.items():
+            signs.setdefault(column, [0, 0])[value < 0] += 1
+    return signs
+
+
+def _annul(live: list[tuple[Vector, Vector]], column: int) -> list[tuple[Vector, Vector]]:
+    """Replace the rows that are not zero in the column by their combinations that are; keep minimal
+    supports."""
+    kept = [row for row in live if column not in row[1]]
+    plus = [row for row in live if row[1].get(column, 0) > 0]
+    minus = [row for row in live if row[1].get(column, 0) < 0]
+    fresh = []
+    for a in plus:
+        for b in minus:
+            u, v = -b[1][column], a[1][column]
+            y, rest = _combined(a[0], u, b[0], v), _combined(a[1], u, b[1], v)
+            shared = gcd(*y.values(), *rest.values())
+            fresh.append(
+                ({i: n // shared for i, n in y.items()}, {i: n // shared for i, n in rest.items()})
+            )
+    return _minimal_supports(kept, fresh) if fresh else kept
+
+
+def _combined(a: Vector, u: int, b: Vector, v: int) -> Vector:
+    total = {i: u * n for i, n in a.items()}
+    for i, n in b.items():
+        total[i] = total.get(i, 0) + v * n
+    return {i: n for i, n in total.items() if n}
+
+
+def _minimal_supports(
+    kept: list[tuple[Vector, Vector]], fresh: list[tuple[Vector, Vector]]
+) -> list[tuple[Vector, Vector]]:
+    """Those rows whose support contains no other one (of equal ones one stays); the kept ones are
+    minimal already."""
+    old = [(sum(1 << i for i in row[0]), row) for row in kept]
+    new: list[tuple[int, tuple[Vector, Vector]]] = []
+    for mask, row in sorted(
+        ((sum(1 << i for i in row[0]), row) for row in fresh), key=lambda one: one[0].bit_count()
+    ):
+        if not any(mask & other == other for other, _ in new) and not any(
+            mask & other == other for other, _ in old
+        ):
+            new.append((mask, row))
+    return [row for mask, row in old if not any(mask & other == other for other, _ in new)] + [
+        row for _, row in new
+    ]
+
+
+def invariant_basis(rows: Sequence[Vector]) -> list[Vector]:
+    """An integer basis of all combinations (signs allowed) of the rows that give zero: sparse
+    elimination."""
+    work = [(dict(row), {i: 1}) for i, row in enumerate(rows)]
+    basis, pivots = [], list[tuple[int, Vector, Vector]]()
+    for rest, y in work:
+        for column, pivot_rest, pivot_y in pivots:
+            if column in rest:
+                u, v = pivot_rest[column], -rest[column]
+                rest, y = _combined(rest, u, pivot_rest, v), _combined(y, u, pivot_y, v)
+        shared = gcd(*rest.values(), *y.values())
+        rest, y = {i: n // shared for i, n in rest.items()}, {i: n // shared for i, n in y.items()}
+        if rest:
+            pivots.append((min(rest), rest, y))
+        else:
+            basis.append(y)
+    return basis
+
+
+def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
+    """The most tokens each place can hold by P-semiflows and capacities; None where these prove
+    nothing.
+
+    y^T M = y^T M0 in every reachable M gives M(p) <= y^T M0 / y(p). Sound with inhibitors and
+    priorities.
+    """
+    bounds = [
+        limit if limit is None else max(limit, n)
+        for limit, n in zip(net.capacity, net.initial, strict=True)
+    ]
+    for y in (flows or place_semiflows(net)).vectors:
+        total = sum(weight * net.initial[p] for p, weight in y.items())
+        for p, weight in y.items():
+            known = bounds[p]
+            bounds[p] = total // weight if known is None else min(known, total // weight)
+    return bounds
+
+
+def linear_bound(net: Net, place: int) -> int | None:
+    """The most tokens of a place over all M = M0 + C x >= 0, x >= 0 (state equation as a linear
+    program); None: none.
+
+    The exact value may be smaller, never larger. Capacities are taken in; inhibitors and priorities
+    are relaxed.
+    """
+    from scipy.optimize import linprog
+
+    C = incidence(net).astype(float)
+    start = np.array(net.initial, dtype=float)
+    limited = [p for p, limit in enumerate(net.capacity) if limit is not None]
+    room = [max(net.capacity[p] or 0, net.initial[p]) - net.initial[p] for p in limited]
+    A, b = np.vstack([-C, C[limited]]), np.concatenate([start, np.array(room, dtype=float)])
+    found = linprog(-C[place], A_ub=A, b_ub=b, method="highs")
+    return int(np.floor(start[place] - found.fun + 1e-6)) if found.status == 0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class Lyapunov:
+    """A linear Lyapunov function y.M of a net: y > 0 (by place), y^T C <= 0, so y.M never grows
+    (checked in integers)."""
+
+    weights: Vector
+    conserved: bool
+    """Whether y^T C = 0: the net is conservative."""
+
+    def value(self, marking: Sequence[int]) -> int:
+        """y.M."""
+        return sum(w * marking[p] for p, w in self.weights.items())
+
+
+def lyapunov(net: Net) -> Lyapunov | None:
+    """A positive integer y with y^T C <= 0, which makes the net bounded from every initial marking;
+    None if none exists.
+
+    The sum of all P-semiflows where they cover the places, else of the minimal y >= 0 with y^T C <=
+    0 where their enumeration stays small, else a linear program whose solution is made rational and
+    checked exactly.
+    """
+    flows = place_semiflows(net)
+    if flows.covers(len(net.places)):
+        total: Vector = {}
+        for y in flows.vectors:
+            total = _combined(total, 1, y, 1)
+        return Lyapunov(total, True)
+    rows: list[Vector] = [{} for _ in net.places]
+    for t in range(len(net.transitions)):
+        for p, change in effect(net, t).items():
+            rows[p][t] = change
+    slack: list[Vector] = [{t: 1} for t in range(len(net.transitions))]
+    falling = _semiflows(rows + slack, SMALL_EFFORT)
+    if falling.complete:
+        places = len(net.places)
+        sums = {p: sum(y.get(p, 0) for y in falling.vectors) for p in range(places)}
+        return (
+            _exact(net, np.array([float(sums[p]) for p in range(places)]))
+            if all(sums.values())
+            else None
+        )
+    from scipy.optimize import linprog
+
+    C = incidence(net).astype(float)
+    n = len(net.places)
+    found = linprog(
+        np.ones(n), A_ub=C.T, b_ub=np.zeros(C.shape[1]), bounds=[(1, None)] * n, method="highs"
+    )
+    return _exact(net, found.x) if found.status == 0 else None
+
+
+def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
+    """Integer weights near a multiple of y that satisfy y^T C <= 0 exactly, if a small denominator
+    does."""
+    for largest in (1, 12, 1000, 10**6):
+        near = [Fraction(float(v)).limit_denominator(largest) for v in y]
+        scale = int(np.lcm.reduce([f.denominator for f in near])) if near else 1
+        weights = {p: int(f * scale) for p, f in enumerate(near)}
+        drift = [
+            sum(weights[p] * c for p, c in effect(net, t).items())
+            for t in range(len(net.transitions))
+        ]
+        if all(w > 0 for w in weights.values()) and all(d <= 0 for d in drift):
+            return Lyapunov(weights, not any(drift))
+    return None
+
+
+def is_strictly_conservative(net: Net) -> bool:
+    """Whether no firing changes the number of tokens."""
+    return all(sum(effect(net, t).values()) == 0 for t in range(len(net.transitions)))
+
+
+def conflict_sets(net: Net) -> list[tuple[int, ...]]:
+    """Groups of transitions that share an input place, directly or through others (of more than one
+    member)."""
+    group = list(range(len(net.transitions)))
+
+    def root(t: int) -> int:
+        while group[t] != t:
+            group[t] = group[group[t]]
+            t = group[t]
+        return t
+
+    owner: dict[int, int] = {}
+    for t in range(len(net.transitions)):
+        for p, _ in net.consume[t]:
+            group[root(t)] = root(owner.setdefault(p, t))
+    sets: dict[int, list[int]] = {}
+    for t in range(len(net.transitions)):
+        sets.setdefault(root(t), []).append(t)
+    return [tuple(members) for members in sets.values() if len(members) > 1]
+
+
+def exclusive_places(net: Net, flows: Semiflows) -> set[tuple[int, int]]:
+    """Pairs of places that a P-semiflow keeps from being marked together: y(p) + y(q) > y^T M0."""
+    pairs: set[tuple[int, int]] = set()
+    for y in flows.vectors:
+        total = sum(weight * net.initial[p] for p, weight in y.items())
+        support = sorted(y)
+        pairs.update(
+            (p, q) for i, p in enumerate(support) for q in support[i + 1 :] if y[p] + y[q] > total
+        )
+    return pairs

@@ -1,0 +1,271 @@
+"""Linear systems of Markov chains: x = b + A x in the order of strong components, and stationary
+vectors.
+
+A is given by its edges: x_i = b_i + sum over edges e of i of a_e x_(target of e). Most robot tasks
+use runs up, so their graphs are long chains of small components: these are solved level by level,
+each component by itself (dense where small, Gauss-Seidel with a triangular factor where large).
+Stationary vectors: Grassmann-Taksar-Heyman elimination, which subtracts nothing and so loses no
+digits (W. K. Grassmann, M. I. Taksar, D. P. Heyman, Oper. Res. 33, 1985), or Gauss-Seidel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, ranges, sum_by
+from petrobot.coordinator.analysis.time.gspn import Values
+
+DENSE = 600
+"""Vertices up to which a component is solved by dense elimination."""
+SWEEPS = 20_000
+TOLERANCE = 1e-14
+
+
+class NotConverged(ArithmeticError):  # noqa: N818 - a fact about an iteration
+    """An iteration did not reach its tolerance; the message gives the residual that it reached."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The order in which the components of a graph are solved: successors first. Built once, used
+    for many sides."""
+
+    graph: Graph
+    waves: tuple[tuple[Index, tuple[Index, ...]], ...]
+    """Each wave: vertices that are components of their own, and the larger components, as vertex
+    numbers."""
+
+    @classmethod
+    def of(cls, graph: Graph, inside: Mask | None = None) -> Plan:
+        """The plan for the vertices marked `inside` (all by default); others count as known
+        zeros."""
+        keep = np.ones(graph.n, dtype=np.bool_) if inside is None else inside
+        component = graph.components
+        ours, theirs = component[graph.source], component[graph.target]
+        crossing = (ours != theirs) & keep[graph.source] & keep[graph.target]
+        outer = Graph(int(component.max()) + 1, *_sorted_edges(ours[crossing], theirs[crossing]))
+        loops = np.zeros(outer.n, dtype=np.bool_)
+        loops[ours[(ours == theirs) & keep[graph.source]]] = True
+        wave = _waves(outer)
+        members = np.flatnonzero(keep)
+        members = members[np.lexsort((component[members], wave[component[members]]))]
+        return cls(graph, tuple(_split(members, component, wave, loops)))
+
+
+def _sorted_edges(source: Any, target: Any) -> tuple[Any, Any]:
+    order = np.argsort(source, kind="stable")
+    return source[order], target[order]
+
+
+def _waves(outer: Graph) -> Index:
+    """Length of the longest way out of each vertex of an acyclic graph."""
+    left = np.diff(outer.row)
+    first, order = outer.into
+    wave = np.zeros(outer.n, dtype=np.int64)
+    front, depth = np.flatnonzero(left == 0), 0
+    while len(front):
+        wave[front] = depth
+        edges = order[ranges(first[front], first[front + 1])]
+        before = outer.source[edges]
+        np.subtract.at(left, before, 1)
+        front, depth = np.unique(before[left[before] == 0]), depth + 1
+    return wave
+
+
+def _split(
+    members: Index, component: Any, wave: Index, loops: Mask
+) -> list[tuple[Index, tuple[Index, ...]]]:
+    """Members, sorted by wave and component, as waves of single vertices and larger components."""
+    waves = []
+    for part in np.split(members, np.flatnonzero(np.diff(wave[component[members]])) + 1):
+        if not len(part):
+            continue
+        looping = loops[component[part]]
+        larger = part[looping]
+        groups = (
+            np.split(larger, np.flatnonzero(np.diff(component[larger])) + 1) if len(larger) else []
+        )
+        waves.append((part[~looping], tuple(groups)))
+    return waves
+
+
+def solve(plan: Plan, value: Values, b: Values) -> Values:
+    """x = b + A x with A given by `value` on the plan's edges; b and x have shape (n,) or (n,
+    k)."""
+    graph = plan.graph
+    x = np.zeros_like(b, dtype=np.float64)
+    for single, groups in plan.waves:
+        if len(single):
+            x[single] = b[single] + _gather(graph, value, x, single)
+        for group in groups:
+            _solve_group(graph, value, x, b, group)
+    return x
+
+
+def _gather(graph: Graph, value: Values, x: Values, vertices: Index) -> Values:
+    """Sum of value * x over the edges of each vertex."""
+    first, last = graph.row[vertices], graph.row[vertices + 1]
+    edges = ranges(first, last)
+    terms = (value[edges] * x[graph.target[edges]].T).T
+    owner = np.repeat(np.arange(len(vertices)), last - first)
+    if x.ndim == 1:
+        return sum_by(owner, terms, len(vertices))
+    return np.stack([sum_by(owner, c, len(vertices)) for c in terms.T], axis=1)
+
+
+def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index) -> None:
+    """Solve one component; what it leads to is known already and the component itself still stands
+    at zero."""
+    x[group] = 0.0
+    right = b[group] + _gather(graph, value, x, group)
+    edges = ranges(graph.row[group], graph.row[group + 1])
+    number = np.full(graph.n, -1, dtype=np.int64)
+    number[group] = np.arange(len(group))
+    edges = edges[number[graph.target[edges]] >= 0]
+    rows, columns = number[graph.source[edges]], number[graph.target[edges]]
+    if len(group) <= DENSE:
+        matrix = np.eye(len(group))
+        np.subtract.at(matrix, (rows, columns), value[edges])
+        x[group] = np.linalg.solve(matrix, right)
+    else:
+        x[group] = _sweep(len(group), rows, columns, value[edges], right)
+
+
+def triangular(n: int, rows: Index, columns: Index, value: Values) -> tuple[Any, Any]:
+    """(solver of I - upper part, lower part) of a sparse matrix: one backward Gauss-Seidel
+    sweep."""
+    from scipy.sparse import csc_array, csr_array, eye_array
+    from scipy.sparse.linalg import splu
+
+    early = columns >= rows
+    upper = csc_array((value[early], (rows[early], columns[early])), shape=(n, n))
+    lower = csr_array((value[~early], (rows[~early], columns[~early])), shape=(n, n))
+    factor = splu(
+        csc_array(eye_array(n, format="csc") - upper), permc_spec="NATURAL", diag_pivot_thresh=0.0
+    )
+    return factor, lower
+
+
+def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) -> Values:
+    """x = right + A x by backward Gauss-Seidel: successors mostly have higher numbers, so news
+    travels in one sweep.
+
+    Where that is slow, the part of the error that is nearly constant over blocks of neighbours is
+    solved for now and then.
+    """
+    factor, lower = triangular(n, rows, columns, value)
+    coarse, x = Coarse(n, rows, columns), factor.solve(right)
+    inverse: Values | None = None
+    for k in range(SWEEPS):
+        before = x
+        x = factor.solve(right + lower @ x)
+        if np.max(np.abs(x - before)) <= TOLERANCE * max(1e-300, float(np.max(np.abs(x)))):
+            return np.asarray(x)
+        if coarse.is_due(k):
+            inverse = coarse.inverse(value) if inverse is None else inverse
+            x = x + coarse.correction(inverse, right + sum_by(rows, value * x[columns], n) - x)
+    raise NotConverged(
+        f"Gauss-Seidel still moved by {np.max(np.abs(x - before)):.2e} after {SWEEPS} sweeps"
+    )
+
+
+def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
+    """The probability vector nu = nu P of an irreducible stochastic matrix given by its entries.
+
+    Gauss-Seidel, with aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F.
+    McAllister, W. J. Stewart, Iterative methods for computing stationary distributions, SIAM J.
+    Alg. Disc. Meth. 5, 1984).
+    """
+    if n == 1:
+        return np.ones(1)
+    if n <= DENSE:
+        matrix = np.zeros((n, n))
+        np.add.at(matrix, (rows, columns), value)
+        return gth(matrix)
+    # The transposed matrix with numbers turned round makes the backward sweep a forward one.
+    factor, lower = triangular(n, n - 1 - columns, n - 1 - rows, value)
+    coarse, x = Coarse(n, n - 1 - rows, n - 1 - columns), np.full(n, 1.0 / n)
+    for k in range(SWEEPS):
+        before = x
+        x = factor.solve(lower @ x)
+        x /= x.sum()
+        if np.max(np.abs(x - before)) <= TOLERANCE * float(np.max(x)):
+            return np.asarray(x[::-1].copy())
+        if coarse.is_due(k):
+            x = x * coarse.scale(value, x)
+            x /= x.sum()
+    raise NotConverged(
+        f"the stationary vector still moved by {np.max(np.abs(x - before)):.2e} after "
+        f"{SWEEPS} sweeps"
+    )
+
+
+class Coarse:
+    """Vertices in blocks of consecutive numbers, neighbours in breadth-first order, for systems
+    that converge slowly."""
+
+    PATIENCE, EVERY, BLOCKS = 60, 5, 128
+
+    def __init__(self, n: int, rows: Index, columns: Index) -> None:
+        """Entries are (rows, columns); the blocks are equally large."""
+        self.count = min(self.BLOCKS, n)
+        self.block = np.arange(n) * self.count // n
+        self.rows, self.pair = rows, self.block[rows] * self.count + self.block[columns]
+
+    def is_due(self, sweep: int) -> bool:
+        """Whether a coarse step follows this sweep."""
+        return sweep >= self.PATIENCE and sweep % self.EVERY == 0
+
+    def _matrix(self, weights: Values) -> Values:
+        return sum_by(self.pair, weights, self.count**2).reshape(self.count, self.count)
+
+    def scale(self, value: Values, x: Values) -> Values:
+        """By how much each vertex' block is off, up to a common factor, for a stationary vector:
+        the chain of the blocks
+
+        has the probabilities flow(I, J) / sum of x over I, so its stationary vector over these sums
+        is that of the flows.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            factor = gth(self._matrix(value * x[self.rows]))
+        # A block whose probability underflows has no flow to judge by: then the sweeps go on alone.
+        return (
+            np.asarray(factor[self.block])
+            if np.isfinite(factor).all() and factor.min() > 0
+            else np.ones(len(x))
+        )
+
+    def inverse(self, value: Values, pinned: bool = False) -> Values:
+        """The inverse of I - A seen from the blocks, for `correction`.
+
+        `pinned` for a stochastic A: the first block keeps its values, since a solution is then free
+        up to a constant.
+        """
+        size, first = np.bincount(self.block, minlength=self.count), int(pinned)
+        matrix = np.diag(size.astype(float)) - self._matrix(value)
+        out = np.zeros_like(matrix)
+        out[first:, first:] = np.linalg.inv(matrix[first:, first:])
+        return out
+
+    def correction(self, inverse: Values, left: Values) -> Values:
+        """What to add to a solution of x = right + A x whose residual is `left`: constant over each
+        block."""
+        return np.asarray((inverse @ sum_by(self.block, left, self.count))[self.block])
+
+
+def gth(matrix: Values) -> Values:
+    """The stationary vector of an irreducible stochastic matrix or generator, shape (n, n), without
+    a subtraction."""
+    work = matrix.copy()
+    n = len(work)
+    for k in range(n - 1, 0, -1):
+        work[:k, k] /= work[k, :k].sum()
+        work[:k, :k] += np.outer(work[:k, k], work[k, :k])
+    x = np.ones(n)
+    for k in range(1, n):
+        x[k] = x[:k] @ work[:k, k]
+    out: Values = x / x.sum()
+    return out

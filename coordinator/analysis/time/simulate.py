@@ -1,0 +1,386 @@
+"""Token game and stochastic simulation, for nets whose chain is too large to solve; results carry
+confidence intervals.
+
+Many independent replicas are played side by side, a row of numpy operations moving all of them by
+one firing. The generator is passed in; the same generator gives the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import sqrt
+from statistics import NormalDist
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.net.graph import Mask
+from petrobot.coordinator.analysis.net.pack import Tokens, effect, thresholds
+from petrobot.coordinator.analysis.time.gspn import Gspn, Values
+from petrobot.coordinator.task.net import Marking, Net
+
+Stop = Callable[[Tokens], Mask]
+"""Tokens of shape (places, replicas) to which replicas have reached their goal, shape
+(replicas,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A simulated number with its confidence interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, sample: Values, confidence: float) -> Estimate:
+        """Normal interval for the mean of independent observations."""
+        mean = float(sample.mean())
+        if len(sample) < 2:
+            return cls(mean, -np.inf, np.inf)
+        half = _z(confidence) * float(sample.std(ddof=1)) / sqrt(len(sample))
+        return cls(mean, mean - half, mean + half)
+
+    @classmethod
+    def share(cls, hits: int, n: int, confidence: float) -> Estimate:
+        """Wilson interval for a probability."""
+        z, p = _z(confidence), hits / n
+        middle, half = p + z * z / (2 * n), z * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        return cls(
+            p,
+            max(0.0, (middle - half) / (1 + z * z / n)),
+            min(1.0, (middle + half) / (1 + z * z / n)),
+        )
+
+    def covers(self, value: float) -> bool:
+        """Whether the interval holds a value."""
+        return self.low <= value <= self.high
+
+
+def _z(confidence: float) -> float:
+    return NormalDist().inv_cdf(0.5 + confidence / 2)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What was seen. Long-run numbers are per replica over its observed time; completion is None
+    without a goal.
+
+    `complete` is False where replicas were cut off by the limit of firings; `firings` counts all of
+    them.
+    """
+
+    replicas: int
+    firings: int
+    throughput: dict[str, Estimate]
+    mean_tokens: dict[str, Estimate]
+    completed: Estimate | None
+    time: Estimate | None
+    """Mean time to the goal of the replicas that reached it (s)."""
+    times: Values
+    """Their times, sorted (s)."""
+    complete: bool
+
+    def quantile(self, q: float) -> float:
+        """Quantile of the time to the goal (s)."""
+        return float(np.quantile(self.times, q))
+
+
+class _Replicas:
+    """Replicas of a GSPN as columns: tokens, clocks, and what was counted."""
+
+    def __init__(self, gspn: Gspn, count: int) -> None:
+        net = gspn.net
+        self.gspn, self.net = gspn, net
+        self.delta = np.zeros((len(net.places), len(net.transitions)), dtype=np.int64)
+        for t in range(len(net.transitions)):
+            for p, change in effect(net, t).items():
+                self.delta[p, t] = change
+        self.limits = [sorted(thresholds(net, t).items()) for t in range(len(net.transitions))]
+        levels = sorted(set(net.priority), reverse=True)
+        self.levels = [
+            [t for t, own in enumerate(net.priority) if own == level] for level in levels
+        ]
+        self.timed = np.array([r is not None for r in gspn.rate])
+        self.tokens = np.repeat(np.array(net.initial, dtype=np.int64)[:, None], count, axis=1)
+
+    def amounts(self) -> tuple[Values, Mask]:
+        """Amount of each enabled transition, shape (transitions, replicas), and which replicas are
+        tangible."""
+        count = self.tokens.shape[1]
+        amount = np.zeros((len(self.net.transitions), count))
+        beaten = np.zeros(count, dtype=np.bool_)
+        tangible = np.ones(count, dtype=np.bool_)
+        for level in self.levels:
+            if beaten.all():
+                break
+            for t in level:
+                able = self._concession(t) & ~beaten
+                amount[t] = self._amount(t, able)
+            some = (amount[level] > 0).any(axis=0)
+            if self.net.priority[level[0]] > 0:
+                tangible &= ~some
+            beaten |= some
+        return amount, tangible
+
+    def _concession(self, t: int) -> Mask:
+        able = np.ones(self.tokens.shape[1], dtype=np.bool_)
+        for p, w in self.net.consume[t]:
+            able &= self.tokens[p] >= w
+        for p, k in self.limits[t]:
+            able &= self.tokens[p] < k
+        return able
+
+    def _amount(self, t: int, able: Mask) -> Values:
+        rate, servers = self.gspn.rate[t], self.gspn.servers[t]
+        if rate is None:
+            return np.asarray(able * self.gspn.weight[t])
+        if servers == 1 or not self.net.consume[t]:
+            return np.asarray(able * rate)
+        degree = np.min([self.tokens[p] // w for p, w in self.net.consume[t]], axis=0)
+        return np.asarray(
+            able * rate * (degree if servers is None else np.minimum(degree, servers))
+        )
+
+
+def simulate(
+    gspn: Gspn,
+    random: np.random.Generator,
+    *,
+    replicas: int = 1000,
+    horizon: float = np.inf,
+    warmup: float = 0.0,
+    goal: Stop | None = None,
+    firings: int = 10_000_000,
+    confidence: float = 0.95,
+    progress: Callable[[int, float], None] | None = None,
+    engine: Literal["numpy", "numba"] = "numpy",
+) -> Simulation:
+    """Play replicas from the initial marking until `horizon` (s) or their goal, at most `firings`
+    in total.
+
+    The engine "numba" (an extra) needs a horizon and knows no goal; its draws come in another
+    order, so its numbers differ from those of "numpy" within their intervals. Raises ImportError
+    where it is not installed.
+
+    Throughput and mean tokens are taken from `warmup` (s) on. Without a horizon a goal is needed,
+    and replicas that are dead before it count as not completed. `progress` is called with (firings,
+    share of replicas still played). Ctrl-C ends the play; the result is then marked as not
+    complete.
+    """
+    if goal is None and not horizon < np.inf:
+        raise ValueError("a simulation needs a horizon (s) or a goal")
+    if engine == "numba":
+        return _compiled(
+            gspn, random, replicas, horizon, warmup, goal, firings, confidence, progress
+        )
+    play = _Play(gspn, random, replicas, horizon, warmup, goal)
+    try:
+        while len(play.alive) and play.fired < firings:
+            play.step()
+            if progress and play.steps % 1000 == 0:
+                progress(play.fired, len(play.alive) / replicas)
+    except KeyboardInterrupt:
+        play.interrupted = True
+    return play.result(confidence)
+
+
+def _compiled(
+    gspn: Gspn,
+    random: np.random.Generator,
+    replicas: int,
+    horizon: float,
+    warmup: float,
+    goal: Stop | None,
+    firings: int,
+    confidence: float,
+    progress: Callable[[int, float], None] | None,
+) -> Simulation:
+    """Replicas one after the other by the compiled kernel."""
+    from petrobot.coordinator.analysis.time.simulate_kernel import Tables, play
+    from petrobot.services.host.numba_kernels import plain
+
+    if plain(play) is play:
+        raise ImportError(
+            "the engine 'numba' needs numba: install petrobot[fast], or take the engine 'numpy'"
+        )
+    if goal is not None or not horizon < np.inf:
+        raise ValueError(
+            "the engine 'numba' plays to a horizon; take the engine 'numpy' for a goal"
+        )
+    tables, initial = Tables.of(gspn), np.array(gspn.net.initial, dtype=np.int64)
+    fires = np.zeros((replicas, len(gspn.net.transitions)))
+    area = np.zeros((replicas, len(gspn.net.places)))
+    observed = np.zeros(replicas)
+    done = fired = 0
+    try:
+        while done < replicas and fired < firings:
+            more, observed[done] = play(
+                initial, tables, random, horizon, warmup, firings - fired, fires[done], area[done]
+            )
+            fired, done = fired + more, done + 1
+            if progress and done % 100 == 0:
+                progress(fired, 1 - done / replicas)
+    except KeyboardInterrupt:
+        pass
+    seen = observed > 0
+    complete = done == replicas and fired < firings
+    return _summed(
+        gspn, fires[seen].T, area[seen].T, observed[seen], fired, replicas, complete, confidence
+    )
+
+
+def _summed(
+    gspn: Gspn,
+    fires: Values,
+    area: Values,
+    observed: Values,
+    fired: int,
+    replicas: int,
+    complete: bool,
+    confidence: float,
+) -> Simulation:
+    """Estimates from counts of shape (transitions, n), areas (places, n) and observed times
+    (n,)."""
+    net = gspn.net
+    rates = fires / observed if len(observed) else np.full((len(net.transitions), 1), np.nan)
+    tokens = area / observed if len(observed) else np.full((len(net.places), 1), np.nan)
+    return Simulation(
+        replicas,
+        fired,
+        {
+            name: Estimate.of(row, confidence)
+            for name, row in zip(net.transitions, rates, strict=True)
+        },
+        {name: Estimate.of(row, confidence) for name, row in zip(net.places, tokens, strict=True)},
+        None,
+        None,
+        np.zeros(0),
+        complete,
+    )
+
+
+class _Play:
+    """One simulation under way; `alive` are the replicas still played (columns of `state`)."""
+
+    def __init__(
+        self,
+        gspn: Gspn,
+        random: np.random.Generator,
+        count: int,
+        horizon: float,
+        warmup: float,
+        goal: Stop | None,
+    ) -> None:
+        self.random, self.horizon, self.warmup, self.goal = random, horizon, warmup, goal
+        self.state = _Replicas(gspn, count)
+        self.count, self.alive = count, np.arange(count)
+        self.now = np.zeros(count)
+        self.fired = self.steps = 0
+        self.interrupted = False
+        self.fires = np.zeros((len(gspn.net.transitions), count))
+        self.area = np.zeros((len(gspn.net.places), count))
+        self.observed = np.zeros(count)
+        self.reached = np.full(count, np.nan)
+        self._arrive()
+
+    def step(self) -> None:
+        """One firing of every replica that is still played."""
+        amount, tangible = self.state.amounts()
+        total = np.add.accumulate(amount, axis=0)
+        whole = total[-1]
+        stay = np.zeros(len(self.alive))
+        moving = tangible & (whole > 0)
+        stay[moving] = self.random.standard_exponential(int(moving.sum())) / whole[moving]
+        stay[whole == 0] = np.inf
+        chosen = (total <= self.random.random(len(self.alive)) * whole).sum(axis=0)
+        after = self.now[self.alive] + stay
+        self._observe(np.minimum(after, self.horizon))
+        going = after < self.horizon
+        self.now[self.alive] = np.minimum(after, self.horizon)
+        if not going.all():
+            self._keep(going)
+            chosen = chosen[going]
+        self.state.tokens += self.state.delta[:, chosen]
+        counted = self.now[self.alive] >= self.warmup
+        self.fires[chosen[counted], self.alive[counted]] += 1
+        self.fired += len(chosen)
+        self.steps += 1
+        self._arrive()
+
+    def _observe(self, until: Values) -> None:
+        span = np.maximum(0.0, until - np.maximum(self.now[self.alive], self.warmup))
+        span = np.where(np.isfinite(span), span, 0.0)
+        if span.any():
+            self.area[:, self.alive] += self.state.tokens * span
+            self.observed[self.alive] += span
+
+    def _arrive(self) -> None:
+        if self.goal is not None and len(self.alive):
+            there = self.goal(self.state.tokens)
+            if there.any():
+                self.reached[self.alive[there]] = self.now[self.alive[there]]
+                self._keep(~there)
+
+    def _keep(self, which: Mask) -> None:
+        self.alive = self.alive[which]
+        self.state.tokens = self.state.tokens[:, which]
+
+    def result(self, confidence: float) -> Simulation:
+        """Everything seen so far, as estimates."""
+        seen = self.observed > 0
+        complete = not len(self.alive) and not self.interrupted
+        fires, area = self.fires[:, seen], self.area[:, seen]
+        bare = _summed(
+            self.state.gspn,
+            fires,
+            area,
+            self.observed[seen],
+            self.fired,
+            self.count,
+            complete,
+            confidence,
+        )
+        times = np.sort(self.reached[~np.isnan(self.reached)])
+        judged = self.count - len(self.alive)
+        return replace(
+            bare,
+            completed=Estimate.share(len(times), judged, confidence)
+            if self.goal is not None and judged
+            else None,
+            time=Estimate.of(times, confidence) if len(times) else None,
+            times=times,
+        )
+
+
+def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
+    """A goal for `simulate` from a predicate on single markings; each marking is judged once."""
+    known: dict[bytes, bool] = {}
+
+    def stop(tokens: NDArray[np.int64]) -> Mask:
+        columns = np.ascontiguousarray(tokens.T)
+        out = np.empty(len(columns), dtype=np.bool_)
+        for i, column in enumerate(columns):
+            key = column.tobytes()
+            if key not in known:
+                known[key] = predicate(tuple(column.tolist()))
+            out[i] = known[key]
+        return out
+
+    return stop
+
+
+def token_game(net: Net, random: np.random.Generator, firings: int) -> tuple[list[str], Marking]:
+    """A random firing sequence, each enabled transition equally likely, and the marking that it
+    ends in."""
+    marking, played = net.initial, []
+    for _ in range(firings):
+        enabled = net.enabled(marking)
+        if not enabled:
+            break
+        t = enabled[int(random.integers(len(enabled)))]
+        marking = net.fire(marking, t)
+        played.append(net.transitions[t])
+    return played, marking

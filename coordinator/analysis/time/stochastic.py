@@ -1,0 +1,487 @@
+"""The stochastic view of a task: its ordinary net refined by choices, statuses, durations, events
+and timers (docs/analysis.md).
+
+Every place and arc of the ordinary net stays, so dropping the added places projects each firing
+sequence on one of the ordinary net. An action place p gets, beside itself, `p.going` (a run goes
+on), `p.success`, `p.failure` and `p.error` (a run has ended and waits to be taken). Preselection:
+an immediate choice of the alternative (weight pi_a), an immediate choice of the status (q_as), then
+a phase-type delay of that status. Preempting events race with it. A preempted run's phases are
+flushed at once, and a repeated run draws afresh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import product
+
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.phase_type import PhaseType, fit, gamma_quantile
+from petrobot.coordinator.task import End, Estimate, Input, Kind, Place, Status, Task, Transition
+from petrobot.coordinator.task.conditions import ConditionFault
+from petrobot.coordinator.task.net import Marking, Net
+
+FLUSH, CHOICE = 3_000_000, 2_000_000
+"""Priorities of flushing and choosing; transitions of the task stand around TASK, moved by their
+own priorities."""
+TASK = 1_000_000
+STAGES = 8
+"""Phases of one duration at most unless told otherwise: several run side by side, so their product
+counts."""
+
+Weights = dict[str, int]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What is known from runs; whatever is missing falls back on the task file's declared
+    estimates.
+
+    `runs[(place or primitive task, action)]` gives share, mean (s) and cv by status;
+    `choice[primitive task][action]` the current probability of each alternative; `waits[event]` the
+    mean wait (s) of a transition for it; `switches[transition]` the relative frequency of a
+    condition among the transitions that compete with it. `preempted[(place, action)]` gives share,
+    mean and cv of the runs that each transition preempted; where all actions of a place have it,
+    the preempting event is one of the causes by which a run ends (its shares and those of `runs`
+    sum to 1), not an independent race.
+    """
+
+    runs: Mapping[tuple[str, str], Mapping[Status, Estimate]] = field(default_factory=dict)
+    choice: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    waits: Mapping[str, float] = field(default_factory=dict)
+    switches: Mapping[str, float] = field(default_factory=dict)
+    preempted: Mapping[tuple[str, str], Mapping[str, Estimate]] = field(default_factory=dict)
+
+
+def is_cause(transition: Transition) -> bool:
+    """Whether a preemption by this transition is a cause of its own by which a run ends, at a time
+    of its own since it began.
+
+    So it is where an event or a timer takes one run and looks at no other one. A transition that
+    fires as soon as its arcs allow it (another run has ended, a token has come) only cuts the run
+    off: the net says when, and the run would have ended otherwise.
+    """
+    runs = [a for a in transition.inputs if a.end is not None]
+    waits = bool(transition.events) or transition.after is not None
+    return waits and len(runs) == 1 and runs[0].end is End.PREEMPT
+
+
+class NoEstimate(ValueError):  # noqa: N818 - names what is missing
+    """Neither a measurement nor a declared estimate gives a number that the stochastic view
+    needs."""
+
+
+@dataclass(frozen=True)
+class StochasticView:
+    """A task as a GSPN. The first places are those of the ordinary net, in its order."""
+
+    task: Task
+    gspn: Gspn
+    origin: Mapping[str, str]
+    """By transition of the GSPN: the task's transition that it is a case of (choices, delays and
+    flushes have none)."""
+    statuses: Mapping[str, tuple[str, str, Status]]
+    """By immediate transition that draws a status: (place, action, status)."""
+    assumptions: tuple[str, ...]
+    """What was assumed because nothing was measured or declared, and approximations made."""
+    fit_errors: Mapping[str, float]
+    """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or
+    timer."""
+
+    def projected(self, marking: Marking) -> Marking:
+        """The marking of the ordinary net behind a marking of the GSPN."""
+        return marking[: len(self.task.net.places)]
+
+    @cached_property
+    def cases(self) -> dict[str, tuple[str, ...]]:
+        """By task transition: its cases in the GSPN."""
+        out: dict[str, list[str]] = {}
+        for case, name in self.origin.items():
+            out.setdefault(name, []).append(case)
+        return {name: tuple(cases) for name, cases in out.items()}
+
+
+def stochastic_view(
+    task: Task,
+    measured: Measured | None = None,
+    *,
+    stages: int = STAGES,
+    timer_stages: int = STAGES,
+) -> StochasticView:
+    """The GSPN of a task. Raises NoEstimate, and ValueError for what this view cannot express
+    (named, with a remedy)."""
+    return _Derivation(task.flat, measured or Measured(), stages, timer_stages).result()
+
+
+class _Derivation:
+    """The GSPN being put together."""
+
+    def __init__(self, task: Task, measured: Measured, stages: int, timer_stages: int) -> None:
+        self.task, self.measured = task, measured
+        self.stages, self.timer_stages = stages, timer_stages
+        net = task.net
+        self.places: Weights = dict(zip(net.places, net.initial, strict=True))
+        self.arcs: dict[str, tuple[Weights, Weights]] = {}
+        self.inhibit: dict[str, Weights] = {}
+        self.priority: Weights = {}
+        self.rates: dict[str, float] = {}
+        self.weights: dict[str, float] = {}
+        self.servers: dict[str, int | None] = {}
+        self.origin: dict[str, str] = {}
+        self.statuses: dict[str, tuple[str, str, Status]] = {}
+        self.assumptions: list[str] = []
+        self.errors: dict[str, float] = {}
+        self.possible: dict[str, set[Status]] = {}
+        self.phases: dict[str, list[str]] = {}
+        self.by: dict[tuple[str, str], str] = {}
+        for place in task.places.values():
+            if place.kind is Kind.ACTION:
+                self._action_place(place)
+        for transition in task.transitions.values():
+            self._transition(transition)
+
+    def result(self) -> StochasticView:
+        """The finished view."""
+        capacity = {
+            p: c
+            for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
+            if c is not None
+        }
+        net = Net.build(
+            self.places,
+            self.arcs,
+            inhibitors=self.inhibit,
+            capacity=capacity,
+            priority=self.priority,
+        )
+        gspn = Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
+        assumed = tuple(dict.fromkeys(self.assumptions))
+        return StochasticView(self.task, gspn, self.origin, self.statuses, assumed, self.errors)
+
+    # Transitions of the GSPN.
+
+    def _immediate(
+        self, name: str, need: Weights, give: Weights, weight: float, priority: int
+    ) -> None:
+        self.arcs[name], self.weights[name], self.priority[name] = (need, give), weight, priority
+
+    def _timed(
+        self, name: str, need: Weights, give: Weights, rate: float, servers: int | None = None
+    ) -> None:
+        self.arcs[name], self.rates[name], self.servers[name] = (need, give), rate, servers
+
+    # Action places.
+
+    def _action_place(self, place: Place) -> None:
+        name = place.name
+        for suffix in ("begin", "going", *Status):
+            self.places[f"{name}.{suffix}"] = 0
+        self.places[f"{name}.begin"] = self.places[f"{name}.going"] = place.tokens
+        if place.servers is not None:
+            self.places[f"{name}.server"] = place.servers
+        self.possible[name], self.phases[name] = set(), []
+        laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
+        alternatives = self._alternatives(place)
+        if alternatives and all(
+            (name, action) in self.measured.preempted for action in alternatives
+        ):
+            self._causes(place, alternatives)
+        for action, chosen in alternatives.items():
+            self._choice(place, action, chosen)
+            known = {s: e for s, e in self._estimates(place, action).items() if e.share > 0}
+            for status, estimate in known.items():
+                self._status(place, action, status, estimate, laws)
+            if not known:  # it was never seen to end by itself: it goes on until something takes it
+                self.phases[name].append(f"{name}.{action}")
+        preempted = any(
+            a.place == name and a.end is End.PREEMPT
+            for t in self.task.transitions.values()
+            for a in t.inputs
+        )
+        if preempted and place.servers is not None and place.servers > 1:
+            raise ValueError(
+                f"places.{name}: which of its {place.servers} runs a preempting transition "
+                "takes is not kept in a GSPN; "
+                "give the place one server for the forecast, or measure"
+            )
+        if preempted:
+            self._flush(name)
+
+    def _causes(self, place: Place, actions: Iterable[str]) -> None:
+        """Preemption as a cause by which a run ends: `p.by.t` waits for t to take the run, which
+        goes on until then."""
+        name = place.name
+        for t in self.task.transitions.values():
+            if is_cause(t) and any(a.place == name for a in t.inputs if a.end is not None):
+                self.by[name, t.name] = f"{name}.by.{t.name}"
+                self.places[f"{name}.by.{t.name}"] = 0
+                self.phases[name].append(f"{name}.by.{t.name}")
+        for action in actions:
+            for transition, estimate in self.measured.preempted[name, action].items():
+                if estimate.share > 0 and (name, transition) in self.by:
+                    self._cause(name, action, transition, estimate)
+
+    def _cause(self, name: str, action: str, transition: str, estimate: Estimate) -> None:
+        """The draw of a preemption and the phases of the time until it comes."""
+        key, end = f"{name}.{action}.by.{transition}", self.by[name, transition]
+        law = self._law(key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages)
+        for i, branch in enumerate(law.branches):
+            chain = [f"{end}.{action}{'abc'[i]}{k}" for k in range(1, branch.stages + 1)]
+            self.places |= dict.fromkeys(chain, 0)
+            self.phases[name] += chain
+            self._immediate(
+                f"{key} {i + 1}",
+                {f"{name}.{action}": 1},
+                {chain[0]: 1},
+                estimate.share * branch.probability,
+                CHOICE,
+            )
+            for phase, following in zip(chain, [*chain[1:], end], strict=True):
+                self._timed(phase, {phase: 1}, {following: 1}, branch.rate)
+
+    def _alternatives(self, place: Place) -> dict[str, float]:
+        primitive = self.task.primitive_task_of(place.name)
+        known = self.measured.choice.get(primitive.name)
+        if known is None:
+            if len(primitive.alternatives) > 1:
+                self.assumptions.append(
+                    f"{primitive.name}: its alternatives are equally likely (no selector "
+                    "state given)"
+                )
+            return {action: 1.0 / len(primitive.alternatives) for action in primitive.alternatives}
+        return {
+            action: known[action] for action in primitive.alternatives if known.get(action, 0.0) > 0
+        }
+
+    def _estimates(self, place: Place, action: str) -> Mapping[Status, Estimate]:
+        primitive = self.task.primitive_task_of(place.name)
+        for key in ((place.name, action), (primitive.name, action)):
+            if key in self.measured.runs:
+                return self.measured.runs[key]
+        if not primitive.estimates:
+            raise NoEstimate(
+                f"primitive_tasks.{primitive.name}: no run of {action} was measured and "
+                "nothing is declared; "
+                f"add [primitive_tasks.{primitive.name}.estimates] or give measurements"
+            )
+        self.assumptions.append(
+            f"{primitive.name}: declared estimates of the task file, for want of measured runs"
+        )
+        return primitive.estimates
+
+    def _choice(self, place: Place, action: str, chosen: float) -> None:
+        name, served = place.name, place.servers is not None
+        need = {f"{name}.begin": 1} | ({f"{name}.server": 1} if served else {})
+        self.places[f"{name}.{action}"] = 0
+        self._immediate(f"{name}.{action}", need, {f"{name}.{action}": 1}, chosen, CHOICE)
+
+    def _status(
+        self,
+        place: Place,
+        action: str,
+        status: Status,
+        estimate: Estimate,
+        laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]],
+    ) -> None:
+        """The draw of a status and the phases of its delay; equal laws of several actions share
+        their phases."""
+        name, key = place.name, f"{place.name}.{action}.{status}"
+        self.possible[name].add(status)
+        law = self._law(key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages)
+        if (status, law) not in laws:
+            laws[status, law] = self._phases(place, status, law, len(laws))
+        entries = laws[status, law]
+        for i, (entry, share) in enumerate(entries):
+            label = key if len(entries) == 1 else f"{key}.{i + 1}"
+            self.statuses[label] = (name, action, status)
+            self._immediate(
+                label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE
+            )
+
+    def _law(self, key: str, mean: float, variance: float, stages: int) -> PhaseType:
+        if not mean > 0:
+            raise NoEstimate(
+                f"{key}: a mean duration of {mean} s for a status that occurs; declare a "
+                "positive one"
+            )
+        law = fit(mean, variance, stages=stages)
+        self.errors[key] = law.error_at_90(gamma_quantile(mean, variance))
+        return law
+
+    def _phases(
+        self, place: Place, status: Status, law: PhaseType, number: int
+    ) -> list[tuple[str, float]]:
+        """Chains of phases with one rate each; gives the places where a run enters and with which
+        probability."""
+        entries: list[tuple[str, float]] = []
+        for j, rate in enumerate(dict.fromkeys(b.rate for b in law.branches)):
+            branches = [b for b in law.branches if b.rate == rate]
+            longest = max(b.stages for b in branches)
+            stem = f"{place.name}.{status}.{number}{'abc'[j]}"
+            chain = [f"{stem}{i}" for i in range(1, longest + 1)]
+            self.places |= dict.fromkeys(chain, 0)
+            self.phases[place.name] += chain
+            for i in range(1, longest):
+                self._timed(f"{stem}{i}", {f"{stem}{i}": 1}, {f"{stem}{i + 1}": 1}, rate)
+            need = {f"{stem}{longest}": 1, f"{place.name}.going": 1}
+            give = {f"{place.name}.{status}": 1} | (
+                {f"{place.name}.server": 1} if place.servers is not None else {}
+            )
+            self._timed(f"{stem}{longest}", need, give, rate)
+            entries += [(f"{stem}{longest - b.stages + 1}", b.probability) for b in branches]
+        return entries
+
+    def _flush(self, name: str) -> None:
+        """What is left of a preempted run vanishes at once: its phase, and its server comes
+        free."""
+        served = f"{name}.server" in self.places
+        give = {f"{name}.server": 1} if served else {}
+        for p in self.phases[name]:
+            self._immediate(f"flush {p}", {p: 1}, dict(give), 1.0, FLUSH)
+            self.inhibit[f"flush {p}"] = {f"{name}.going": 1}
+
+    # Transitions of the task.
+
+    def _transition(self, t: Transition) -> None:
+        cases = list(self._cases(t))
+        for i, (need, give) in enumerate(cases):
+            name = t.name if len(cases) == 1 else f"{t.name} {i + 1}"
+            self.origin[name] = t.name
+            inhibit = {i.place: i.threshold for i in t.inhibitors}
+            if inhibit:
+                self.inhibit[name] = inhibit
+            self._fires(t, name, need, give)
+
+    def _cases(self, t: Transition) -> list[tuple[Weights, Weights]]:
+        """What a firing takes and gives, once for each combination of the statuses of the runs that
+        it takes."""
+        net, index = self.task.net, self.task.net.transition_index[t.name]
+        base_need = {net.places[p]: w for p, w in net.consume[index]}
+        base_give = {net.places[p]: w for p, w in net.produce[index]}
+        for output in t.outputs:
+            if self.task.places[output.place].kind is Kind.ACTION:
+                for suffix in ("begin", "going"):
+                    base_give[f"{output.place}.{suffix}"] = output.weight
+        out = []
+        for combination in product(
+            *(self._takings(t, arc) for arc in t.inputs if arc.end is not None)
+        ):
+            taken = [(place, status) for place, status, _, _ in combination if status is not None]
+            if not self._may_hold(t, dict(taken)):
+                continue
+            need, give = dict(base_need), dict(base_give)
+            for _, _, takes, back in combination:
+                need |= takes
+                for place, n in back.items():
+                    give[place] = give.get(place, 0) + n
+            out.append((need, give))
+        return out
+
+    def _takings(
+        self, t: Transition, arc: Input
+    ) -> list[tuple[str, Status | None, Weights, Weights]]:
+        """The ways in which an arc may take its runs: (place, status if all have one, taken, given
+        back)."""
+        p, w = arc.place, arc.weight
+        if arc.end is End.PREEMPT:
+            cause = {self.by[p, t.name]: 1} if (p, t.name) in self.by else {}
+            return [(p, None, {f"{p}.going": w, **cause}, {})]
+        if arc.end is End.GOING:
+            return [(p, None, {f"{p}.going": w}, {f"{p}.going": w})]
+        if arc.end is End.ERROR:
+            return (
+                [(p, Status.ERROR, {f"{p}.{Status.ERROR}": w}, {})]
+                if Status.ERROR in self.possible[p]
+                else []
+            )
+        normal = [s for s in (Status.SUCCESS, Status.FAILURE) if s in self.possible[p]]
+        out: list[tuple[str, Status | None, Weights, Weights]] = [
+            (p, s, {f"{p}.{s}": w}, {}) for s in normal
+        ]
+        if len(normal) == 2:
+            first, second = (f"{p}.{s}" for s in normal)
+            out += [(p, None, {first: i, second: w - i}, {}) for i in range(1, w)]
+        return out
+
+    def _may_hold(self, t: Transition, status: Mapping[str, Status]) -> bool:
+        """Whether the condition can be true for these statuses (judged where it reads nothing
+        else)."""
+        if t.when is None:
+            return True
+        values = {f"{place}.status": str(s) for place, s in status.items()}
+        if not t.when.names <= set(values):
+            return True
+        try:
+            return t.when.holds(values)
+        except ConditionFault:
+            return False
+
+    def _fires(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
+        """How the case fires: after a delay, with its events, or at once."""
+        share = self._switch(t)
+        if any((a.place, t.name) in self.by for a in t.inputs):
+            self._immediate(name, need, give, 1.0, TASK + t.priority)
+        elif t.after is not None:
+            self._timer(t, name, need, give)
+        elif t.events:
+            self._timed(name, need, give, share / self._wait(t), 1)
+        else:
+            weight = share * (t.weight if t.weight is not None else 1.0)
+            self._immediate(name, need, give, weight, TASK + t.priority)
+
+    def _switch(self, t: Transition) -> float:
+        """Relative frequency with which a condition on variables is true."""
+        if t.when is None or all(n.endswith((".status", ".reason")) for n in t.when.names):
+            return 1.0
+        known = self.measured.switches.get(t.name)
+        if known is None:
+            self.assumptions.append(
+                f"{t.name}: its condition is as often true as those that compete with it"
+            )
+        return 1.0 if known is None else known
+
+    def _wait(self, t: Transition) -> float:
+        """Mean time (s) until all events of a transition have come: the mean of the latest of
+        exponentials."""
+        means = []
+        for event in t.events:
+            mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
+            if mean is None:
+                raise NoEstimate(
+                    f"events.{event}: no wait was measured and no mean_wait is declared; add "
+                    "mean_wait = SECONDS"
+                )
+            if event not in self.measured.waits:
+                self.assumptions.append(f"{event}: declared mean wait of the task file")
+            means.append(mean)
+        if len(means) > 1:
+            self.assumptions.append(
+                f"{t.name}: the wait for all its events is taken as one exponential"
+            )
+        whole = 0.0
+        for chosen in range(1, 1 << len(means)):
+            rate = sum(1 / m for i, m in enumerate(means) if chosen >> i & 1)
+            whole += (-1) ** (chosen.bit_count() + 1) / rate
+        return whole
+
+    def _timer(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
+        """A fixed delay as Erlang phases counted in a place of its own, set back as soon as the
+        transition is disabled."""
+        assert t.after is not None
+        law = self._law(f"{t.name}.after", t.after, 0.0, self.timer_stages)
+        (branch,) = law.branches
+        count, last = f"{name}.phase", branch.stages - 1
+        self._timed(name, need | ({count: last} if last else {}), give, branch.rate, 1)
+        if not last:
+            return
+        self.places[count] = 0
+        tick = f"{name}.tick"
+        self._timed(tick, dict(need), {**need, count: 1}, branch.rate, 1)
+        self.inhibit[tick] = {i.place: i.threshold for i in t.inhibitors} | {count: last}
+        for place, n in need.items():
+            self._immediate(f"{name}.reset {place}", {count: 1}, {}, 1.0, FLUSH)
+            self.inhibit[f"{name}.reset {place}"] = {place: n}
+        for i in t.inhibitors:
+            back = {i.place: i.threshold}
+            self._immediate(f"{name}.barred {i.place}", {count: 1, **back}, back, 1.0, FLUSH)

@@ -1,0 +1,281 @@
+"""The forecast of a task from its stochastic view: three reliabilities, time, firings, and what is
+worth improving.
+
+R_conj: the task is completed and every run ended with SUCCESS. R_goal: expected met goals for each
+run token. P_complete: `final` is reached at all. Long-run numbers are those of mission runs back to
+back (renewal reward): expected firings, or time-weighted tokens, of one mission run over its mean
+length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.analysis.net.graph import Mask, sum_by
+from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.time.completion import Completion, Law, completion, law
+from petrobot.coordinator.analysis.time.gspn import Chain, Values
+from petrobot.coordinator.analysis.time.linear import Plan, solve
+from petrobot.coordinator.analysis.time.markov import visits_before
+from petrobot.coordinator.analysis.time.sensitivity import (
+    Slope,
+    reliability_slopes,
+    slopes_of,
+    time_slopes,
+)
+from petrobot.coordinator.analysis.time.stochastic import StochasticView
+from petrobot.coordinator.task import Counts, End, Status
+from petrobot.coordinator.task.net import Marking
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """What improving one action of a place would bring; the derivatives are exact.
+
+    `time_share`: per cent of mean mission time saved per per cent of its durations (the bottleneck
+    has the largest). `completion_gain`, `goal_gain`: change of P_complete and of the expected met
+    goals for each unit of probability moved from ERROR to SUCCESS (0 where it never ends in ERROR).
+    """
+
+    place: str
+    action: str
+    time_share: float
+    completion_gain: float
+    goal_gain: float
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """All numbers of one stochastic view. Times are in seconds, conditional on completing."""
+
+    view: StochasticView
+    chain: Chain
+    done: Completion
+    transient: Mask
+    flow: Values
+    """Expected number of times that each edge is taken in one mission run."""
+
+    @property
+    def completion_probability(self) -> float:
+        """P_complete."""
+        return self.done.probability
+
+    @cached_property
+    def firings(self) -> dict[str, float]:
+        """Expected firings of each transition of the task in one mission run."""
+        names = self.chain.gspn.net.transitions
+        count = sum_by(self.chain.label, self.flow, len(names))
+        out = dict.fromkeys(self.view.task.net.transitions, 0.0)
+        for case, name in self.view.origin.items():
+            out[name] += float(count[self.chain.gspn.net.transition_index[case]])
+        return out
+
+    @cached_property
+    def mission_time(self) -> float:
+        """Mean length of a mission run, however it ends (s)."""
+        return float(self._time.sum())
+
+    @cached_property
+    def _time(self) -> Values:
+        """Expected time spent in each marking in one mission run (s)."""
+        visits = visits_before(self.chain, self.transient)
+        return np.where(
+            self.transient, visits * np.where(self.transient, self.chain.sojourn, 0.0), 0.0
+        )
+
+    @cached_property
+    def throughput(self) -> dict[str, float]:
+        """Firings per second of each transition of the task, mission runs back to back."""
+        return {name: n / self.mission_time for name, n in self.firings.items()}
+
+    @cached_property
+    def mean_tokens(self) -> dict[str, float]:
+        """Time average of the tokens of each place of the task, mission runs back to back."""
+        space = self.chain.space
+        places = enumerate(self.view.task.net.places)
+        return {name: float(self._time @ space.tokens(p)) / self.mission_time for p, name in places}
+
+    @cached_property
+    def goal_reliability(self) -> float | None:
+        """R_goal: expected met goals for each run token; None if the task names no goal transitions
+        or runs place."""
+        task = self.view.task
+        if not task.goal_transitions or not task.runs_place:
+            return None
+        runs = self.chain.gspn.net.initial[self.chain.gspn.net.place_index[task.runs_place]]
+        return sum(self.firings[name] for name in task.goal_transitions) / runs if runs else None
+
+    @cached_property
+    def conjunctive_reliability(self) -> float:
+        """R_conj: probability of completing with every run ended in SUCCESS."""
+        spoilt = np.isin(self.chain.label, self._spoiling)
+        open_ = self.transient[self.chain.source] & ~spoilt
+        value = np.where(open_ & self.transient[self.chain.target], self.chain.probability, 0.0)
+        direct = open_ & self.done.goal[self.chain.target]
+        arrive = sum_by(self.chain.source[direct], self.chain.probability[direct], self.chain.n)
+        return float(solve(Plan.of(self.chain.graph, self.transient), value, arrive)[0])
+
+    @property
+    def _spoiling(self) -> list[int]:
+        """Transitions of the GSPN by which a run ends other than with SUCCESS; one that was
+        preempted before has not ended so."""
+        net, flat = self.chain.gspn.net, self.view.task.flat
+        index = net.transition_index
+        bad = {Counts.FAILURE, Counts.ERROR}
+        lost = {
+            t.name
+            for t in flat.transitions.values()
+            if any(a.counts in bad for a in t.inputs if a.end is End.PREEMPT)
+        }
+        ends = {
+            net.place_index[f"{place}.{status}"]
+            for place, _, status in self.view.statuses.values()
+            if status is not Status.SUCCESS
+        }
+        spoilt = [
+            t for t in range(len(net.transitions)) if any(p in ends for p, _ in net.produce[t])
+        ]
+        return spoilt + [index[case] for case, name in self.view.origin.items() if name in lost]
+
+    @cached_property
+    def worth(self) -> tuple[Worth, ...]:
+        """What is worth improving, the largest share of time first."""
+        time, complete, goals = (
+            time_slopes(self.done),
+            reliability_slopes(self.done),
+            self._goal_slopes(),
+        )
+        actions = dict.fromkeys((place, action) for place, action, _ in self.view.statuses.values())
+        by_place: dict[str, list[tuple[str, str]]] = {}
+        for key in actions:
+            by_place.setdefault(key[0], []).append(key)
+        found = []
+        for place, keys in by_place.items():
+            whole = -sum(time[name].elasticity for name in self._phases(place))
+            share = self._use(keys)
+            for key in keys:
+                found.append(
+                    Worth(
+                        *key, whole * share[key], self._move(key, complete), self._move(key, goals)
+                    )
+                )
+        return tuple(sorted(found, key=lambda w: -w.time_share))
+
+    def _phases(self, place: str) -> list[str]:
+        """Timed transitions that are phases of a place's runs."""
+        gspn = self.chain.gspn
+        return [
+            name
+            for name, rate in zip(gspn.net.transitions, gspn.rate, strict=True)
+            if rate is not None
+            and name not in self.view.origin
+            and name.startswith((f"{place}.by.", *(f"{place}.{s}." for s in Status)))
+        ]
+
+    def _use(self, keys: list[tuple[str, str]]) -> dict[tuple[str, str], float]:
+        """Share of a place's runs that each action takes (actions with equal laws share their
+        phases)."""
+        count = sum_by(self.chain.label, self.flow, len(self.chain.gspn.net.transitions))
+        index = self.chain.gspn.net.transition_index
+        runs = {key: float(count[index[f"{key[0]}.{key[1]}"]]) for key in keys}
+        total = sum(runs.values())
+        return {key: n / total if total else 0.0 for key, n in runs.items()}
+
+    def _move(self, key: tuple[str, str], slopes: Mapping[str, Slope]) -> float:
+        """Derivative for probability moved from ERROR to SUCCESS of one action of a place."""
+
+        def gain(status: Status) -> float | None:
+            names = [
+                n
+                for n, (place, action, s) in self.view.statuses.items()
+                if (place, action, s) == (*key, status)
+            ]
+            weight = sum(slopes[n].value for n in names)
+            return (
+                sum(slopes[n].derivative * slopes[n].value for n in names) / weight
+                if weight
+                else None
+            )
+
+        better, worse = gain(Status.SUCCESS), gain(Status.ERROR)
+        return better - worse if better is not None and worse is not None else 0.0
+
+    def _goal_slopes(self) -> dict[str, Slope]:
+        """Derivatives of the expected number of met goals."""
+        chain, goals = self.chain, set(self.view.task.goal_transitions)
+        hits = np.array(
+            [self.view.origin.get(name) in goals for name in chain.gspn.net.transitions]
+        )[chain.label]
+        inside = self.transient[chain.source]
+        value = np.where(inside & self.transient[chain.target], chain.probability, 0.0)
+        gain = sum_by(chain.source, np.where(inside & hits, chain.probability, 0.0), chain.n)
+        g = solve(Plan.of(chain.graph, self.transient), value, gain)
+        ahead = np.where(self.transient[chain.target], g[chain.target], 0.0)
+        by_edge = self.flow * (hits + ahead - g[chain.source])
+        return slopes_of(chain, by_edge, float(g[0]))
+
+    @cached_property
+    def recovery_time(self) -> float:
+        """The longest mean time back to the nominal flow over all markings that lead there (s)."""
+        ordinary = OrdinaryView(self.view.task)
+        nominal = (
+            self.chain.space.where(lambda m: ordinary.is_nominal(self.view.projected(m)))
+            & ~self.chain.vanishing
+        )
+        back = completion(self.chain, nominal)
+        able = (back.h > 0) & ~nominal
+        return float(np.max(back.y[able] / back.h[able], initial=0.0))
+
+    def law(self) -> Law:
+        """The distribution of the time to completion."""
+        return law(self.chain, self.done.goal)
+
+    def to_json(self, quantiles: tuple[float, ...] = (0.5, 0.9, 0.99)) -> dict[str, Any]:
+        """Plain data. Quantiles take a pass of uniformisation; give none to leave them out."""
+        shape = self.law() if quantiles and self.completion_probability > 0 else None
+        return {
+            "P_complete": self.completion_probability,
+            "R_goal": self.goal_reliability,
+            "R_conj": self.conjunctive_reliability,
+            "mean": self.done.mean,
+            "standard_deviation": self.done.variance**0.5,
+            "quantiles": {f"{q:g}": shape.quantile(q) for q in quantiles} if shape else {},
+            "mission_time": self.mission_time,
+            "recovery_time": self.recovery_time,
+            "firings": self.firings,
+            "worth": [
+                {"place": w.place, "action": w.action, "time_share": w.time_share,
+                 "completion_gain": w.completion_gain, "goal_gain": w.goal_gain} for w in self.worth
+            ],
+            "markings": self.chain.n,
+            "residual": self.done.residual,
+            "assumptions": list(self.view.assumptions),
+            "fit_errors": dict(self.view.fit_errors),
+        }  # fmt: skip
+
+
+def forecast(view: StochasticView, *, limits: Limits | None = None) -> Forecast:
+    """Solve a stochastic view. Raises ValueError if its space is not complete within the limits
+    (simulate instead)."""
+    chain = Chain.of(view.gspn, limits=limits)
+    ordinary = OrdinaryView(view.task)
+    known: dict[Marking, bool] = {}
+
+    def final(marking: Marking) -> bool:
+        own = view.projected(marking)
+        if own not in known:
+            known[own] = ordinary.is_final(own)
+        return known[own]
+
+    goal = chain.space.where(final) & ~chain.vanishing
+    transient = ~chain.graph.bottom[chain.graph.components] & ~goal
+    visits = np.where(transient, visits_before(chain, transient), 0.0)
+    return Forecast(
+        view, chain, completion(chain, goal), transient, visits[chain.source] * chain.probability
+    )

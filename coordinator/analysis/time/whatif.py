@@ -1,0 +1,159 @@
+"""What if: a place's tokens, an action's times and shares, or a transition's rate changed without
+editing the file.
+
+A change is written SUBJECT=NUMBER:
+
+    runs=10                                tokens of a resource or control place
+    locate_ball.error.share=0.05           a status of every action of a primitive task (`share`,
+                                           `mean` in s, `cv`);
+    locate_ball.locate_hough.success.mean=0.4    of one of its actions. The other shares keep their
+                                                 proportions.
+    serve.rate=2.5, serve.weight=3         a transition of a net with rates
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.stochastic import Measured
+from petrobot.coordinator.task import Estimate, Kind, Status, Task
+from petrobot.coordinator.task.net import Net
+
+FIELDS = ("share", "mean", "cv")
+FORM = (
+    "write PLACE=N, PRIMITIVE.STATUS.share=X (or .mean, .cv), "
+    "PRIMITIVE.ACTION.STATUS.mean=X or TRANSITION.rate=X"
+)
+
+Runs = dict[tuple[str, str], Mapping[Status, Estimate]]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One change: which number, and what it becomes."""
+
+    subject: tuple[str, ...]
+    value: float
+
+    @property
+    def text(self) -> str:
+        """As it is written."""
+        return f"{'.'.join(self.subject)}={self.value:g}"
+
+    def fault(self, problem: str, remedy: str = FORM) -> FormatError:
+        """The error about this change."""
+        return FormatError("what if", self.text, problem, remedy)
+
+    def count(self) -> int:
+        """The value as a number of tokens. Raises FormatError."""
+        if self.value < 0 or self.value != int(self.value):
+            raise self.fault("tokens are counted", "give a whole number, 0 or more")
+        return int(self.value)
+
+
+def read_change(text: str) -> Change:
+    """A change from its text. Raises FormatError."""
+    subject, sign, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = float("nan")
+    if not sign or not subject.strip() or not abs(number) < float("inf"):
+        raise FormatError("what if", text, "no change of one number", FORM)
+    return Change(tuple(part.strip() for part in subject.split(".")), number)
+
+
+def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tuple[Task, Measured]:
+    """The task with other tokens, and what is known of its runs with other estimates. Raises
+    FormatError."""
+    runs: Runs = dict(measured.runs)
+    for change in changes:
+        if len(change.subject) == 1:
+            task = _other_tokens(task, change)
+        else:
+            _other_estimate(task, runs, change)
+    return task, replace(measured, runs=runs)
+
+
+def _other_tokens(task: Task, change: Change) -> Task:
+    name, n = change.subject[0], change.count()
+    place = task.places.get(name)
+    if place is None or place.kind not in (Kind.RESOURCE, Kind.CONTROL):
+        raise change.fault(f"{name} is no resource or control place of {task.name}")
+    capacity = None if place.capacity is None else max(place.capacity, n)
+    return replace(task, places={**task.places, name: replace(place, tokens=n, capacity=capacity)})
+
+
+def _other_estimate(task: Task, runs: Runs, change: Change) -> None:
+    """Change the estimates of one action, or of all actions of a primitive task."""
+    *subject, word, key = change.subject
+    primitive = task.primitive_tasks.get(subject[0]) if subject else None
+    if primitive is None or len(subject) > 2 or word not in list(Status) or key not in FIELDS:
+        raise change.fault(f"no number of {task.name}")
+    actions = primitive.alternatives if len(subject) == 1 else (subject[1],)
+    for action in actions:
+        if action not in primitive.alternatives:
+            raise change.fault(
+                f"{action} is no alternative of {primitive.name}", " ".join(primitive.alternatives)
+            )
+        known = runs.get((primitive.name, action), primitive.estimates)
+        runs[primitive.name, action] = _altered(known, Status(word), key, change)
+
+
+def _altered(
+    known: Mapping[Status, Estimate], status: Status, key: str, change: Change
+) -> Mapping[Status, Estimate]:
+    value = change.value
+    if value < 0 or (key == "share" and value > 1) or (key == "mean" and value == 0):
+        raise change.fault(
+            "out of range", "shares lie between 0 and 1, means above 0, cv is not negative"
+        )
+    if status not in known:
+        if key != "share":
+            raise change.fault(f"nothing is known of runs that end with {status}")
+        mean = max((e.mean for e in known.values()), default=1.0)
+        known = {**known, status: Estimate(0.0, mean)}
+    found = {**known, status: replace(known[status], **{key: value})}
+    if key != "share":
+        return found
+    rest = sum(e.share for s, e in known.items() if s is not status)
+    if rest == 0 and value < 1:
+        raise change.fault("nothing else is known that the rest could end with")
+    scale = (1 - value) / rest if rest else 0.0
+    return {s: e if s is status else replace(e, share=e.share * scale) for s, e in found.items()}
+
+
+def change_net(net: Net, changes: Sequence[Change]) -> Net:
+    """The net with other initial tokens. Raises FormatError."""
+    initial = list(net.initial)
+    for change in changes:
+        name = ".".join(change.subject)
+        if name not in net.place_index:
+            raise change.fault(f"the net has no place {name}" + _rates_hint(name))
+        initial[net.place_index[name]] = change.count()
+    return replace(net, initial=tuple(initial))
+
+
+def _rates_hint(name: str) -> str:
+    return ", and no rates (give --rates)" if name.endswith((".rate", ".weight")) else ""
+
+
+def change_gspn(gspn: Gspn, changes: Sequence[Change]) -> Gspn:
+    """The GSPN with other initial tokens, rates and weights. Raises FormatError."""
+    for change in changes:
+        name, _, key = ".".join(change.subject).rpartition(".")
+        try:
+            if key in ("rate", "weight") and name in gspn.net.transition_index:
+                if change.value <= 0:
+                    raise change.fault("out of range", "rates and weights are above 0")
+                gspn = gspn.changed(**{f"{key}s": {name: change.value}})
+            else:
+                gspn = replace(gspn, net=change_net(gspn.net, [change]))
+        except FormatError:
+            raise
+        except ValueError as error:
+            raise change.fault(str(error)) from error
+    return gspn

@@ -1,0 +1,386 @@
+"""`learned show`: what is known of actions, how they are judged, over all contexts and in each, and
+what remains to be said."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
+from math import inf, isfinite, isnan
+from typing import TYPE_CHECKING, Any
+
+from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import write_json
+
+if TYPE_CHECKING:
+    from petrobot.coordinator.learning.estimate import Tally
+    from petrobot.coordinator.learning.estimates_file import Kept
+    from petrobot.coordinator.learning.objective import Comparison, Figures, Question
+
+Tallies = Mapping[str, "Mapping[str, Tally]"]
+"""By action, then by context."""
+
+
+def show(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> int:
+    """Print what is known of the primitive tasks' actions, and write it as JSON."""
+    from petrobot.coordinator.learning.objective import compare
+
+    known = {task: kept.estimates.of(task, options.context) for task in tasks}
+    refuse_unknown_context(kept, tasks, options)
+    try:
+        _refuse_unknown_cost(known, options)
+        shown = {}
+        for task, tallies in known.items():
+            question = _question(kept, task, options)
+            shown[task] = _plain(kept, task, tallies, question, compare(tallies, question), options)
+    except ValueError as fault:
+        raise CommandError(2, str(fault)) from fault
+    if options.json:
+        write_json(options.json, {"file": str(options.file), "primitive_tasks": shown})
+    if options.json != "-":
+        for task, about in shown.items():
+            _print(task, about, options)
+    return 0
+
+
+def _question(kept: Kept, task: str, options: argparse.Namespace) -> Question:
+    """As given; else by what the file says that the actions were judged (its target counts over
+    contexts, not in one)."""
+    asked = kept.question(task)
+    target = asked.target if options.target is None and options.context is None else options.target
+    return replace(
+        asked,
+        measure=options.cost or asked.measure,
+        target=target,
+        rho=asked.rho if options.rho is None else options.rho,
+    )
+
+
+def refuse_unknown_context(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> None:
+    """Raise CommandError for a context in which no action of these primitive tasks was run."""
+    if options.context is None:
+        return
+    known = {c for task in tasks for c in kept.estimates.contexts(task)}
+    if options.context not in known:
+        there = ", ".join(repr(c) for c in sorted(known)) or "none"
+        raise CommandError(
+            2,
+            f"--context {options.context!r}: {options.file} knows no run in it; it knows the "
+            f"contexts {there}",
+        )
+
+
+def _refuse_unknown_cost(known: Mapping[str, Tallies], options: argparse.Namespace) -> None:
+    """A number that no result has would be a cost of 0 for everything."""
+    kind, _, name = (options.cost or "").partition(":")
+    tallies = [
+        t
+        for by_action in known.values()
+        for by_context in by_action.values()
+        for t in by_context.values()
+    ]
+    if kind != "value" or not name or any(name in t.values for t in tallies):
+        return
+    there = (
+        ", ".join(f"value:{n}" for n in sorted({n for t in tallies for n in t.values}))
+        or "no numbers at all"
+    )
+    raise CommandError(
+        2,
+        f"--cost {options.cost}: no result in {options.file} has a number {name!r}; the "
+        f"results have: {there}",
+    )
+
+
+# --- plain data -------------------------------------------------------------------------------
+
+
+def _plain(
+    kept: Kept,
+    task: str,
+    tallies: Tallies,
+    asked: Question,
+    judged: Comparison,
+    options: argparse.Namespace,
+) -> dict[str, Any]:
+    from petrobot.coordinator.learning.objective import cost_to_reach, pareto, reliability_for
+
+    rows = [_row(tallies[f.action], asked, f) for f in judged.figures]
+    front = {f.action for f in pareto(judged.figures)}
+    for row in rows:
+        row["pareto"] = row["action"] in front
+    about: dict[str, Any] = {
+        "cost": asked.measure,
+        "target": asked.target,
+        "target_unmet": judged.unmet and asked.target is not None,
+        "rho": judged.rho,
+        "best": judged.best,
+        "judged_over": list(judged.scenarios),
+        "contexts": sorted({c for by_context in tallies.values() for c in by_context}),
+        "uncosted": list(judged.uncosted),
+        "asked_elsewhere": [_words(q) for q in kept.asked.get(task, ())[1:]],
+        "actions": rows,
+        "break_even": _break_even(judged),
+    }
+    if options.target is not None:
+        about["to_reach"] = _answer(cost_to_reach(judged.figures, options.target))
+    if options.budget is not None:
+        about["for_cost"] = _answer(reliability_for(judged.figures, options.budget))
+    about["by_context"] = _by_context(tallies, replace(asked, target=None, rho=judged.rho))
+    about["selectors"] = _selectors(kept, task)
+    return about
+
+
+def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[str, Any]:
+    from petrobot.coordinator.learning.estimate import Tally, merge
+
+    whole = reduce(merge, by_context.values(), Tally())
+    cost = whole.cost(asked.measure)
+    return {
+        "action": f.action,
+        "runs": f.runs,
+        "R": _number(f.reliability),
+        "R_low": f.lower,
+        "R_high": f.upper,
+        "worst": f.worst,
+        "R_over_all_runs": _number(whole.reliability),
+        "A": f.availability,
+        "C": _number(f.cost),
+        "C_largest": _number(f.largest_cost),
+        "scenario": f.scenario,
+        "scenarios": list(f.scenarios),
+        "J": _number(f.j),
+        "cost_mean": cost.mean if cost.n else None,
+        "cost_deviation": cost.deviation,
+        **_times(whole),
+        "censored": whole.censored,
+        "unknown": whole.unknown,
+        "corrected": whole.corrected,
+        "causes": {
+            f"{status}: {cause or '-'}": n
+            for (status, cause), n in whole.counts.items()
+            if status != "success"
+        },
+        "not_executed": dict(whole.not_executed),
+    }
+
+
+def _times(tally: Tally) -> dict[str, Any]:
+    return {
+        "seconds_mean": tally.wall.mean if tally.wall.n else None,
+        "seconds_p50": _number(tally.quantile(0.5)),
+        "seconds_p90": _number(tally.quantile(0.9)),
+        "cpu_mean": tally.cpu.mean if tally.cpu.n else None,
+        "cpu_p90": _number(tally.quantile(0.9, "cpu")),
+    }
+
+
+def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
+    """Each action in each context by itself, J with the rho of the whole comparison."""
+    from petrobot.coordinator.learning.objective import compare
+
+    out = []
+    for action, by_context in tallies.items():
+        for context, tally in by_context.items():
+            (f,) = compare({action: {context: tally}}, asked).figures
+            row = {
+                "action": action,
+                "context": context,
+                "runs": f.runs,
+                "R": _number(f.reliability),
+            }
+            row |= {
+                "R_low": f.lower,
+                "R_high": f.upper,
+                "A": f.availability,
+                "C": _number(f.cost),
+                "J": _number(f.j),
+            }
+            out.append(row | _times(tally))
+    return out
+
+
+def _selectors(kept: Kept, task: str) -> dict[str, Any]:
+    return {
+        name: {
+            "frozen": state["frozen"],
+            "contexts": {
+                context: dict(zip(state["actions"], learner["p"], strict=True))
+                for context, learner in state["learners"].items()
+            },
+        }
+        for (of, name), state in kept.selectors.items()
+        if of == task
+    }
+
+
+def _break_even(judged: Comparison) -> list[dict[str, Any]]:
+    """rho at which the best action would stop being so, against each other one: `above` or `below`
+    it the other is better."""
+    from petrobot.coordinator.learning.objective import break_even
+
+    if judged.best is None:
+        return []
+    best = judged.of(judged.best)
+    found = [
+        (other, break_even(best, other)) for other in judged.figures if other.action != best.action
+    ]
+    return [
+        {
+            "against": other.action,
+            "rho": rho,
+            "better": "above" if other.cost < best.cost else "below",
+        }
+        for other, rho in found
+        if rho is not None
+    ]
+
+
+def _answer(figures: Figures | None) -> dict[str, Any] | None:
+    return (
+        None
+        if figures is None
+        else {"action": figures.action, "R": figures.reliability, "C": figures.cost}
+    )
+
+
+def _number(x: float) -> float | None:
+    return x if isfinite(x) else None
+
+
+def _words(asked: Question) -> str:
+    """A question as the options that ask it."""
+    parts = [f"--cost {asked.measure}"]
+    parts += [f"--target {asked.target:g}"] if asked.target is not None else []
+    parts += [f"--rho {asked.rho:g}"] if asked.rho is not None else []
+    return " ".join(parts)
+
+
+# --- for people -------------------------------------------------------------------------------
+
+
+def _print(task: str, about: dict[str, Any], options: argparse.Namespace) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    target = "" if about["target"] is None else f", target R {about['target']:g}"
+    table = Table(
+        title=f"{task} (C: {about['cost']}, rho {about['rho']:.4g}{target})",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    table.show_edge = table.pad_edge = False
+    always_there = all(row["A"] == 1.0 for row in about["actions"])
+    columns = [
+        "action",
+        "runs",
+        "R",
+        "R 95 %",
+        "C",
+        "J",
+        "s p50/p90",
+        "cpu ms",
+        *([] if always_there else ["A"]),
+    ]
+    for column in columns:
+        table.add_column(column, justify="left" if column == "action" else "right", no_wrap=True)
+    for row in about["actions"]:
+        name = row["action"] + (" *" if row["action"] == about["best"] else "")
+        table.add_row(*_cells(name, row)[: len(columns)])
+        if len(about["contexts"]) > 1:
+            for part in about["by_context"]:
+                if part["action"] == row["action"]:
+                    table.add_row(*_cells(f"  {_named(part['context'])}", part)[: len(columns)])
+    console.print(table)
+    for line in [*_warnings(about), *_remarks(about, options)]:
+        console.print(f"  {line}", highlight=False)
+
+
+def _cells(name: str, row: Mapping[str, Any]) -> list[str]:
+    times = f"{_cell(row['seconds_p50'])}/{_cell(row['seconds_p90'])}"
+    cpu = None if row["cpu_mean"] is None else 1e3 * row["cpu_mean"]
+    interval = f"{row['R_low']:.2f}-{row['R_high']:.2f}"
+    numbers = [row["R"], interval, row["C"], row["J"], times, cpu, row["A"]]
+    return [name, str(row["runs"]), *map(_cell, numbers)]
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return "-" if value is None or isnan(value) or value in (inf, -inf) else f"{value:.3g}"
+
+
+def _named(context: str) -> str:
+    return context or "(no context)"
+
+
+def _warnings(about: Mapping[str, Any]) -> list[str]:
+    """What J of this table cannot say."""
+    lines, run = [], [row for row in about["actions"] if row["runs"]]
+    if about["target_unmet"] and run:
+        lines.append(
+            f"no action surely reaches R {about['target']:g} in any context: judged without "
+            "a target"
+        )
+    elif about["target"] is not None:
+        below = [row["action"] for row in run if not row["scenarios"]]
+        lines += [
+            f"{action} does not surely reach R {about['target']:g} in any context: no J"
+            for action in below
+        ]
+    over = ", ".join(map(_named, about["judged_over"]))
+    if not over and len(run) > 1:
+        lines.append(
+            "there is no context in which all actions were run: each is judged in its own, "
+            "the order says little"
+        )
+    elif over and len(about["judged_over"]) < len(about["contexts"]):
+        lines.append(f"judged over the contexts in which all actions were run: {over}")
+    for action in about["uncosted"]:
+        lines.append(
+            f"{action}: no run reported {about['cost']}, so its cost is taken as 0; give "
+            "another --cost, or correct `cost` "
+            "in the task file or the name in the action's result"
+        )
+    lines += [f"elsewhere it was judged by {asked}" for asked in about["asked_elsewhere"]]
+    return lines
+
+
+def _remarks(about: Mapping[str, Any], options: argparse.Namespace) -> list[str]:
+    lines = []
+    for row in about["actions"]:
+        if options.target is not None or (row["scenarios"] and about["target"] is not None):
+            met = ", ".join(map(_named, row["scenarios"])) or "none"
+            most = f", where it costs {_cell(row['C_largest'])} at most" if row["scenarios"] else ""
+            lines.append(f"{row['action']} meets R {about['target']:g} in: {met}{most}")
+        if row["causes"]:
+            lines.append(
+                f"{row['action']}: "
+                + ", ".join(f"{n} {cause}" for cause, n in row["causes"].items())
+            )
+    lines += [
+        f"{b['against']} is better than {about['best']} {b['better']} rho = {b['rho']:.4g}"
+        for b in about["break_even"]
+    ]
+    for key, words in (
+        ("to_reach", f"R {options.target} costs least with"),
+        ("for_cost", f"cost {options.budget} buys"),
+    ):
+        if key in about:
+            answer = about[key]
+            said = (
+                "nothing known"
+                if answer is None
+                else f"{answer['action']}: R {answer['R']:.3f}, C {answer['C']:.4g}"
+            )
+            lines.append(f"{words} {said}")
+    for name, selector in about["selectors"].items():
+        for context, p in selector["contexts"].items():
+            shares = ", ".join(f"{action} {share:.3f}" for action, share in p.items())
+            frozen = " (frozen)" if selector["frozen"] else ""
+            lines.append(f"{name}{frozen} {context or 'any context'}: {shares}")
+    return lines

@@ -1,0 +1,306 @@
+"""The tables of an estimates file: what is in them, and the statements that read and change
+them."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import sqlite3
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from math import inf
+from typing import Any
+
+from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.estimate import merge as merge_tallies
+from petrobot.coordinator.learning.learning import corrected
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Correction
+from petrobot.coordinator.learning.waits import Flow, PassageKey
+from petrobot.coordinator.learning.waits import merge as merge_flows
+
+# Two states of one selector, learned apart (on two machines, or in a file and its copy), as one: context by context.
+
+State = Mapping[str, Any]
+
+
+def trials(state: State) -> float:
+    """Trials that a state has learned from, in all contexts. Raises KeyError, TypeError or
+    ValueError if it is no state."""
+    return sum(float(learner["k"]) for learner in state["learners"].values())
+
+
+def joined(mine: State, other: State) -> dict[str, Any]:
+    """Of each context the learner with more trials; `frozen` as in `mine`.
+
+    States over other actions do not mix: the one with more trials is kept whole. Contexts come out
+    sorted, ties are settled by the learners' text, so that files which met agree whoever took in
+    whom.
+    """
+    if list(mine["actions"]) != list(other["actions"]):
+        return {**(other if _rank(other) > _rank(mine) else mine), "frozen": mine["frozen"]}
+    learners = dict(mine["learners"])
+    for context, learner in other["learners"].items():
+        if context not in learners or _weight(learner) > _weight(learners[context]):
+            learners[context] = learner
+    return {**mine, "learners": dict(sorted(learners.items()))}
+
+
+def _rank(state: State) -> tuple[float, str]:
+    return trials(state), json.dumps(state["learners"], sort_keys=True)
+
+
+def _weight(learner: Mapping[str, Any]) -> tuple[float, str]:
+    return float(learner["k"]), json.dumps(learner, sort_keys=True)
+
+
+SCHEMA = 2
+"""1 had no table `question`. Files of schema 1 are read as they are, and become 2 when something is
+written to them."""
+APPLICATION = 0x70657472
+""""petr": SQLite's application_id of these files."""
+CHOICE = "choice of "
+"""Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not
+its estimates."""
+COUNTED = "counted "
+"""Before a mission run's id in the table `about`: the origin under which its runs were counted when
+it was interrupted."""
+CAMPAIGN = "campaign/"
+"""Begins the names of campaigns' origins."""
+
+QUESTION = """
+CREATE TABLE question(origin TEXT, primitive_task TEXT, version INTEGER NOT NULL, cost TEXT NOT NULL, target REAL, rho REAL,
+  PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID
+"""
+TABLES = f"""
+CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+  PRIMARY KEY(origin, primitive_task, action, context)) WITHOUT ROWID;
+CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+  PRIMARY KEY(origin, task, transition_name, context)) WITHOUT ROWID;
+CREATE TABLE selector(primitive_task TEXT, name TEXT, trials REAL NOT NULL, state TEXT NOT NULL,
+  PRIMARY KEY(primitive_task, name)) WITHOUT ROWID;
+CREATE TABLE forgotten(origin TEXT, primitive_task TEXT, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
+CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
+{QUESTION};
+"""
+
+
+def is_empty(db: sqlite3.Connection) -> bool:
+    """Whether nothing was ever written: a kill can leave such a file."""
+    return int(db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]) == 0
+
+
+def schema(db: sqlite3.Connection) -> int:
+    """The version of its tables; 0 if it says none."""
+    return int(db.execute("PRAGMA user_version").fetchone()[0])
+
+
+def migrate(db: sqlite3.Connection) -> None:
+    """From schema 1. A campaign's own origin is closed from now on; what had been added to it
+    before cannot be told apart."""
+    db.execute(QUESTION)
+    origin = fact(db, "origin")
+    if origin.startswith(CAMPAIGN):
+        db.execute("INSERT OR IGNORE INTO about VALUES ('closed', ?)", (origin,))
+    db.execute(f"PRAGMA user_version = {SCHEMA}")
+
+
+def count_session(db: sqlite3.Connection) -> None:
+    """One more session was learned from: the draws of the next one are others."""
+    db.execute("UPDATE about SET value = CAST(value AS INTEGER) + 1 WHERE name = 'generation'")
+
+
+def renew_origin(db: sqlite3.Connection) -> None:
+    """What is added from now on stands under another name than what was added before."""
+    db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
+
+
+def fact(db: sqlite3.Connection, name: str) -> str:
+    """A line of the table `about`; empty if it is not there."""
+    row = db.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
+    return str(row[0]) if row else ""
+
+
+def add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
+    """Add to an origin's sums."""
+    _put_tally(db, origin, key, merge_tallies(_own_tally(db, origin, key), gained))
+
+
+def correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
+    """A verdict on a run that an origin's sums have counted already; left alone if they have
+    not."""
+    key = Key(correction.primitive_task, correction.action, correction.context)
+    with suppress(KeyError):  # the run is not among this origin's any more
+        _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
+
+
+def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
+    where = (origin, key.primitive_task, key.action, key.context)
+    row = db.execute(
+        "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND "
+        "context = ?",
+        where,
+    ).fetchone()
+    return tally_of(row) if row else Tally()
+
+
+def _put_tally(db: sqlite3.Connection, origin: str, key: Key, tally: Tally) -> None:
+    db.execute(
+        "INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", tally_row(origin, key, tally)
+    )
+
+
+def tally_row(origin: str, key: Key, tally: Tally) -> tuple[Any, ...]:
+    """A row of the table `tally`."""
+    body = json.dumps(tally.to_plain(), separators=(",", ":"))
+    return origin, key.primitive_task, key.action, key.context, tally.changes, body
+
+
+def add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow) -> None:
+    """Add to an origin's firings."""
+    where = (origin, key.task, key.transition, key.context)
+    row = db.execute(
+        "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?",
+        where,
+    ).fetchone()
+    flow = merge_flows(flow_of(row) if row else Flow(), gained)
+    db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", flow_row(origin, key, flow))
+
+
+def flow_row(origin: str, key: PassageKey, flow: Flow) -> tuple[Any, ...]:
+    """A row of the table `flow`."""
+    return origin, key.task, key.transition, key.context, flow.fired, json.dumps(flow.to_plain())
+
+
+def put_question(
+    db: sqlite3.Connection, origin: str, task: str, asked: Question, version: int
+) -> None:
+    """Keep by what an origin judges the actions of a primitive task."""
+    row = (origin, task, version, asked.measure, asked.target, asked.rho)
+    db.execute("INSERT OR REPLACE INTO question VALUES (?, ?, ?, ?, ?, ?)", row)
+
+
+def questions(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
+    """Rows of the table `question`; none in a file of schema 1."""
+    return db.execute("SELECT * FROM question").fetchall() if schema(db) > 1 else []
+
+
+def question_of(row: Sequence[Any]) -> Question:
+    """Of cost, target and rho. Raises ValueError."""
+    cost, target, rho = row
+    Tally().cost(cost)
+    if target is not None and not 0 < target <= 1:
+        raise ValueError(f"{target!r} is no target reliability")
+    if rho is not None and not 0 <= rho < inf:
+        raise ValueError(f"{rho!r} is no weight of cost")
+    return Question(cost, target, rho)
+
+
+def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
+    """Replace a selector's state."""
+    body = json.dumps(state, separators=(",", ":"))
+    db.execute(
+        "INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)",
+        (task, state["selector"], trials(state), body),
+    )
+
+
+def take_selector(
+    db: sqlite3.Connection, task: str, name: str, state: Mapping[str, Any], origin: str
+) -> None:
+    """Another file's state, unless what was learned there under that origin was reset here."""
+    if db.execute(
+        "SELECT 1 FROM forgotten WHERE origin = ? AND primitive_task = ?", (origin, CHOICE + task)
+    ).fetchone():
+        return
+    row = db.execute(
+        "SELECT state FROM selector WHERE primitive_task = ? AND name = ?", (task, name)
+    ).fetchone()
+    put_selector(db, task, state if row is None else joined(state_of(row[0]), state))
+
+
+def forget(db: sqlite3.Connection) -> None:
+    """Drop what some file has reset; if that was this file's own, what it learns from now on is
+    another origin's."""
+    db.execute(
+        "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
+        "AND f.primitive_task = tally.primitive_task)"
+    )
+    db.execute(
+        "DELETE FROM question WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = "
+        "question.origin "
+        "AND f.primitive_task = question.primitive_task)"
+    )
+    db.execute(
+        "DELETE FROM flow WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = flow.origin "
+        "AND f.primitive_task = '')"
+    )
+    if db.execute("SELECT 1 FROM forgotten WHERE origin = ?", (fact(db, "origin"),)).fetchone():
+        renew_origin(db)
+
+
+KEYS = {
+    "tally": "origin, primitive_task, action, context",
+    "flow": "origin, task, transition_name, context",
+    "question": "origin, primitive_task",
+}
+"""Primary keys of the tables whose rows have a version."""
+
+
+def take_later(db: sqlite3.Connection, table: str, rows: Sequence[Sequence[Any]]) -> None:
+    """Rows that are not there yet, or of a later version than those that are."""
+    names = [name for _, name, *_ in db.execute(f"PRAGMA table_info({table})")]
+    body = ", ".join(
+        f"{name} = excluded.{name}" for name in names if name not in KEYS[table].split(", ")
+    )
+    db.executemany(
+        f"INSERT INTO {table} VALUES ({', '.join('?' for _ in names)}) ON "
+        f"CONFLICT({KEYS[table]}) DO UPDATE SET {body} "
+        "WHERE excluded.version > version",
+        rows,
+    )
+
+
+def tally_of(row: Sequence[Any]) -> Tally:
+    """Of a row of the table `tally`. Raises ValueError naming the row."""
+    _, task, action, context, version, body = row
+    try:
+        tally = Tally.of_plain(json.loads(body))
+        _agree(tally.changes, version)
+    except (ValueError, KeyError, TypeError) as fault:
+        raise ValueError(f"{task}, {action}{_in(context)}: {_said(fault)}") from fault
+    return tally
+
+
+def _agree(changes: int, version: int) -> None:
+    """A higher version would win every merge, whatever stands behind it."""
+    if changes != version:
+        raise ValueError(f"version {version} of what was changed {changes} times")
+
+
+def _in(context: str) -> str:
+    return f" ({context})" if context else ""
+
+
+def _said(fault: Exception) -> str:
+    return f"{fault} is missing" if isinstance(fault, KeyError) else str(fault)
+
+
+def state_of(body: str) -> dict[str, Any]:
+    """A selector's state. Raises KeyError, TypeError or ValueError if it is none."""
+    state: dict[str, Any] = json.loads(body)
+    if not 0 <= trials(state) < inf:  # it would win, or lose, every merge
+        raise ValueError(f"a selector that has learned from {trials(state):g} trials")
+    return state
+
+
+def flow_of(row: Sequence[Any]) -> Flow:
+    """Of a row of the table `flow`. Raises ValueError naming the row."""
+    _, _, transition, context, version, body = row
+    try:
+        flow = Flow.of_plain(json.loads(body))
+        _agree(flow.fired, version)
+    except (ValueError, KeyError, TypeError, IndexError) as fault:
+        raise ValueError(f"transition {transition}{_in(context)}: {_said(fault)}") from fault
+    return flow

@@ -1,0 +1,321 @@
+"""The executor's selector that learns: it turns the executor's records into records of learning,
+and chooses by them.
+
+It stands on two sides of the executor: as its `Selector` it is asked for actions, as an `Observer`
+it sees everything that happens. Its state changes by what it observes alone, never by being asked,
+and times are kept to the microsecond, as journals keep them; so a resumed run, whose recorded steps
+are shown to it again, has the same state as one that was never interrupted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.engine import State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Fired,
+    Instruction,
+    RunRecorded,
+    StartRun,
+)
+from petrobot.coordinator.engine.state import Phase
+from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
+from petrobot.coordinator.learning.estimate import Observation
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
+from petrobot.coordinator.task.conditions import parse as parse_condition
+from petrobot.services.comm.calls.notices import Progress
+
+LARGEST = 1e150
+"""Numbers of results from here on are no costs: their squares could not be summed."""
+
+
+class ContextError(ValueError):
+    """A context is not one that the task can tell apart."""
+
+
+@dataclass(frozen=True)
+class Contexts:
+    """What contexts are told apart by: names of parameters and variables, and conditions on
+    them."""
+
+    parts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Parse the conditions. Raises ContextError."""
+        try:
+            parsed = tuple(parse_condition(part) for part in self.parts)
+        except ConditionError as fault:
+            raise ContextError(f"context: {fault}") from fault
+        object.__setattr__(self, "_conditions", parsed)
+
+    @property
+    def conditions(self) -> tuple[Expression, ...]:
+        """The parts, parsed."""
+        parsed: tuple[Expression, ...] = self._conditions  # type: ignore[attr-defined]
+        return parsed
+
+    def check(self, task: Task) -> None:
+        """Raise ContextError if a name is neither a parameter nor a variable of the task."""
+        known = {*task.parameters, *task.flat.variables}
+        for condition in self.conditions:
+            for name in sorted(condition.names - known):
+                raise ContextError(
+                    f"context {condition.text!r}: {task.name} has no parameter or variable "
+                    f"{name!r}; "
+                    f"it has: {', '.join(sorted(known)) or 'none'}"
+                )
+
+    def of(self, values: Mapping[str, Any]) -> str:
+        """The context now, as text: `regime=B`, `light < 0.3=true`; several parts are joined by a
+        comma."""
+        return ", ".join(f"{c.text}={_judged(c, values)}" for c in self.conditions)
+
+
+def usual_contexts(task: Task) -> Contexts:
+    """The regime, if the task has a parameter of that name; else no contexts are told apart."""
+    return Contexts(("regime",) if "regime" in task.parameters else ())
+
+
+def _judged(condition: Expression, values: Mapping[str, Any]) -> str:
+    if condition.names == {condition.text}:
+        value = values.get(condition.text)
+        return str(value).lower() if isinstance(value, bool) or value is None else str(value)
+    try:
+        return "true" if condition.holds(values) else "false"
+    except ConditionFault:
+        return "unknown"
+
+
+@dataclass
+class _Going:
+    """A run whose token was seen."""
+
+    entered: float
+    context: str | None = None
+    taken_by: str | None = None
+    taken_at: float = 0.0
+    ended: RunEnded | None = None
+
+
+class LearningSelector(FirstAlternative):
+    """Implements `Selector` and `Observer` over a `Learning`.
+
+    `chosen`: actions that the user fixed; what is learned of them counts nevertheless. `live`:
+    records are applied as they come; False for a worker of a campaign, whose records are applied
+    later, in order, to the one state of all. `generation`: how many mission runs were learned from
+    before, so that the draws of a second run with the same seed are others. `declared`: in lock
+    step the compute time (s) of each action as services.toml declares it, so that measured CPU time
+    never steers there.
+    """
+
+    def __init__(
+        self,
+        learning: Learning,
+        contexts: Contexts | None = None,
+        chosen: Mapping[str, str] | None = None,
+        *,
+        seed: int = 0,
+        generation: int = 0,
+        live: bool = True,
+        declared: Mapping[str, float] | None = None,
+    ) -> None:
+        super().__init__(chosen)
+        self.learning = learning
+        self.contexts = usual_contexts(learning.task) if contexts is None else contexts
+        self.contexts.check(learning.task)
+        self.records: list[Record] = []
+        """Everything that was learned from, in order."""
+        self._seed, self._generation, self._live = seed, generation, live
+        self._declared = declared
+        self._values: Mapping[str, Any] = {}
+        self._going: dict[str, _Going] = {}
+        self._deferred: dict[str, tuple[End, int]] = {}
+        """Runs whose verdict may still come, each with the trials of its primitive task and context
+        up to then."""
+        self._trials: Counter[tuple[str, str]] = Counter()
+        self._waiting: dict[str, float] = {}
+        self._watched = _waits_for_events(learning.task)
+
+    @property
+    def context(self) -> str:
+        """The context now."""
+        return self.contexts.of(self._values)
+
+    # --- selector -----------------------------------------------------------------------------
+
+    def choose(
+        self,
+        task: str,
+        run: str,
+        alternatives: tuple[str, ...],
+        variables: Mapping[str, Any] | None = None,
+    ) -> tuple[str, str]:
+        """The user's choice, else the selector's. (The operator's own is the executor's: it stands
+        in the engine's state.)"""
+        if task in self._chosen or task not in self.learning.selectors:
+            return super().choose(task, run, alternatives, variables)
+        context = self.contexts.of(self._values if variables is None else variables)
+        rng = np.random.default_rng([self._seed, self._generation, 1, *run.encode()])
+        return self.learning.choose(task, context, alternatives, rng)
+
+    def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
+        """Probability of each alternative in the context now, and its R, C and J where they are
+        known."""
+        selector = self.learning.selectors.get(task)
+        if selector is None:
+            return {}
+        batch, shares = selector.learner(self.context), selector.probabilities(self.context)
+        known = {
+            "reliability": batch.reliability(),
+            "cost": batch.mean_cost(),
+            "j": batch.objective(),
+        }
+        shown: dict[str, dict[str, float]] = {}
+        for i, action in enumerate(selector.actions):
+            shown[action] = {"probability": shares[action]}
+            if batch.runs[0, i] > 0:
+                shown[action] |= {name: float(values[0, i]) for name, values in known.items()}
+        return shown
+
+    # --- observer -----------------------------------------------------------------------------
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Keep what a choice was made on, and what a run's result says beside its status."""
+        if isinstance(stimulus, Chosen):
+            self._choice(now, stimulus)
+        elif isinstance(stimulus, RunEnded):
+            self._run(now, stimulus.run).ended = stimulus
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Turn the executor's records into records of learning."""
+        if isinstance(instruction, Fired):
+            self._fired(now, instruction)
+        elif isinstance(instruction, StartRun):
+            self._run(now, instruction.run)
+        elif isinstance(instruction, RunRecorded):
+            self._ended(now, instruction)
+        elif isinstance(instruction, Corrected):
+            self._corrected(instruction)
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Nothing to learn."""
+
+    def settled(self, now: float, state: State) -> None:
+        """Keep the variables, the runs that go on, and since when transitions wait."""
+        self._values = state.variables
+        for run in state.runs():
+            if run.phase is Phase.DONE:
+                continue
+            going = self._run(now, run.id)
+            if going.context is None and run.action:
+                going.context = self.contexts.of(state.variables)
+        net = self.learning.task.net
+        for name in self._watched:
+            if net.has_concession(state.marking, net.transition_index[name]):
+                self._waiting.setdefault(name, now)
+            else:
+                self._waiting.pop(name, None)
+
+    # --- records ------------------------------------------------------------------------------
+
+    def _run(self, now: float, run: str) -> _Going:
+        return self._going.setdefault(run, _Going(now))
+
+    def _note(self, record: Record) -> None:
+        self.records.append(record)
+        if self._live:
+            self.learning.apply(record)
+
+    def _choice(self, now: float, chosen: Chosen) -> None:
+        place = self.learning.task.flat.places.get(chosen.key.rpartition("#")[0])
+        if place is None or not place.task:
+            return
+        going = self._run(now, chosen.key)
+        going.context = self.context
+        self._note(Choice(place.task, chosen.alternative, going.context))
+
+    def _fired(self, now: float, fired: Fired) -> None:
+        for run in fired.runs:
+            if run in self._going:
+                self._going[run].taken_by, self._going[run].taken_at = fired.transition, now
+        since = self._waiting.pop(fired.transition, None)
+        waited = None if since is None else round(now - since, 6)
+        self._note(Passage(fired.transition, self.context, waited))
+
+    def _ended(self, now: float, record: RunRecorded) -> None:
+        going = self._going.pop(record.run, _Going(now))
+        context = self.context if going.context is None else going.context
+        preempted = (going.taken_by or "") if record.cancelled else None
+        until = going.taken_at if preempted else now
+        seconds = (
+            max(0.0, record.seconds)
+            if preempted is None
+            else round(max(0.0, until - going.entered), 6)
+        )
+        result = going.ended
+        outcome = Observation(
+            record.status,
+            seconds,
+            record.cause,
+            record.executed,
+            self._cpu(record, result),
+            _numbers(result.values) if result is not None and preempted is None else {},
+            preempted,
+            round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
+        )
+        end = End(record.primitive_task, record.action, context, outcome)
+        selector, where = (
+            self.learning.selectors.get(end.primitive_task),
+            (end.primitive_task, context),
+        )
+        if selector is not None and selector.learns_from(end.action, outcome):
+            self._trials[where] += 1
+        if record.deferred:
+            self._deferred[record.run] = (end, self._trials[where])
+        self._note(end)
+
+    def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
+        """CPU seconds as measured; as declared where they are the cost and the run must come out
+        the same again."""
+        if (
+            self._declared is not None
+            and self.learning.question(record.primitive_task).measure == "cpu"
+        ):
+            return self._declared.get(record.action, 0.0)
+        return None if result is None else result.cpu_seconds
+
+    def _corrected(self, corrected: Corrected) -> None:
+        end, trials = self._deferred.pop(corrected.run, (None, 0))
+        if end is not None:
+            what = (end.primitive_task, end.action, end.context, end.outcome)
+            age = self._trials[end.primitive_task, end.context] - trials
+            self._note(Correction(*what, corrected.status, corrected.cause, age))
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers of a result; anything else is no cost. What is not finite would spoil every sum
+    that it came into."""
+    return {
+        name: float(value)
+        for name, value in sorted(values.items())
+        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST
+    }
+
+
+def _waits_for_events(task: Task) -> Sequence[str]:
+    """Transitions that wait for events alone, not for a run."""
+    return [
+        t.name
+        for t in task.flat.transitions.values()
+        if t.events and all(a.end is None for a in t.inputs)
+    ]

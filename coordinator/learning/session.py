@@ -1,0 +1,185 @@
+"""One mission run that learns: opened on an estimates file, written down for a resume, and saved
+once."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.learning.learner import Contexts, LearningSelector, usual_contexts
+from petrobot.coordinator.learning.learning import Estimates, Learning
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Correction, End
+from petrobot.coordinator.learning.selectors import DEFAULT, RULES
+from petrobot.coordinator.task import Task
+
+
+@dataclass(frozen=True)
+class LearningSetting:
+    """How a mission run learns. `contexts`: what is told apart (None: the regime, if the task has
+    one)."""
+
+    path: Path
+    selector: str = DEFAULT
+    target: float | None = None
+    """Target reliability: among actions that meet it, the lowest J; None: the lowest J of all."""
+    contexts: tuple[str, ...] | None = None
+    chosen: Mapping[str, str] = field(default_factory=dict)
+    """Actions that the user fixed, by primitive task."""
+    frozen: bool = False
+    """Choose by what was learned, and write nothing."""
+    declared: Mapping[str, float] | None = None
+    """Lock step: declared compute time of each action (s)."""
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain data for a journal's header."""
+        return {
+            "path": str(self.path.resolve()),
+            "selector": self.selector,
+            "target": self.target,
+            "contexts": None if self.contexts is None else list(self.contexts),
+            "chosen": dict(self.chosen),
+            "frozen": self.frozen,
+            "declared": None if self.declared is None else dict(self.declared),
+        }
+
+    @classmethod
+    def of_plain(cls, data: Mapping[str, Any]) -> LearningSetting:
+        """What `to_plain` gave."""
+        contexts = None if data["contexts"] is None else tuple(data["contexts"])
+        given = (
+            data["selector"],
+            data["target"],
+            contexts,
+            data["chosen"],
+            data["frozen"],
+            data["declared"],
+        )
+        return cls(Path(data["path"]), *given)
+
+
+class LearningSession:
+    """The learning of one mission run, between an estimates file and the executor.
+
+    `begun`: the selectors' states and the generation when the run began, as `beginning()` gave them
+    (for a resumed run; None: as the file has them). Raises EstimatesError, ContextError,
+    ValueError.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        setting: LearningSetting,
+        seed: int,
+        begun: Mapping[str, Any] | None = None,
+    ) -> None:
+        if setting.selector not in RULES:
+            raise ValueError(f"no selector {setting.selector!r}; there are: {', '.join(RULES)}")
+        self.setting = setting
+        self.file = EstimatesFile(setting.path)
+        if setting.frozen and not setting.path.exists():
+            raise EstimatesError(
+                f"{setting.path}: no such file, so nothing was learned to be frozen; learn first"
+            )
+        kept = self.file.read()
+        contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
+        generation = kept.generation if begun is None else int(begun["generation"])
+        self._generation = generation
+        self._token = secrets.token_hex(8) if begun is None else str(begun["token"])
+        self.learning = _learning(
+            task, setting, kept, None if begun is None else begun["selectors"], self._token
+        )
+        self._begun = self.learning.state()
+        self.selector = LearningSelector(
+            self.learning,
+            contexts,
+            setting.chosen,
+            seed=seed,
+            generation=generation,
+            live=not setting.frozen,
+            declared=setting.declared,
+        )
+
+    def beginning(self) -> dict[str, Any]:
+        """Plain data from which a resumed run derives the same choices again."""
+        begun = {"token": self._token, "generation": self._generation, "selectors": self._begun}
+        return {**self.setting.to_plain(), **begun}
+
+    def save(self, *, interrupted: bool = False) -> int:
+        """Add what was learned to the file; gives the number of runs that were counted.
+
+        `interrupted`: the mission run may be resumed; what is saved of it now will not be counted
+        again then.
+        """
+        if self.setting.frozen:
+            return 0
+        done = self.file.records_of(self._token)
+        gained, late = (self.learning.gained, ()) if not done else self._gained_after(done)
+        counted = len(self.selector.records) if interrupted else None
+        self.file.add(
+            gained, self.learning.state(), self._token, counted, late, self.learning.asked()
+        )
+        return sum(t.runs + t.censored for t in gained.tallies.values())
+
+    def _gained_after(self, done: int) -> tuple[Estimates, Sequence[Correction]]:
+        """What came after so many records, and the verdicts in it on runs that the file has counted
+        already."""
+        counted = {
+            id(record.outcome) for record in self.selector.records[:done] if isinstance(record, End)
+        }
+        gained, late = Estimates(), []
+        for record in self.selector.records[done:]:
+            if isinstance(record, Correction) and id(record.was) in counted:
+                late.append(record)
+            else:
+                gained.apply(record, self.learning.task.name, self.learning.salt)
+        return gained, late
+
+
+def _learning(
+    task: Task,
+    setting: LearningSetting,
+    kept: Kept,
+    states: Mapping[str, Mapping[str, Any]] | None,
+    salt: str,
+) -> Learning:
+    """`salt` names the session, so that its runs in the kept sample are told from any other's, a
+    copied file's included."""
+    question = Question(target=setting.target)
+    learning = Learning(task, setting.selector, question, kept.estimates, salt)
+    try:
+        learning.restore(kept.states(setting.selector) if states is None else states)
+    except ValueError as fault:
+        raise EstimatesError(
+            f"{setting.path}: the state of selector {setting.selector} does not fit: {fault}; "
+            "reset it with `petrobot learned reset`"
+        ) from fault
+    if states is None:
+        learning.prime()
+    if setting.frozen:
+        learning.freeze()
+    return learning
+
+
+def session_of(task: Task, header: Mapping[str, Any]) -> LearningSession | None:
+    """The session of a recorded run, as it began; None if it did not learn. Raises EstimatesError,
+    ValueError."""
+    begun = header.get("learning")
+    if begun is None:
+        return None
+    try:
+        return LearningSession(task, LearningSetting.of_plain(begun), header["seed"], begun)
+    except (KeyError, TypeError) as fault:
+        raise ValueError(
+            f"the journal's header says in `learning` how the run learned, but not all: {fault}"
+        ) from fault
+
+
+def fixed_by_user(header: Mapping[str, Any]) -> Mapping[str, str]:
+    """The actions that the user of a recorded run had fixed."""
+    chosen: Mapping[str, str] = header.get("chosen", {})
+    return chosen

@@ -1,0 +1,305 @@
+"""The emergency stop: straight to the nodes that own devices, and to their bus where a node does
+not answer.
+
+No coordinator is needed, and none can delay it: each node is asked over a connection of its own,
+stops its devices at once (a drive's quick stop goes out with the next bus cycle) and lets no action
+use them until `CLEAR` comes. Where a node that owns a CAN bus of this host does not answer in time,
+all CANopen devices of that bus are stopped by NMT (CiA 301: a drive that leaves OPERATIONAL while
+it moves stops, object 6007h).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from petrobot.coordinator.run.supervisor import is_local
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.latch import ALL, LatchError, latch_of
+from petrobot.services.comm.calls.notices import Answered, Notice, PeerLost
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.protocol.messages import Command, Hello
+from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.comm.tls.credentials import Credentials
+
+STOP = "emergency_stop"
+CLEAR = "clear_emergency"
+NODE_LATE = 0.15
+"""Seconds after which a node that has not answered is passed by, over its bus."""
+STANDSTILL = 1.5
+"""Seconds that devices have to come to rest before their last answer is given as it is."""
+ASK_AGAIN = 0.02
+BUS_PATIENCE = 0.5
+BUS_TIMES, BUS_PAUSE = 3, 0.01
+"""How often the order goes on the bus, and the pause between (s): one frame may be lost."""
+
+
+@dataclass
+class Stopped:
+    """What became of one node's devices."""
+
+    node: str
+    devices: dict[str, str] = field(default_factory=dict)
+    """Each device's answer: stopped, stopping, cleared, not ready, no answer."""
+    seconds: float | None = None
+    """From the order to the first answer; None without one."""
+    why: str = ""
+    """Why there is no answer."""
+    bus: str = ""
+    """What was done on the bus in the node's place."""
+    note: str = ""
+    """What else the node says: that the stop is not kept on its disk."""
+    latch: str = ""
+    """What was kept or cleared on disk in the node's place."""
+    cleared: bool = False
+    """Whether the stop of a node that does not run was cleared on its disk."""
+
+    @property
+    def answered(self) -> bool:
+        """Whether the node itself has answered."""
+        return self.seconds is not None
+
+
+def nodes_with_devices(directory: Directory) -> list[str]:
+    """The nodes that own devices with a driver: those that an emergency stop goes to."""
+    return list(
+        dict.fromkeys(device.node for device in directory.devices.values() if device.driver)
+    )
+
+
+def buses_of(directory: Directory, node: str) -> list[Mapping[str, Any]]:
+    """CAN buses of a node's devices, as `services.comm.can_ports.open_can` takes them."""
+    found = []
+    for device in directory.devices.values():
+        can = device.config.get("can") or {
+            k: device.config[k] for k in _CAN_KEYS if k in device.config
+        }
+        if device.node == node and {"interface", "channel"} <= can.keys() and can not in found:
+            found.append(can)
+    return found
+
+
+_CAN_KEYS = ("interface", "channel", "bitrate")
+
+
+class EmergencyLine:
+    """A connection to one node for emergency stops alone. It fits every services.toml: a stop must
+    not fail for a hash."""
+
+    def __init__(self, directory: Directory, node: str, credentials: Credentials) -> None:
+        name = f"estop-{secrets.token_hex(4)}"
+        entry = directory.nodes[node]
+        caller = Caller(
+            node, Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name), auto_ack=True
+        )
+        self.node = node
+        self.why = ""
+        self.note = ""
+        self.reached = False
+        self._name = name
+        self._numbers = 0
+        self._device_names = frozenset(directory.devices)
+        self._answers: dict[str, asyncio.Future[Mapping[str, Any]]] = {}
+        self.client = Client(
+            entry.host,
+            entry.port,
+            caller,
+            on_notices=self._hear,
+            key=credentials.key,
+            tls=credentials.client(),
+        )
+
+    async def connect(self, timeout: float) -> bool:
+        """Whether the node lets us in within so many seconds; `why` says why not."""
+        self.client.start()
+        up = self.reached = await self.client.connected(timeout)
+        if not up and not self.why:
+            trouble = f": {self.client.trouble}" if self.client.answered else ""
+            self.why = (
+                f"{self.node} does not answer on {self.client.host}:{self.client.port}{trouble}"
+            )
+        return up
+
+    async def order(self, verb: str, timeout: float) -> dict[str, str] | None:
+        """Give an order; each device's answer, or None when there was none in time."""
+        self._numbers += 1
+        identity = f"{self._name}/{verb}#{self._numbers}"
+        told = self._answers[identity] = asyncio.get_running_loop().create_future()
+        self.client.caller.command(self.client.now(), Command(identity, verb))
+        self.client.flush()
+        try:
+            async with asyncio.timeout(timeout):
+                data = await told
+        except TimeoutError:
+            self.why = self.why or f"no answer within {timeout:g} s"
+            return None
+        finally:
+            self._answers.pop(identity, None)
+        self.note = str(data.get("note") or "")
+        answers = data.get("answers")
+        if isinstance(answers, Mapping):
+            return {str(device): str(answer) for device, answer in answers.items()}
+        self.why = str(data.get("text") or data.get("cause") or "an answer that says nothing")
+        return None
+
+    def devices_of(self, answers: Mapping[str, str]) -> dict[str, str]:
+        """Answers of devices: that under the node's own name is of its actions without one, unless
+        a device is called so."""
+        own = {self.node} - self._device_names
+        return {device: answer for device, answer in answers.items() if device not in own}
+
+    async def close(self) -> None:
+        """Hang up."""
+        await self.client.close()
+
+    def _hear(self, _: float, notices: list[Notice]) -> None:
+        for notice in notices:
+            if isinstance(notice, Answered):
+                told = self._answers.get(notice.answer.id)
+                if told is not None and not told.done():
+                    told.set_result(notice.answer.data)
+            elif isinstance(notice, PeerLost):
+                self.why = notice.reason
+
+
+async def order_all(
+    directory: Directory, credentials: Credentials, verb: str = STOP, *, bus: bool = False
+) -> list[Stopped]:
+    """Give an order to every node that owns devices, all at once; with `bus` stop their buses
+    without waiting for them."""
+    nodes = nodes_with_devices(directory)
+    return list(
+        await asyncio.gather(*(_order(directory, credentials, n, verb, bus) for n in nodes))
+    )
+
+
+async def _order(
+    directory: Directory, credentials: Credentials, node: str, verb: str, bus: bool
+) -> Stopped:
+    stopped = Stopped(node)
+    line = EmergencyLine(directory, node, credentials)
+    asking = asyncio.create_task(_ask(line, stopped, verb))
+    try:
+        if verb == STOP:
+            if not bus:
+                await _answered(stopped, asking, NODE_LATE)
+            if not bus and not stopped.answered:
+                # The processes of its devices look at the latch themselves: they stop although the
+                # node may be frozen.
+                stopped.latch = await _latch(directory, node)
+            if bus or not stopped.answered:
+                stopped.bus = await _stop_buses(directory, node)
+        await asking
+        if verb == STOP and not stopped.answered:
+            stopped.latch = stopped.latch or await _latch(directory, node)
+        elif stopped.answered:
+            stopped.latch = ""  # it was only late, and keeps the stop itself
+        if verb == CLEAR and not stopped.answered and not line.reached:
+            stopped.latch, stopped.cleared = await _unlatch(directory, node)
+    finally:
+        await line.close()
+    return stopped
+
+
+async def _answered(stopped: Stopped, asking: asyncio.Task[None], timeout: float) -> None:
+    """Wait for the node's first answer, at most so many seconds."""
+    deadline = asyncio.get_running_loop().time() + timeout
+    while (
+        not stopped.answered and not asking.done() and asyncio.get_running_loop().time() < deadline
+    ):
+        await asyncio.wait({asking}, timeout=ASK_AGAIN)
+
+
+async def _ask(line: EmergencyLine, stopped: Stopped, verb: str) -> None:
+    """Order until all devices stand; the first answer counts for `seconds`."""
+    loop = asyncio.get_running_loop()
+    begun = loop.time()
+    if await line.connect(STANDSTILL):
+        while True:
+            answers = await line.order(verb, STANDSTILL)
+            if answers is None:
+                break
+            if stopped.seconds is None:
+                stopped.seconds = loop.time() - begun
+            stopped.devices, stopped.note = line.devices_of(answers), line.note or stopped.note
+            if "stopping" not in stopped.devices.values() or loop.time() - begun > STANDSTILL:
+                return
+            await asyncio.sleep(ASK_AGAIN)
+    stopped.why = line.why
+
+
+async def _latch(directory: Directory, node: str) -> str:
+    """Keep on disk that the devices of a node are stopped that did not answer: it heeds that when
+    it goes on, or is started."""
+    if not await asyncio.to_thread(is_local, directory.nodes[node].host):
+        return (
+            f"not latched: {node} is on another host; run `petrobot estop` there before "
+            "it is started again"
+        )
+    try:
+        path = await asyncio.to_thread(latch_of(directory.source, node).stop, [ALL])
+    except LatchError as fault:
+        return f"not latched: {fault}; do not start {node} again before the cell is safe"
+    return f"latched: {path} keeps its devices stopped until `petrobot estop --clear` is said"
+
+
+async def _unlatch(directory: Directory, node: str) -> tuple[str, bool]:
+    """Clear on disk the stop of a node that does not run; what was done in words, and whether it is
+    cleared."""
+    if node not in await asyncio.to_thread(still_stopped, directory):
+        return "", False
+    devices = [name for name, device in directory.devices.items() if device.node == node]
+    try:
+        await asyncio.to_thread(latch_of(directory.source, node).clear, devices, devices)
+    except LatchError as fault:
+        return f"not cleared: {fault}", False
+    return (
+        "it does not run; its stop is cleared on disk, so its devices take orders when it is "
+        "started",
+        True,
+    )
+
+
+def still_stopped(directory: Directory) -> list[str]:
+    """The nodes of this host whose devices an emergency stop still holds, as their disks say."""
+    nodes = nodes_with_devices(directory)
+    here = [node for node in nodes if is_local(directory.nodes[node].host)]
+    return [node for node in here if latch_of(directory.source, node).stopped()]
+
+
+async def _stop_buses(directory: Directory, node: str) -> str:
+    """Stop every CANopen device on the node's buses by NMT; says what was done."""
+    buses = buses_of(directory, node)
+    if not buses:
+        return ""
+    if not await asyncio.to_thread(is_local, directory.nodes[node].host):
+        return (
+            "its bus is on another host: run `petrobot estop --bus` there, or press the "
+            "hardware's emergency stop"
+        )
+    return "; ".join([await asyncio.to_thread(_stop_bus, can) for can in buses])
+
+
+def _stop_bus(can: Mapping[str, Any]) -> str:
+    from petrobot.services.comm.canopen.cia301 import NmtCommand, nmt
+    from petrobot.services.comm.canopen.ports import open_can
+
+    patience = {"timeout": BUS_PATIENCE} if can["interface"] == "petrobot_stream" else {}
+    try:
+        port = open_can({**can, **patience})
+        try:
+            for _ in range(BUS_TIMES):
+                port.send(nmt(NmtCommand.STOP))
+                time.sleep(BUS_PAUSE)
+                # what is left unread when a socket closes may cost the other end what we have sent
+                port.receive()
+        finally:
+            port.close()
+    except (ConnectionError, ValueError, OSError) as fault:
+        return f"bus {can['channel']}: {fault}"
+    return f"bus {can['channel']}: all devices stopped by NMT"

@@ -1,0 +1,200 @@
+"""Journals of mission runs as the page's history: every record with its marking, told in words."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.background import RefusedError
+from petrobot.coordinator.engine import Engine, Fired, Phase, Report, RunRecorded, StartRun
+from petrobot.coordinator.operator.event_texts import reason_of, told
+from petrobot.coordinator.operator.net_state import picture
+from petrobot.coordinator.run.folder import JOURNAL, RESULT
+from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
+from petrobot.coordinator.run.recording import ReplayError, Step, replay
+from petrobot.coordinator.task import End, Task
+from petrobot.coordinator.task.file import TaskFileError, loads
+
+RECORDS_AT_MOST = 20_000
+RUNS_AT_MOST = 300
+
+
+@dataclass(frozen=True, slots=True)
+class JournalHistory:
+    """The runs of one folder (`coordinator.record.runfolder`). Fits
+    `coordinator.operator.port.HistoryPort`."""
+
+    folder: Path
+
+
+def _runs(folder: str) -> list[dict[str, Any]]:
+    """Every run, newest first: {id, task, state, started (ISO 8601 text), seconds}."""
+    paths = sorted(Path(folder).glob(f"*/{JOURNAL}"), key=lambda p: p.stat().st_mtime, reverse=True)
+    return [_listed(path) for path in paths[:RUNS_AT_MOST]]
+
+
+def _run(folder: str, run: str) -> dict[str, Any]:
+    """One run, derived again from its journal: {id, task (as in a snapshot), initial (marking),
+    records}."""
+    if run not in {path.parent.name for path in Path(folder).glob(f"*/{JOURNAL}")}:
+        raise RefusedError(404, "no such run")
+    return opened(Path(folder) / run / JOURNAL, run)
+
+
+def _listed(path: Path) -> dict[str, Any]:
+    """What the list of runs says of one; the journal itself is read only when it is opened."""
+    entry: dict[str, Any] = {
+        "id": path.parent.name,
+        "task": "",
+        "state": "running",
+        "started": "",
+        "seconds": None,
+    }
+    try:
+        result = json.loads((path.parent / RESULT).read_text(encoding="utf-8"))
+        seconds = result.get("sim_s", result.get("wall_s"))
+        entry |= {
+            "task": result.get("task", ""),
+            "state": result.get("status", ""),
+            "seconds": seconds,
+        }
+    except (OSError, ValueError):
+        entry["state"] = "running or interrupted"
+    entry["modified"] = path.stat().st_mtime
+    return entry
+
+
+def opened(path: Path, run: str) -> dict[str, Any]:
+    """A journal as the page's history. A journal that cannot be derived again says so in `fault`,
+    with what could be."""
+    try:
+        journal = read_journal(path)
+        task = task_of(journal)
+    except (JournalError, TaskFileError, KeyError) as fault:
+        return {"id": run, "fault": f"{fault}", "task": None, "initial": {}, "records": []}
+    engine = Engine(task, journal.header.get("devices") or _devices(journal))
+    teller = _Teller(task)
+    records: list[dict[str, Any]] = []
+    fault_text = (
+        f"a torn tail of {journal.torn_bytes} bytes was dropped" if journal.torn_bytes else ""
+    )
+    try:
+        for step in replay(journal, engine):
+            records.append(teller.record(step))
+            if len(records) >= RECORDS_AT_MOST:
+                fault_text = f"only the first {RECORDS_AT_MOST} records are shown"
+                break
+    except (JournalError, ReplayError) as fault:
+        fault_text = str(fault)
+    header = journal.header
+    return {
+        "id": run,
+        "fault": fault_text,
+        "mode": header.get("mode", ""),
+        "seed": header.get("seed"),
+        "started": header.get("date", ""),
+        "from": _source(header),
+        "task": picture(task),
+        "initial": dict(zip(task.net.places, task.net.initial, strict=True)),
+        "records": records,
+    }
+
+
+def _source(header: Mapping[str, Any]) -> dict[str, Any] | None:
+    """From which point of which run this one set out."""
+    source = header.get("from")
+    return (
+        {key: source[key] for key in ("run", "record", "going") if key in source}
+        if source
+        else None
+    )
+
+
+def task_of(journal: Journal) -> Task:
+    """The task that a journal ran, with the number of runs that it was given. Raises TaskFileError,
+    KeyError."""
+    from petrobot.coordinator.launch import with_runs
+
+    task = loads(journal.header["task"], f"{journal.path} (task)")
+    runs = journal.header.get("runs")
+    return with_runs(task, runs)[0] if runs is not None else task
+
+
+def _devices(journal: Journal) -> dict[str, str]:
+    from petrobot.services.comm.location_file import parse
+
+    text = journal.header.get("services")
+    if not text:
+        return {}
+    directory = parse(text, Path(journal.header.get("services_path", "services.toml")))
+    return {a.name: a.device for a in directory.actions.values() if a.device}
+
+
+class _Teller:
+    """Turns steps into records; keeps which run had which action, for the reasons of firings."""
+
+    def __init__(self, task: Task) -> None:
+        self._places = task.net.places
+        self._marking = task.net.initial
+        self._actions: dict[str, str] = {}
+        self._ends: dict[str, dict[str, Any]] = {}
+        self._errors = {
+            t.name
+            for t in task.flat.transitions.values()
+            if any(i.end is End.ERROR for i in t.inputs)
+        }
+
+    def record(self, step: Step) -> dict[str, Any]:
+        """{number, t, text, firings, marking (what changed), notes, error, going (places whose runs
+        go on)}."""
+        firings, notes = [], []
+        for instruction in step.instructions:
+            if isinstance(instruction, StartRun):
+                self._actions[instruction.run] = instruction.action
+                notes.append(f"{instruction.action} starts in {instruction.place}")
+            elif isinstance(instruction, RunRecorded):
+                end = reason_of(
+                    instruction.status, instruction.cause, instruction.text, instruction.executed
+                )
+                self._ends[instruction.run] = end
+            elif isinstance(instruction, Report) and instruction.severity.value != "note":
+                notes.append(instruction.text)
+            elif isinstance(instruction, Fired):
+                firings.append(self._firing(step, instruction))
+        after = step.state.marking
+        changed = {self._places[i]: n for i, n in enumerate(after) if n != self._marking[i]}
+        self._marking = after
+        return {
+            "number": step.number,
+            "t": round(step.time, 4),
+            "text": told(step.stimulus),
+            "firings": firings,
+            "marking": changed,
+            "notes": notes,
+            "error": any(f["error"] for f in firings),
+            "going": sorted(
+                {run.place for run in step.state.runs() if run.phase is not Phase.DONE}
+            ),
+        }
+
+    def _firing(self, step: Step, fired: Fired) -> dict[str, Any]:
+        ends = [self._ends[run] for run in fired.runs if run in self._ends]
+        worst = max(
+            ends,
+            key=lambda end: ("none", "success", "failure", "error").index(end["status"]),
+            default=None,
+        )
+        return {
+            "transition": fired.transition,
+            "cause": told(step.stimulus, fired.cause),
+            "error": fired.transition in self._errors,
+            "reason": worst if worst and worst["status"] in ("failure", "error") else None,
+            "action": self._actions.get(fired.runs[0], "") if fired.runs else "",
+        }
+
+
+WORKS: Mapping[str, Callable[..., Any]] = {"runs": _runs, "run": _run}
+"""For `coordinator.analysing.Apart`."""

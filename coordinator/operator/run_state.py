@@ -1,0 +1,334 @@
+"""Tells a mission run as changes of the page's state: an observer of the executor, and of journals
+read back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from petrobot.coordinator.engine import (
+    Abort,
+    CancelRun,
+    Chosen,
+    Corrected,
+    EventOccurred,
+    Finished,
+    Fired,
+    Hold,
+    HoldRun,
+    Instruction,
+    Marked,
+    Mode,
+    Paused,
+    Phase,
+    RaiseEvent,
+    ReleaseRun,
+    Report,
+    Resumed,
+    RunEnded,
+    RunHeld,
+    RunRecorded,
+    StartRun,
+    State,
+    Stimulus,
+)
+from petrobot.coordinator.engine.state import ACTIVE
+from petrobot.coordinator.operator.changes import empty_state
+from petrobot.coordinator.operator.event_texts import plain_value, reason_of, told
+from petrobot.coordinator.operator.feed import Feed
+from petrobot.coordinator.operator.net_state import picture
+from petrobot.coordinator.task import End, Executed, Scope, Task
+from petrobot.coordinator.task.net import Marking
+from petrobot.coordinator.task.wording import Severity
+from petrobot.services.comm.calls.notices import Progress
+
+_AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
+_GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
+_LEVEL = {Severity.NOTE: "info", Severity.WARNING: "warning", Severity.ERROR: "error"}
+
+
+class Narrator:
+    """Fills a feed. `where` gives the node of each action. Fits
+    `coordinator.mission.executor.Observer`.
+
+    `settled` is to be called after each stimulus that the engine has handled, with the new state:
+    it tells what no instruction says (latched events, variables, breakpoints).
+    """
+
+    def __init__(
+        self, feed: Feed, task: Task, where: Mapping[str, str] | None = None, origin: float = 0.0
+    ) -> None:
+        self.feed = feed
+        self.task = task
+        self.origin = origin
+        self._where = where or {}
+        self._net = task.net
+        self._stimulus: Stimulus | None = None
+        self._ends: dict[str, dict[str, Any]] = {}
+        self._actions: dict[str, str] = {}
+        self._why: dict[str, str] = {}
+        self._held: dict[str, str] = {}
+        self._seen: State | None = None
+        self._aborted = False
+        self._error_exits = {
+            t.name
+            for t in task.flat.transitions.values()
+            if any(i.end is End.ERROR for i in t.inputs)
+        }
+        self._tell: Mapping[type, Callable[[float, Any], None]] = {
+            Fired: self._fired,
+            Marked: lambda t, i: self._marking(t, i.before, i.after),
+            StartRun: self._started,
+            CancelRun: lambda t, i: self._state(t, i.run, "stopping"),
+            HoldRun: lambda t, i: self._state(t, i.run, "holding"),
+            ReleaseRun: lambda t, i: self._state(t, i.run, "running"),
+            RunRecorded: self._recorded,
+            Corrected: self._corrected,
+            Report: self._report,
+            Paused: self._paused,
+            Resumed: lambda t, i: self.feed.emit("paused", time=t, paused=None),
+            Finished: self._finished,
+        }
+
+    def begin(self, mission: str, mode: str, *, starts: bool = True, **parts: Any) -> None:
+        """A mission run begins: clients get a snapshot with the task at its initial marking.
+
+        `starts` says whether another mission run can be started when this one has ended. `parts`
+        are further parts of the snapshot that outlive a mission run, such as `controls`, `nodes`
+        and `selectors`.
+        """
+        flat = self.task.flat
+        events = {
+            name: {
+                "scope": e.scope.value,
+                "memory": e.memory.value,
+                "armed": False,
+                "count": 0,
+                "last": None,
+            }
+            for name, e in flat.events.items()
+        }
+        state = {key: value for key, value in empty_state().items() if key != "sequence"} | {
+            "mission": {
+                "id": mission,
+                "state": "idle",
+                "mode": mode,
+                "firings": 0,
+                "starts": starts,
+            },
+            "task": picture(self.task),
+            "marking": dict(zip(self._net.places, self._net.initial, strict=True)),
+            "events": events,
+            "variables": {n: plain_value(v) for n, v in flat.initial_variables().items()},
+        }
+        self.feed.replace(**(state | parts))
+
+    # --- what the executor tells --------------------------------------------------------------
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """The engine takes a stimulus in."""
+        time = now - self.origin
+        self._stimulus = stimulus
+        if isinstance(stimulus, RunEnded):
+            self._ends[stimulus.run] = reason_of(
+                stimulus.status, stimulus.cause, stimulus.text, stimulus.executed
+            )
+        elif isinstance(stimulus, Chosen):
+            self._why[stimulus.key] = stimulus.reason
+        elif isinstance(stimulus, (EventOccurred, RaiseEvent)):
+            known = self.feed.state["events"].get(stimulus.event)
+            if known is not None:
+                event = {**known, "count": known["count"] + 1, "last": round(time, 4)}
+                self.feed.emit("event", time=time, name=stimulus.event, event=event)
+        elif isinstance(stimulus, Abort):
+            self._aborted = True
+        elif isinstance(stimulus, RunHeld):
+            self._answered(time, stimulus)
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """The engine gave an instruction or a record."""
+        tell = self._tell.get(type(instruction))
+        if tell is not None:
+            tell(now - self.origin, instruction)
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """A run says how far it is."""
+        self.feed.emit(
+            "run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4)
+        )
+
+    def settled(self, now: float, state: State) -> None:
+        """The engine has handled a stimulus."""
+        time, seen = now - self.origin, self._seen
+        if seen is None or seen.flags != state.flags:
+            self._flags(time, seen.flags if seen else frozenset(), state.flags)
+        if seen is None or seen.variables is not state.variables:
+            before = seen.variables if seen else {}
+            for name, value in state.variables.items():
+                if name not in before or before[name] != value:
+                    self.feed.emit("variable", time=time, name=name, value=plain_value(value))
+        if seen is None or seen.breakpoints != state.breakpoints:
+            self.feed.emit(
+                "breakpoints",
+                time=time,
+                breakpoints=[self._key(n) for n in sorted(state.breakpoints)],
+            )
+        before_overrides = seen.overrides if seen else {}
+        if before_overrides is not state.overrides:
+            self._overrides(time, before_overrides, state.overrides)
+        if (
+            state.mode in (Mode.RUNNING, Mode.PAUSED)
+            and self.feed.state["mission"]["state"] == "idle"
+        ):
+            self.feed.emit("mission", time=time, mission={"state": "running"})
+        if state.mode is Mode.ABORTING and self.feed.state["mission"]["state"] == "running":
+            self.feed.emit(
+                "mission", time=time, mission={"state": "stopping", "reason": state.ending}
+            )
+        self._seen = state
+
+    def adopt(self, now: float, state: State) -> None:
+        """Take over a state that another process left: all of it is told."""
+        time = now - self.origin
+        self._marking(time, (-1,) * len(state.marking), state.marking)
+        self.feed.emit("mission", time=time, mission={"firings": state.firings})
+        for run in (*state.runs(), *state.stopping.values()):
+            if run.phase in _GOING:
+                primitive = self.task.primitive_task_of(run.place)
+                self._started(
+                    time,
+                    StartRun(
+                        run.id,
+                        run.place,
+                        primitive.name,
+                        run.action,
+                        run.arguments,
+                        primitive.deadline,
+                    ),
+                )
+                if run.phase not in (Phase.RUNNING, Phase.STARTING):
+                    self._state(time, run.id, "held" if run.phase is Phase.HELD else "stopping")
+        if state.mode is Mode.PAUSED:
+            self._paused(time, Paused("as another process left it"))
+        self.settled(now, state)
+
+    # --- in the words of the protocol ---------------------------------------------------------
+
+    def _fired(self, time: float, fired: Fired) -> None:
+        ends = [self._ends[run] for run in fired.runs if run in self._ends]
+        worst = max(
+            ends, key=lambda end: ("success", "failure", "error").index(end["status"]), default=None
+        )
+        run = next(
+            (r for r in fired.runs if self._ends.get(r) is worst),
+            fired.runs[0] if fired.runs else "",
+        )
+        action = self._actions.get(run, "")
+        firing = {
+            "number": fired.number,
+            "transition": fired.transition,
+            "at": round(time, 4),
+            "cause": told(self._stimulus, fired.cause),
+            "reason": worst if worst is not None and worst["status"] != "success" else None,
+            "error": fired.transition in self._error_exits,
+            "run": run,
+            "action": action,
+            "node": self._where.get(action, ""),
+        }
+        self.feed.emit("fired", time=time, firing=firing)
+        self._marking(time, fired.before, fired.after)
+        self.feed.emit("mission", time=time, mission={"firings": fired.number})
+
+    def _marking(self, time: float, before: Marking, after: Marking) -> None:
+        places = self._net.places
+        changed = {places[i]: n for i, n in enumerate(after) if n != before[i]}
+        if changed:
+            self.feed.emit("marking", time=time, marking=changed)
+
+    def _started(self, time: float, start: StartRun) -> None:
+        self._actions[start.run] = start.action
+        run = {
+            "id": start.run,
+            "place": start.place,
+            "primitive_task": start.primitive_task,
+            "action": start.action,
+            "node": self._where.get(start.action, ""),
+            "why": self._why.pop(start.run, "the only alternative"),
+            "started": round(time, 4),
+            "deadline": start.deadline,
+            "progress": 0.0,
+            "state": "running",
+        }
+        self.feed.emit("run_started", time=time, run=run)
+
+    def _state(self, time: float, run: str, state: str) -> None:
+        self.feed.emit("run_progress", time=time, id=run, state=state)
+
+    def _answered(self, time: float, held: RunHeld) -> None:
+        self._state(time, held.run, _AFTER_HOLD[held.answer])
+        node = self._where.get(self._actions.get(held.run, ""), "?")
+        before = self._held.get(node, Hold.HELD.value)
+        self._held[node] = (
+            before if before == Hold.CANNOT.value else held.answer.value
+        )  # the worst of a node's runs
+        paused = self.feed.state["paused"]
+        if paused is not None:
+            self.feed.emit("paused", time=time, paused={**paused, "nodes": dict(self._held)})
+
+    def _recorded(self, time: float, record: RunRecorded) -> None:
+        reason = reason_of(record.status, record.cause, record.text, record.executed)
+        self._ends.setdefault(record.run, reason)
+        status = record.status.value if record.status is not None else "none"
+        self.feed.emit(
+            "run_ended", time=time, id=record.run, status=status, ended=round(time, 4), reason=reason,
+            cancelled=record.cancelled,
+        )  # fmt: skip
+
+    def _corrected(self, time: float, corrected: Corrected) -> None:
+        reason = reason_of(corrected.status, corrected.cause, corrected.text, Executed.YES)
+        self.feed.emit(
+            "run_judged", time=time, id=corrected.run, status=corrected.status.value, reason=reason
+        )
+
+    def _report(self, time: float, report: Report) -> None:
+        if report.severity is not Severity.NOTE:
+            self.feed.emit(
+                "notice",
+                time=time,
+                notice={
+                    "level": _LEVEL[report.severity],
+                    "text": report.text,
+                    "at": round(time, 4),
+                },
+            )
+
+    def _paused(self, time: float, paused: Paused) -> None:
+        self._held = {}
+        self.feed.emit(
+            "paused", time=time, paused={"reason": paused.reason, "at": round(time, 4), "nodes": {}}
+        )
+
+    def _finished(self, time: float, finished: Finished) -> None:
+        state = "aborted" if self._aborted else finished.status.value
+        self.feed.emit("paused", time=time, paused=None)
+        if self.feed.state["mission"]["state"] == "stopped":
+            return  # the emergency stop stands until it is cleared, whatever the run came to
+        self.feed.emit("mission", time=time, mission={"state": state, "reason": finished.reason})
+
+    def _flags(self, time: float, before: frozenset[str], after: frozenset[str]) -> None:
+        for name in before ^ after:
+            known = self.feed.state["events"].get(name)
+            if known is not None and self.task.flat.events[name].scope is Scope.EXTERNAL:
+                self.feed.emit(
+                    "event", time=time, name=name, event={**known, "armed": name in after}
+                )
+
+    def _overrides(self, time: float, before: Mapping[str, str], after: Mapping[str, str]) -> None:
+        for name in sorted(
+            name for name in {*before, *after} if before.get(name) != after.get(name)
+        ):
+            selector = {**self.feed.state["selectors"].get(name, {}), "override": after.get(name)}
+            self.feed.emit("selector", time=time, name=name, selector=selector)
+
+    def _key(self, name: str) -> str:
+        return f"{'places' if name in self._net.place_index else 'transitions'}.{name}"

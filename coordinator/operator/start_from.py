@@ -1,0 +1,219 @@
+"""Where a simulated run sets out from a recorded one: the state after one of its records, and what
+becomes of runs that went on.
+
+A marking says where the task stood, not where the world stood. So the laboratory of the new run is
+prepared as for any run, and an action that went on at that moment begins again (the default), or
+counts as ended if the operator says how. Runs that had ended and whose token still waited stay
+ended, with their status and cause. Variables and latched events are as they were; timers begin
+anew; what the operator wanted (pause, breakpoints, choices) is not taken over. Record 0 is the
+run's own beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.engine import (
+    Engine,
+    Mode,
+    Phase,
+    Point,
+    Run,
+    Standing,
+    State,
+    point_from_plain,
+    to_plain,
+)
+from petrobot.coordinator.launch import Setting, lockstep_id
+from petrobot.coordinator.learning.session import fixed_by_user, session_of
+from petrobot.coordinator.run.folder import JOURNAL, header
+from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
+from petrobot.coordinator.run.journal import Journal, JournalWriter
+from petrobot.coordinator.run.recording import STIMULUS, JournalStore, clock_reading, replay
+from petrobot.coordinator.task import Kind, Status, Task
+
+AGAIN = "again"
+"""A run that went on begins anew."""
+ENDS = (AGAIN, *(status.value for status in Status))
+"""What may become of a run that went on; an end may be followed by a colon and a cause."""
+
+
+class DepartureError(ValueError):
+    """No run can set out there: which record or which word is wrong, and what is possible."""
+
+
+@dataclass(frozen=True)
+class Departure:
+    """A point of a recorded run; `point` is None at its beginning."""
+
+    run: str
+    record: int
+    time: float = 0.0
+    """On the recorded run's clock (s)."""
+    going: Mapping[str, str] = field(default_factory=dict)
+    """What becomes of the runs that went on, by place."""
+    point: Point | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """For the header of the new run's journal."""
+        plain = {
+            "run": self.run,
+            "record": self.record,
+            "time": self.time,
+            "going": dict(self.going),
+        }
+        return plain if self.point is None else {**plain, "point": to_plain(self.point)}
+
+
+def departure(
+    journal: Journal, engine: Engine, run: str, record: int, going: Mapping[str, str] | str = AGAIN
+) -> Departure:
+    """The state after a record (of those between two stimuli, the earlier), as a point to set out
+    from.
+
+    `going` is one word for all runs that went on, or words by place; places that are not named
+    begin again. Raises DepartureError, and what `replay` raises when the journal cannot be derived
+    again.
+    """
+    numbers = [r.number for r in journal.records if r.kind == STIMULUS]
+    last = numbers[-1] if numbers else 0
+    if not 0 <= record <= last:
+        raise DepartureError(
+            f"{run} has records 0 (its beginning) to {last}; {record} is none of them"
+        )
+    state, time = engine.initial(), 0.0
+    for step in replay(journal, engine):
+        if step.number > record:
+            break
+        state, time = step.state, step.time
+    live = {r.place for r in state.runs() if r.phase is not Phase.DONE}
+    if state.mode is Mode.FRESH:
+        return Departure(run, record, time, _words(live, going))
+    words = _words(live, going)
+    return Departure(run, record, time, words, point_of(engine, state, words))
+
+
+def departed(then: Mapping[str, Any]) -> Point | None:
+    """The point at which a run set out, from its journal's header; None if at the task's own
+    beginning."""
+    plain = then.get("from", {}).get("point")
+    return None if plain is None else point_from_plain(plain)
+
+
+def departing(
+    journal: Journal,
+    task: Task,
+    engine: Engine,
+    departure: Departure,
+    seed: int | None = None,
+    parameters: Mapping[str, Any] | None = None,
+) -> Setting:
+    """The setting of the new run: that of the recorded one, but for a `seed` and `parameters` that
+    are given.
+
+    Who chooses is as at that moment: a selector that learned is brought there, and what it learns
+    from here on is not kept. Raises ValueError, EstimatesError.
+    """
+    then = journal.header
+    session = session_of(task, then)
+    if session is not None:
+        _bring(session.selector, journal, engine, departure.record)
+    selector = FirstAlternative(fixed_by_user(then)) if session is None else session.selector
+    given = {**then["parameters"], **(parameters or {})}
+    return Setting(
+        task, given, then["runs"], then["seed"] if seed is None else seed, selector, departure.point
+    )
+
+
+def _bring(selector: Observer, journal: Journal, engine: Engine, record: int) -> None:
+    for step in replay(journal, engine):
+        if step.number > record:
+            return
+        selector.stimulus(step.time, step.stimulus)
+        for instruction in step.instructions:
+            selector.instruction(step.time, instruction)
+        selector.settled(step.time, step.state)
+
+
+def departed_store(
+    journal: Journal,
+    setting: Setting,
+    departure: Departure,
+    folder: Path,
+    more: Mapping[str, Any] | None = None,
+) -> JournalStore:
+    """The new run's journal in its own folder; its header says from which run and record it came.
+    Raises JournalError."""
+    then = journal.header
+    given: dict[str, Any] = {
+        "services_path": then["services_path"],
+        "seed": setting.seed,
+        "runs": setting.runs,
+        "parameters": {**setting.task.parameters, **setting.parameters},
+        "clock": clock_reading(0.0),
+        "durable": False,
+        "mock": then.get("mock", ""),
+        "cell": "launched",
+        "chosen": dict(then.get("chosen", {})),
+        "from": departure.plain(),
+        **(more or {}),
+    }
+    first = header(lockstep_id(setting), then["task"], then["services"], "lockstep", given)
+    return JournalStore(JournalWriter(folder / JOURNAL, first), 0.0, durable=bool(given["durable"]))
+
+
+def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:
+    """A state as a point to set out from; `words` say what becomes of the runs that go on, by
+    place."""
+    task, places = engine.compiled.task, engine.compiled.net.places
+    tokens = {place: n for place, n in zip(places, state.marking, strict=True) if n}
+    marking = {
+        place: n for place, n in tokens.items() if task.places[place].kind is not Kind.ACTION
+    }
+    runs = sorted(state.runs(), key=lambda r: (r.phase is not Phase.DONE, r.ended, r.order))
+    over = [Standing(r.place, r.status, r.cause, r.action) for r in runs if r.phase is Phase.DONE]
+    live = [_standing(r, words.get(r.place, AGAIN)) for r in runs if r.phase is not Phase.DONE]
+    ended = [s for s in live if s.status is not None]
+    verdicts: dict[str, Any] = {}
+    for s in ended:
+        verdicts |= {f"{s.place}.status": str(s.status), f"{s.place}.reason": s.cause}
+    # an aborted run leaves tokens without runs: they begin again, too
+    held = {place: sum(r.place == place for r in runs) for place in tokens}
+    bare = [
+        Standing(p)
+        for p, n in tokens.items()
+        if task.places[p].kind is Kind.ACTION
+        for _ in range(n - held[p])
+    ]
+    standing = (*over, *ended, *(s for s in live if s.status is None), *bare)
+    return Point(marking, standing, {**state.variables, **verdicts}, state.flags)
+
+
+def _standing(run: Run, word: str) -> Standing:
+    end, _, cause = word.partition(":")
+    return (
+        Standing(run.place) if end == AGAIN else Standing(run.place, Status(end), cause, run.action)
+    )
+
+
+def _words(live: set[str], going: Mapping[str, str] | str) -> dict[str, str]:
+    given = dict.fromkeys(sorted(live), going) if isinstance(going, str) else dict(going)
+    for place, word in given.items():
+        if place not in live:
+            there = f"there: {', '.join(sorted(live))}" if live else "nothing ran then"
+            raise DepartureError(f"no run went on in {place!r} at that record; {there}")
+        _check(word)
+    if isinstance(going, str):
+        _check(going)
+    return {place: given.get(place, AGAIN) for place in sorted(live)}
+
+
+def _check(word: str) -> None:
+    end, colon, _ = word.partition(":")
+    if end not in ENDS or (end == AGAIN and colon):
+        raise DepartureError(
+            f"{word!r}: a run that went on begins {AGAIN}, or ends in {', '.join(ENDS[1:])}[:CAUSE]"
+        )

@@ -1,0 +1,90 @@
+"""What all handlers of one server share: the mission, the task files, the doors, and who is
+connected."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Coroutine
+from dataclasses import dataclass, field
+from typing import Any
+
+from aiohttp import web
+
+from petrobot.coordinator.background import Apart
+from petrobot.coordinator.operator.port import HistoryPort, MissionPort, OffersPort, StartsPort
+from petrobot.coordinator.page.access import Doors
+from petrobot.coordinator.page.connection_limits import Gate
+from petrobot.coordinator.page.sessions import Session, carry_out, encode
+from petrobot.coordinator.page.task_store import TaskStore
+
+ABSENT_S = 10.0
+"""Controls go free when their holder's last window has been gone for so long."""
+CLOCK_S = 0.05
+"""How much too early a timer of the loop may come."""
+ENCODED_KEPT = 8
+
+
+@dataclass
+class House:
+    """The state of one page server."""
+
+    port: MissionPort
+    store: TaskStore
+    doors: Doors
+    offers: OffersPort | None = None
+    history: HistoryPort | None = None
+    starts: StartsPort | None = None
+    gate: Gate | None = None
+    sessions: set[Session] = field(default_factory=set)
+    commands: set[asyncio.Task[None]] = field(default_factory=set)
+    apart: Apart = field(default_factory=Apart)
+    """Where work on documents and journals is done."""
+    analyses: Apart = field(default_factory=Apart)
+    """Where drawings are analysed, which takes so long that nothing else may wait for it."""
+    closing: bool = False
+    _heard: dict[str, float] = field(default_factory=dict)
+    _encoded: OrderedDict[tuple[int, int], str] = field(default_factory=OrderedDict)
+
+    def encode_once(self, delta: dict[str, Any]) -> str:
+        """A merged delta as text; clients that are equally far share it."""
+        key = (delta["first"], delta["last"])
+        text = self._encoded.get(key)
+        if text is None:
+            text = self._encoded[key] = encode(delta)
+            if len(self._encoded) > ENCODED_KEPT:
+                self._encoded.popitem(last=False)
+        return text
+
+    def left(self, session: Session) -> None:
+        """A client left: if it holds the controls and does not come back in time, they go free."""
+        self.sessions.discard(session)
+        if session.who and not self.closing:
+            asyncio.get_running_loop().call_later(ABSENT_S, self._free_controls, session.who)
+
+    def heard(self, who: str) -> None:
+        """A script gave a command: if it holds the controls and gives none for a while, they go
+        free."""
+        loop = asyncio.get_running_loop()
+        self._heard[who] = loop.time()
+        loop.call_later(ABSENT_S, self._free_controls, who)
+
+    def _free_controls(self, who: str) -> None:
+        if asyncio.get_running_loop().time() < self._heard.get(who, -ABSENT_S) + ABSENT_S - CLOCK_S:
+            return  # it has been heard again since
+        self._heard.pop(who, None)
+        if self.closing or any(session.who == who for session in self.sessions):
+            return
+        if self.port.snapshot().get("controls", {}).get("holder") == who:
+            self._in_background(self._release(who))
+
+    async def _release(self, who: str) -> None:
+        await carry_out(self.port, who, "release_controls", {"why": "its last window was closed"})
+
+    def _in_background(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.ensure_future(work)
+        self.commands.add(task)
+        task.add_done_callback(self.commands.discard)
+
+
+HOUSE: web.AppKey[House] = web.AppKey("house", House)

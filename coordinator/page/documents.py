@@ -1,0 +1,189 @@
+"""The written side over HTTP: task files, what nodes offer, findings of the check, foreign formats,
+journals.
+
+Nothing here looks into a document: whatever takes its time is done in a process of its own and
+passed on as it comes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from aiohttp import web
+
+from petrobot.coordinator.background import RefusedError
+from petrobot.coordinator.page.app_state import HOUSE, House
+from petrobot.coordinator.page.requests import json_answer, read_object, refused, send_json
+from petrobot.coordinator.page.task_store import StoreError
+
+RENAMES_AT_MOST = 1000
+DESK_AT_MOST = 64
+
+
+def add_routes(app: web.Application) -> None:
+    """The routes for documents."""
+    app.router.add_get("/api/tasks", _list)
+    app.router.add_get("/api/tasks/{name}", _open)
+    app.router.add_put("/api/tasks/{name}", _save)
+    app.router.add_get("/api/revisions/{name}", _revision)
+    app.router.add_post("/api/check", _check)
+    app.router.add_post("/api/analyse", _analyse)
+    app.router.add_get("/api/tasks/{name}/export/{form}", _export)
+    app.router.add_post("/api/import", _import)
+    app.router.add_get("/api/offers", _offers)
+    app.router.add_get("/api/runs", _runs)
+    app.router.add_get("/api/runs/{run}", _run)
+
+
+async def _list(request: web.Request) -> web.Response:
+    return json_answer(request.app[HOUSE].store.listed())
+
+
+async def _open(request: web.Request) -> web.StreamResponse:
+    house = request.app[HOUSE]
+    given = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
+    return await _done(request, "opening", given)
+
+
+async def _revision(request: web.Request) -> web.Response:
+    """{revision}: whether a file is still the one that was opened; cheap enough to be asked every
+    few seconds."""
+    try:
+        return json_answer(
+            {"revision": request.app[HOUSE].store.read(request.match_info["name"]).revision}
+        )
+    except StoreError as fault:
+        raise refused(RefusedError(fault.status, str(fault))) from fault
+
+
+async def _save(request: web.Request) -> web.StreamResponse:
+    """{base, document, renames} or, to settle a conflict, {base, text}; 409 gives both versions."""
+    house = request.app[HOUSE]
+    body = await read_object(request)
+    content = (
+        {"text": body["text"]}
+        if isinstance(body.get("text"), str)
+        else {"document": _document(body)}
+    )
+    about = {**house.store.folders, "name": request.match_info["name"], "where": _where(house)}
+    return await _done(
+        request, "saving", {**about, "base": body.get("base"), "content": content} | _renames(body)
+    )
+
+
+async def _check(request: web.Request) -> web.StreamResponse:
+    """{name, document, desk}: what the check says of a document that is being drawn, and the text
+    that it would be saved as.
+
+    What was asked from the same desk before is given up, analyses too: it was about an older
+    drawing.
+    """
+    house = request.app[HOUSE]
+    body = await read_object(request)
+    desk = str(body.get("desk") or "")[:DESK_AT_MOST]
+    house.analyses.give_up(desk)
+    return await _done(request, "check", {**_drawing(house, body), "where": _where(house)}, desk)
+
+
+async def _analyse(request: web.Request) -> web.StreamResponse:
+    """{name, document, desk}: verdicts on a document that is being drawn, and where its time goes;
+    one analysis at a time."""
+    house = request.app[HOUSE]
+    body = await read_object(request)
+    desk = str(body.get("desk") or "")[:DESK_AT_MOST]
+    drawing = _drawing(house, body)
+    try:
+        text = json.loads(await house.apart.do("drawing", drawing))["text"]
+        said = await house.analyses.do(
+            "analysis", {"text": text, "filename": f"{drawing['name']}.toml"}, desk
+        )
+    except RefusedError as refusal:
+        raise refused(refusal) from refusal
+    return await send_json(request, said)
+
+
+async def _export(request: web.Request) -> web.Response:
+    house, name, form = request.app[HOUSE], request.match_info["name"], request.match_info["form"]
+    try:
+        made = json.loads(
+            await house.apart.do("export", {**house.store.folders, "name": name, "form": form})
+        )
+    except RefusedError as refusal:
+        raise refused(refusal) from refusal
+    return web.Response(
+        text=made["text"],
+        content_type=made["content_type"],
+        headers={
+            "Content-Disposition": f'attachment; filename="{name}.{form}"',
+            "Cache-Control": "no-store",
+        },
+    )
+
+
+async def _import(request: web.Request) -> web.StreamResponse:
+    """{form, text}: a net in another format as a document to go on drawing."""
+    body = await read_object(request)
+    return await _done(
+        request, "import", {"form": str(body.get("form")), "text": str(body.get("text"))}
+    )
+
+
+async def _offers(request: web.Request) -> web.Response:
+    offers = request.app[HOUSE].offers
+    return json_answer(list(offers()) if offers is not None else [])
+
+
+async def _runs(request: web.Request) -> web.StreamResponse:
+    history = request.app[HOUSE].history
+    if history is None:
+        return json_answer([])
+    return await _done(request, "runs", {"folder": str(history.folder)})
+
+
+async def _run(request: web.Request) -> web.StreamResponse:
+    history = request.app[HOUSE].history
+    if history is None:
+        raise web.HTTPNotFound(text="no such run")
+    return await _done(
+        request, "run", {"folder": str(history.folder), "run": request.match_info["run"]}
+    )
+
+
+async def _done(
+    request: web.Request, work: str, given: Mapping[str, Any], desk: str = ""
+) -> web.StreamResponse:
+    """Have the work done apart, and pass on what came of it."""
+    try:
+        said = await request.app[HOUSE].apart.do(work, given, desk)
+    except RefusedError as refusal:
+        if refusal.more:
+            return json_answer(refusal.more, refusal.status)
+        raise refused(refusal) from refusal
+    return await send_json(request, said)
+
+
+def _where(house: House) -> dict[str, str] | None:
+    if house.offers is None:
+        return None
+    return {str(offer["action"]): str(offer["node"]) for offer in house.offers()}
+
+
+def _drawing(house: House, body: Mapping[str, Any]) -> dict[str, Any]:
+    named = {"name": str(body.get("name") or "new_task"), "document": _document(body)}
+    return {**house.store.folders, **named, **_renames(body)}
+
+
+def _document(body: Mapping[str, Any]) -> dict[str, Any]:
+    document = body.get("document")
+    if not isinstance(document, dict):
+        raise web.HTTPBadRequest(text="document is an object")
+    return document
+
+
+def _renames(body: Mapping[str, Any]) -> dict[str, Any]:
+    given = body.get("renames", [])
+    if not isinstance(given, list):
+        raise web.HTTPBadRequest(text="renames is a list of {path, old, new}")
+    return {"renames": given[:RENAMES_AT_MOST]}

@@ -1,0 +1,172 @@
+"""The folders of task files: names, texts, revisions. Shipped ones are read only; a save that would
+undo another's is refused with both versions."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from petrobot.coordinator.page.edits import EditError, Rename, edited, parse
+from petrobot.services.host.whole_file import make_folder, write_whole
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,63}")
+LARGEST_FILE = 1024 * 1024
+
+
+class StoreError(Exception):
+    """A task file cannot be read or written; `status` is the HTTP status to answer with."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class Conflict(Exception):  # noqa: N818 - no fault: two people edited the same file
+    """The file is no longer what the edit began from."""
+
+    def __init__(self, theirs: TaskText, yours: str) -> None:
+        super().__init__(f"{theirs.name} was changed by somebody else since you opened it")
+        self.theirs = theirs
+        self.yours = yours
+
+
+@dataclass(frozen=True, slots=True)
+class TaskText:
+    """One task file as it stands on disk."""
+
+    name: str
+    text: str
+    own: bool = True
+    """Whether it stands in the user's own folder; a shipped one is saved as a copy there."""
+
+    @property
+    def revision(self) -> str:
+        """Changes exactly when the text does."""
+        return hashlib.sha256(self.text.encode()).hexdigest()[:16]
+
+
+class TaskStore:
+    """Task files by bare name: those of the user's own folder, made when it is first needed, and
+    behind them shipped ones."""
+
+    def __init__(self, folder: Path, shipped: Path | None = None) -> None:
+        self._folder = folder
+        self._shipped = shipped
+
+    @property
+    def folder(self) -> Path:
+        """Where tasks are saved."""
+        return self._folder
+
+    @property
+    def folders(self) -> dict[str, str]:
+        """Where its files are, for work in a process of its own."""
+        return {"tasks": str(self._folder), "shipped": str(self._shipped or "")}
+
+    def names(self) -> list[str]:
+        """All task files."""
+        return sorted(self._own() | self._behind())
+
+    def listed(self) -> list[dict[str, object]]:
+        """All task files: {name, own, shipped}; one that is both is the user's copy of a shipped
+        one."""
+        own, behind = self._own(), self._behind()
+        return [
+            {"name": name, "own": name in own, "shipped": name in behind}
+            for name in sorted(own | behind)
+        ]
+
+    def read(self, name: str) -> TaskText:
+        """One task file, the user's own if there is one. Raises StoreError."""
+        path = self._path(name)
+        try:
+            return TaskText(name, _content(path))
+        except FileNotFoundError:
+            pass
+        if self._shipped is not None:
+            with contextlib.suppress(FileNotFoundError):
+                return TaskText(name, _content(self._shipped / path.name), own=False)
+        raise StoreError(404, f"no task file {name}.toml")
+
+    def _own(self) -> set[str]:
+        return _stems(self._folder)
+
+    def _behind(self) -> set[str]:
+        return _stems(self._shipped) if self._shipped is not None else set()
+
+    def save(
+        self, name: str, base: str | None, document: dict[str, object], renames: list[Rename]
+    ) -> TaskText:
+        """Write an edited document; `base` is the revision that the edit began from, None for a new
+        file.
+
+        Only what differs from the file's own values is altered in its text. Raises Conflict,
+        StoreError.
+        """
+        try:
+            current: TaskText | None = self.read(name)
+        except StoreError as fault:
+            if fault.status != 404:
+                raise
+            current = None
+        yours = self.edited_text(current, document, renames)
+        if (current.revision if current else None) != base:
+            raise Conflict(current or TaskText(name, ""), yours)
+        self._write(name, yours)
+        return TaskText(name, yours)
+
+    def save_text(self, name: str, base: str | None, text: str) -> TaskText:
+        """Write a whole text, as after a conflict was settled by hand. Raises Conflict,
+        StoreError."""
+        try:
+            parse(text)
+            current = self.read(name) if name in self.names() else None
+        except EditError as fault:
+            raise StoreError(400, str(fault)) from fault
+        if (current.revision if current else None) != base:
+            raise Conflict(current or TaskText(name, ""), text)
+        self._write(name, text)
+        return TaskText(name, text)
+
+    def edited_text(
+        self, current: TaskText | None, document: dict[str, object], renames: list[Rename]
+    ) -> str:
+        """What the file would become. Raises StoreError."""
+        try:
+            return edited(current.text if current else "", document, renames)
+        except EditError as fault:
+            raise StoreError(400, str(fault)) from fault
+
+    def _path(self, name: str) -> Path:
+        if not _NAME.fullmatch(name):
+            raise StoreError(400, "a task's name has letters, digits, _ and - only, 64 at most")
+        return self._folder / f"{name}.toml"
+
+    def _write(self, name: str, text: str) -> None:
+        path = self._path(name)
+        if len(text.encode()) > LARGEST_FILE:
+            raise StoreError(413, f"{name}.toml would be larger than {LARGEST_FILE} bytes")
+        try:
+            make_folder(self._folder)
+            write_whole(path, text)
+        except OSError as fault:
+            raise StoreError(400, f"{name}.toml cannot be written: {fault}") from fault
+
+
+def _stems(folder: Path) -> set[str]:
+    return {path.stem for path in folder.glob("*.toml") if _NAME.fullmatch(path.stem)}
+
+
+def _content(path: Path) -> str:
+    """A task file's text. Raises FileNotFoundError, StoreError."""
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise StoreError(413, f"{path.name} is larger than {LARGEST_FILE} bytes")
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as fault:
+        raise StoreError(400, f"{path.name} cannot be read: {fault}") from fault

@@ -1,0 +1,265 @@
+"""Work on task files that may take long for a large net, as plain functions of plain data: open,
+save, check, convert.
+
+The page's server has all of it done in a process of its own (`coordinator.analysing.Apart`), in the
+names of `WORKS`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from petrobot.coordinator.analysis.commands import net_file_of
+from petrobot.coordinator.analysis.formats import pnml_writing
+from petrobot.coordinator.analysis.formats.netfile import FormatError as NetFormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFile
+from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
+from petrobot.coordinator.background import RefusedError
+from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
+from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
+from petrobot.coordinator.task import Kind, Task
+from petrobot.coordinator.task.check import check
+from petrobot.coordinator.task.file import TaskFileError, dumps, loads
+
+# Nets of other tools as the text of a task file, to go on drawing: names, marking, weights, inhibitors and positions; pure.
+
+_NOT_NAME = re.compile(r"\W+")
+
+
+def as_task_file(model: NetFile) -> str:
+    """Its places are control places, to be given their meaning by drawing on; `final` is never true
+    until it is written."""
+    names = usable_names(model)
+    document = tomlkit.document()
+    document.add("schema", tomlkit.item(1))
+    document.add(
+        "task", tomlkit.item({"name": _free(model.name or "imported", set()), "final": "false"})
+    )
+    places, transitions = tomlkit.table(is_super_table=True), tomlkit.table(is_super_table=True)
+    net = model.net
+    for place, tokens, capacity in zip(net.places, net.initial, net.capacity, strict=True):
+        own = {"tokens": tokens} if tokens else {}
+        most = {} if capacity is None else {"capacity": capacity}
+        places.add(
+            names[place],
+            tomlkit.item({"kind": Kind.CONTROL.value, **own, **most, **_position(model, place)}),
+        )
+    for t, name in enumerate(net.transitions):
+        takes = [_arc(names[net.places[p]], w) for p, w in net.consume[t]]
+        takes += [f"!{_arc(names[net.places[p]], w)}" for p, w in net.inhibit[t]]
+        gives = [_arc(names[net.places[p]], w) for p, w in net.produce[t]]
+        first = {"priority": net.priority[t]} if net.priority[t] else {}
+        fields = {"in": takes, "out": gives, **first, **_position(model, name)}
+        transitions.add(names[name], tomlkit.item(fields))
+    document.add("places", places)
+    document.add("transitions", transitions)
+    return tomlkit.dumps(document)
+
+
+def usable_names(model: NetFile) -> dict[str, str]:
+    """For each id of the file a name that a task file may hold: its label made usable, kept apart
+    from all others."""
+    taken: set[str] = set()
+    return {
+        i: _free(model.labels.get(i) or i, taken)
+        for i in (*model.net.places, *model.net.transitions)
+    }
+
+
+def _arc(place: str, weight: int) -> str:
+    return f"{place}*{weight}" if weight > 1 else place
+
+
+def _position(model: NetFile, name: str) -> dict[str, int]:
+    where = model.positions.get(name)
+    return {} if where is None else {"x": round(where[0]), "y": round(where[1])}
+
+
+def _free(label: str, taken: set[str]) -> str:
+    stem = _NOT_NAME.sub("_", label.strip()).strip("_") or "element"
+    if stem[0].isdigit():
+        stem = f"n{stem}"
+    name, n = stem, 2
+    while name in taken:
+        name, n = f"{stem}_{n}", n + 1
+    taken.add(name)
+    return name
+
+
+Where = Mapping[str, str] | None
+
+
+class FormatError(ValueError):
+    """A format is not known, or the text is not in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A task in another format."""
+
+    text: str
+    content_type: str
+
+
+def findings(text: str, filename: str, where: Mapping[str, str] | None) -> list[dict[str, Any]]:
+    """What keeps the task from running or should be looked at: {severity, key, text, remedy};
+    errors first.
+
+    `where` gives the node of each action that is offered; None leaves offers out.
+    """
+    try:
+        task = loads(text, filename)
+    except TaskFileError as error:
+        return [_finding("error", fault.key, fault.text, fault.remedy) for fault in error.faults]
+    report = check(task, where)
+    return [_finding(f.severity.value, f.key, f.text, f.remedy) for f in report.findings]
+
+
+def _finding(severity: str, key: str, text: str, remedy: str) -> dict[str, Any]:
+    return {"severity": severity, "key": key, "text": text, "remedy": remedy}
+
+
+def load(text: str, filename: str) -> Task:
+    """The task in a text. Raises FormatError with all faults."""
+    try:
+        return loads(text, filename)
+    except TaskFileError as error:
+        raise FormatError(str(error)) from error
+
+
+def export(text: str, filename: str, form: str) -> Made:
+    """The task in another format. Raises FormatError."""
+    task = load(text, filename)
+    if form == "toml":
+        return Made(dumps(task), "application/toml")
+    if form == "pnml":
+        return Made(pnml_writing.write_pnml(net_file_of(task)), "application/xml")
+    raise FormatError(f"no format {form!r}: toml and pnml are known")
+
+
+def imported(form: str, text: str) -> str:
+    """A net in another format as the text of a task file, to go on drawing. Raises FormatError."""
+    if form == "toml":
+        return text
+    if form != "pnml":
+        raise FormatError(f"no format {form!r}: toml and pnml are known")
+    try:
+        return as_task_file(parse_pnml(text))
+    except NetFormatError as error:
+        raise FormatError(f"not a place/transition net in PNML: {error}") from error
+
+
+# --- as orders --------------------------------------------------------------------------------
+
+
+def _store(tasks: str, shipped: str) -> TaskStore:
+    return TaskStore(Path(tasks), Path(shipped) if shipped else None)
+
+
+def _refused(fault: StoreError) -> RefusedError:
+    return RefusedError(fault.status, str(fault))
+
+
+def _described(task: TaskText, where: Where) -> dict[str, Any]:
+    """A task file for the designer: its document, its text, and what the check says of it."""
+    try:
+        document = plain(parse(task.text))
+    except EditError as fault:
+        raise RefusedError(422, f"{task.name}.toml: {fault}") from fault
+    found = findings(task.text, f"{task.name}.toml", where)
+    about = {"name": task.name, "revision": task.revision, "own": task.own}
+    return {**about, "text": task.text, "document": document, "findings": found}
+
+
+def _open(tasks: str, shipped: str, name: str, where: Where) -> dict[str, Any]:
+    try:
+        return _described(_store(tasks, shipped).read(name), where)
+    except StoreError as fault:
+        raise _refused(fault) from fault
+
+
+def _save(
+    tasks: str,
+    shipped: str,
+    name: str,
+    where: Where,
+    base: str | None,
+    content: dict[str, Any],
+    renames: list[Any],
+) -> dict[str, Any]:
+    """`content` is {document}, or {text} to settle a conflict. A conflict is refused with both
+    versions."""
+    store = _store(tasks, shipped)
+    try:
+        if "text" in content:
+            return _described(store.save_text(name, base, content["text"]), where)
+        return _described(store.save(name, base, content["document"], _renames(renames)), where)
+    except Conflict as conflict:
+        both = {
+            "conflict": str(conflict),
+            "yours": conflict.yours,
+            "theirs": _described(conflict.theirs, where),
+        }
+        raise RefusedError(409, str(conflict), both) from conflict
+    except StoreError as fault:
+        raise _refused(fault) from fault
+
+
+def _drawn(
+    tasks: str, shipped: str, name: str, document: dict[str, Any], renames: list[Any]
+) -> dict[str, Any]:
+    """The text that a drawing would be saved as: {text}."""
+    store = _store(tasks, shipped)
+    try:
+        current = store.read(name) if name in store.names() else None
+        return {"text": store.edited_text(current, document, _renames(renames))}
+    except StoreError as fault:
+        raise _refused(fault) from fault
+
+
+def _check(where: Where, name: str, **drawing: Any) -> dict[str, Any]:
+    """The text that a drawing would be saved as, and what the check says of it."""
+    made = _drawn(name=name, **drawing)
+    return {"findings": findings(made["text"], f"{name}.toml", where), **made}
+
+
+def _export(tasks: str, shipped: str, name: str, form: str) -> dict[str, Any]:
+    try:
+        task = _store(tasks, shipped).read(name)
+        made = export(task.text, f"{task.name}.toml", form)
+    except StoreError as fault:
+        raise _refused(fault) from fault
+    except FormatError as fault:
+        raise RefusedError(400, str(fault)) from fault
+    return {"text": made.text, "content_type": made.content_type}
+
+
+def _import(form: str, text: str) -> dict[str, Any]:
+    try:
+        return {"document": plain(parse(imported(form, text)))}
+    except (FormatError, EditError) as fault:
+        raise RefusedError(400, str(fault)) from fault
+
+
+def _renames(given: list[Any]) -> list[Rename]:
+    try:
+        return [Rename(tuple(map(str, r["path"])), str(r["old"]), str(r["new"])) for r in given]
+    except (TypeError, KeyError):
+        raise RefusedError(400, "a rename is {path, old, new}") from None
+
+
+WORKS: Mapping[str, Callable[..., Any]] = {
+    "opening": _open,
+    "saving": _save,
+    "drawing": _drawn,
+    "check": _check,
+    "findings": findings,
+    "export": _export,
+    "import": _import,
+}

@@ -1,1 +1,0 @@
-"""What is kept of a run, and read, derived and exported again."""

@@ -1,6 +1,0 @@
-"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures, and two
-campaigns compared."""
-
-from petrobot.coordinator.report.run_page import report_html
-
-__all__ = ["report_html"]

@@ -1,0 +1,294 @@
+"""The executor: where net and network meet. It feeds the engine, and has its instructions carried
+out.
+
+A machine without clock or sockets: `take` what a caller noticed, `advance` to a time, and the calls
+it makes are in its callers. Every stimulus is handed to the store before its effects leave, and
+effects leave after the store's `sync`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.engine.instructions import (
+    CancelRun,
+    Choose,
+    Finished,
+    HoldRun,
+    Instruction,
+    ReleaseRun,
+    StartRun,
+    Subject,
+)
+from petrobot.coordinator.engine.stimuli import (
+    Chosen,
+    EventOccurred,
+    RunRaised,
+    Stimulus,
+    VariableChanged,
+    Verdict,
+)
+from petrobot.coordinator.run.calls import Dispatch
+from petrobot.coordinator.run.interfaces import (
+    FirstAlternative,
+    Forgetful,
+    Observer,
+    Selector,
+    Store,
+)
+from petrobot.coordinator.run.recording import Step
+from petrobot.coordinator.task import Scope, Status, Task
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.notices import (
+    Accepted,
+    Answered,
+    Ended,
+    EventArrived,
+    Late,
+    Notice,
+    PeerBack,
+    Progress,
+)
+from petrobot.services.comm.calls.verdicts import VERDICT_EVENTS, VerdictSaid, verdict_event
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.protocol.messages import Answer, Event, Outcome
+
+MEMORY_EVENTS: Final = "memory:"
+SYNC_WITHIN: Final = 0.5
+"""Seconds after which what waits for a sync is synced although no effect calls for it, so that
+nodes may forget results."""
+_LEAVES_THE_PROCESS: Final = (StartRun, CancelRun, HoldRun, ReleaseRun)
+
+
+@dataclass
+class Executor:
+    """Runs one mission. `callers` has one caller for each node of the directory."""
+
+    task: Task
+    engine: Engine
+    directory: Directory
+    callers: Mapping[str, Caller]
+    mission: str
+    seed: int = 0
+    selector: Selector = field(default_factory=FirstAlternative)
+    store: Store = field(default_factory=Forgetful)
+    observers: list[Observer] = field(default_factory=list)
+    finished: Finished | None = None
+    on_status: Callable[[Mapping[str, Any]], None] | None = None
+    """Gets what nodes answer to the operator's questions."""
+
+    def __post_init__(self) -> None:
+        """Start with the engine's initial state."""
+        self.state = self.engine.initial()
+        self.dispatch = Dispatch(self.directory, self.callers, self.mission, self.seed)
+        self._queue: deque[Stimulus] = deque()
+        self._effects: list[Instruction] = []
+        self._acks: list[Callable[[], None]] = []
+        self._unsafe_since: float | None = None
+        self._external = {
+            e.name for e in self.task.flat.events.values() if e.scope is Scope.EXTERNAL
+        }
+
+    # --- in -----------------------------------------------------------------------------------
+
+    def subscribe(self, now: float) -> None:
+        """Have the events and variables that the task knows, and verdicts on its runs, sent by
+        every node."""
+        known = self._external | {MEMORY_EVENTS + name for name in self.task.flat.variables}
+        names = sorted(known | {verdict_event(self.mission)})
+        for caller in self.callers.values():
+            caller.subscribe(now, names)
+
+    def relive(self, now: float, step: Step) -> None:
+        """Take in a step that an earlier process recorded at `now`; observers see it, nothing is
+        carried out again."""
+        self.state = step.state
+        self.dispatch.relive(now, step.stimulus, step.instructions, step.boots)
+        for observer in self.observers:
+            observer.stimulus(now, step.stimulus)
+            for instruction in step.instructions:
+                observer.instruction(now, instruction)
+            observer.settled(now, step.state)
+        self.finished = next(
+            (i for i in step.instructions if isinstance(i, Finished)), self.finished
+        )
+
+    def adopt(self, now: float) -> None:
+        """Go on from the steps relived: ask nodes for the runs, give the orders again."""
+        orders = self.engine.outstanding(self.state)
+        self._queue.extend(self._choose(order) for order in orders if isinstance(order, Choose))
+        self._queue.extend(self.dispatch.adopt(now, orders, self.state))
+        self._work(now)
+
+    def stimulate(self, now: float, *stimuli: Stimulus) -> None:
+        """Take stimuli in, and let their effects leave."""
+        self._queue.extend(stimuli)
+        self._work(now)
+
+    def take(self, now: float, node: str, notices: Iterable[Notice]) -> None:
+        """Take what a node's caller noticed."""
+        for notice in notices:
+            if isinstance(notice, Ended):
+                self._ended(now, node, notice.outcome)
+            elif isinstance(notice, Accepted):
+                self._queue.extend(self.dispatch.accepted(now, notice.id))
+            elif isinstance(notice, EventArrived):
+                self._event(now, node, notice.event)
+            elif isinstance(notice, Progress):
+                self._progress(now, notice)
+            elif isinstance(notice, Answered):
+                self._answered(now, notice.answer)
+            elif isinstance(notice, Late):
+                self._queue.extend(self.dispatch.late(now, notice.outcome))
+            elif isinstance(notice, PeerBack):
+                self.dispatch.back(now, node, notice.boot, notice.runs)
+        self._work(now)
+
+    def advance(self, now: float) -> None:
+        """Fire the timers that are over, start what waited for a fence, sync what has waited for
+        long."""
+        if (
+            self.dispatch.idle and self._unsafe_since is None
+        ):  # asked at each tick of a lock-step cell
+            return
+        due = self.due()
+        if due is None or now < due:
+            return
+        self._queue.extend(self.dispatch.advance(now))
+        self._work(now)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next."""
+        due = self.dispatch.due()
+        if self._unsafe_since is None:
+            return due
+        safe_by = self._unsafe_since + SYNC_WITHIN
+        return safe_by if due is None else min(due, safe_by)
+
+    # --- one stimulus after the other ---------------------------------------------------------
+
+    def _work(self, now: float) -> None:
+        while self._queue:
+            while self._queue:
+                self._handle(now, self._queue.popleft())
+            self._make_safe(now)
+            effects, self._effects = self._effects, []
+            for instruction in effects:
+                self._queue.extend(self.dispatch.carry_out(now, instruction))
+        self._make_safe(now)
+
+    def _make_safe(self, now: float) -> None:
+        """Before effects leave: what moves hardware, or is the end, is synced; everything else
+        survives this process.
+
+        Independent effects of one turn share one sync. What waits is synced within `SYNC_WITHIN`,
+        and acknowledged then.
+        """
+        if self.store.safe:
+            self._unsafe_since = None
+            self._acknowledge()
+            return
+        leaving = [effect for effect in self._effects if isinstance(effect, _LEAVES_THE_PROCESS)]
+        moves = any(
+            self.store.durable or self.dispatch.moves_hardware(effect) for effect in leaving
+        )
+        waited = self._unsafe_since is not None and now >= self._unsafe_since + SYNC_WITHIN
+        if moves or waited or self.finished is not None:
+            self.store.sync()
+            self._unsafe_since = None
+            self._acknowledge()
+        else:
+            self.store.flush()
+            self._unsafe_since = now if self._unsafe_since is None else self._unsafe_since
+
+    def _acknowledge(self) -> None:
+        acks, self._acks = self._acks, []
+        for acknowledge in acks:
+            acknowledge()
+
+    def _handle(self, now: float, stimulus: Stimulus) -> None:
+        for observer in self.observers:
+            observer.stimulus(now, stimulus)
+        self.state, instructions = self.engine.handle(self.state, stimulus)
+        self.store.append(now, stimulus, instructions, self.state)
+        for instruction in instructions:
+            for observer in self.observers:
+                observer.instruction(now, instruction)
+            if isinstance(instruction, Choose):
+                self._queue.appendleft(self._choose(instruction))
+            elif isinstance(instruction, Finished):
+                self.finished = instruction
+            elif self.dispatch.carries_out(instruction):
+                self._effects.append(instruction)
+        for observer in self.observers:
+            observer.settled(now, self.state)
+
+    def _choose(self, choose: Choose) -> Chosen:
+        if choose.subject is Subject.ACTION:
+            fixed = self.state.overrides.get(choose.of)
+            if fixed is not None:
+                return Chosen(choose.key, fixed, "chosen by the operator")
+            offered = (
+                tuple(a for a in choose.alternatives if a in self.directory.actions)
+                or choose.alternatives
+            )
+            return Chosen(
+                choose.key,
+                *self.selector.choose(choose.of, choose.key, offered, self.state.variables),
+            )
+        draw = np.random.default_rng([self.seed, *choose.key.encode()]).random() * sum(
+            choose.weights
+        )
+        bounds = np.cumsum(choose.weights)
+        index = min(int(np.searchsorted(bounds, draw, side="right")), len(bounds) - 1)
+        return Chosen(choose.key, choose.alternatives[index], f"draw {draw:.4f} of {bounds[-1]:g}")
+
+    # --- what nodes say -----------------------------------------------------------------------
+
+    def _ended(self, now: float, node: str, outcome: Outcome) -> None:
+        self._acks.append(lambda: self.callers[node].acknowledge(now, outcome.id))
+        self._queue.extend(self.dispatch.ended(now, outcome))
+
+    def _event(self, now: float, node: str, event: Event) -> None:
+        if event.number:
+            self._acks.append(lambda: self.callers[node].acknowledge_event(now, event))
+        if event.name.startswith(MEMORY_EVENTS):
+            name = event.name.removeprefix(MEMORY_EVENTS)
+            self._queue.append(VariableChanged(name, event.data.get("value"), event.source))
+        elif event.name.startswith(VERDICT_EVENTS):
+            with suppress(ValueError):  # a foreign node's mistake; nobody here could mend it
+                self._queue.append(self.verdict(VerdictSaid.of_data(event.data)))
+        elif event.run:
+            run = self.dispatch.run_of(event.run)
+            if run is not None:
+                self._queue.append(RunRaised(run, event.name))
+        elif event.name in self._external and (
+            event.number or self.engine.awaits(self.state, event.name)
+        ):
+            self._queue.append(EventOccurred(event.name, event.source, event.number))
+
+    def verdict(self, said: VerdictSaid) -> Verdict:
+        """What somebody says of a run, as the engine takes it. One on another mission run's run
+        names none of this one."""
+        return Verdict(
+            said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text
+        )
+
+    def _progress(self, now: float, notice: Progress) -> None:
+        run = self.dispatch.run_of(notice.id)
+        if run is not None:
+            for observer in self.observers:
+                observer.progress(now, run, notice)
+
+    def _answered(self, now: float, answer: Answer) -> None:
+        held = self.dispatch.answered(now, answer)
+        self._queue.extend(held)
+        if not held and self.on_status is not None and "devices" in answer.data:
+            self.on_status(answer.data)

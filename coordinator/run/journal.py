@@ -1,0 +1,277 @@
+"""The journal of a mission run: an append-only file of checksummed records, synced before effects
+leave.
+
+Format 1. The file starts with the eight bytes `MAGIC`. Each record is a little-endian u32 length, a
+u32 CRC-32 of the payload, and the payload, a msgpack array `[number, kind, data]`. Record 0 is the
+header (kind "header"): texts of task file and services.toml, versions, seed. Numbers count up by
+one. A file that ends inside a record, or whose last record fails its checksum, was torn by a crash:
+the tail is dropped and reported (also one of zeros, which a file system may leave after a power
+cut). One that cannot be read with whole records behind it is damage, not a crash, and is refused.
+
+Kinds of a mission run's journal: coordinator/run/recording.py. Why not SQLite:
+docs/decisions/journal.md has the measurement.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from petrobot.services.host.whole_file import make_folder, sync_folder
+
+FORMAT = 1
+MAGIC = b"PETROJ%d\n" % FORMAT
+_FAMILY = re.compile(rb"PETROJ(\d+)\n")
+PREFIX = struct.Struct("<II")
+SMALLEST_RECORD, LARGEST_RECORD = 4, 1 << 25
+"""Bytes of a record's payload. What a node may send in one message must find room in it, with all
+that is kept beside it."""
+_ARRAY_OF_THREE = 0x93
+
+
+class JournalError(Exception):
+    """The journal cannot be read or written: file, place and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One line of a journal."""
+
+    number: int
+    kind: str
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Journal:
+    """A journal read back: its header, its records in order, and how many bytes of a torn tail were
+    dropped."""
+
+    path: Path
+    header: Mapping[str, Any]
+    records: tuple[Record, ...]
+    torn_bytes: int
+    good_bytes: int
+
+
+class JournalWriter:
+    """Appends records; `sync` makes all that was appended durable with one fdatasync (group
+    commit)."""
+
+    def __init__(self, path: Path, header: Mapping[str, Any] | None = None) -> None:
+        """Create a journal with a header, or, without one, go on with an existing file behind its
+        last good record."""
+        self.path = path
+        self._buffer = bytearray()
+        self._unsynced = False
+        """Whether records were handed to the operating system since the last sync."""
+        self._torn: int | None = None
+        """Where the file is to be cut before anything is appended; None: nowhere."""
+        self.syncs = 0
+        if header is not None:
+            try:
+                make_folder(path.parent)
+                self._file = os.open(
+                    path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o600
+                )
+            except FileExistsError as fault:
+                raise JournalError(
+                    f"{path}: exists already; a journal is never overwritten"
+                ) from fault
+            except OSError as fault:
+                text = f"{path}: {fault.strerror}; give --journal a folder that can be written"
+                raise JournalError(text) from fault
+            self._take(path)
+            self._buffer += MAGIC
+            self.next_number = 0
+            self.append("header", {"format": FORMAT, **header})
+            try:
+                self.sync()
+            except JournalError as fault:
+                os.close(self._file)
+                path.unlink(missing_ok=True)  # of a run that has not begun nothing is left
+                with contextlib.suppress(OSError):
+                    path.parent.rmdir()  # if there is nothing else in it
+                raise JournalError(
+                    f"{fault}; give --journal a folder that can be written"
+                ) from fault
+            sync_folder(path.parent)
+        else:
+            self.found = self._go_on(path)
+            self.next_number = len(self.found.records) + 1
+            self._torn = self.found.good_bytes if self.found.torn_bytes else None
+
+    def _go_on(self, path: Path) -> Journal:
+        """Be the writer of an existing journal, and read it as it is from now on; it stays as it is
+        until something is appended."""
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CLOEXEC)
+        except OSError as fault:
+            raise JournalError(
+                f"{path}: {fault.strerror}; it can be gone on with only where it can be written"
+            ) from fault
+        self._take(path)
+        try:
+            return read_journal(path)
+        except BaseException:
+            os.close(self._file)
+            raise
+
+    def _take(self, path: Path) -> None:
+        """Be the only writer for as long as this process lives: a run that goes on cannot be
+        resumed beside itself."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as fault:
+            os.close(self._file)
+            text = (
+                f"{path}: another process writes it: the run goes on; end that process "
+                "first if it hangs"
+            )
+            raise JournalError(text) from fault
+
+    def append(self, kind: str, data: Mapping[str, Any]) -> int:
+        """Add a record to the next sync; gives its number."""
+        number = self.next_number
+        payload = msgpack.packb([number, kind, data], use_bin_type=True)
+        if len(payload) > LARGEST_RECORD:
+            raise JournalError(
+                f"{self.path}: a record of {len(payload)} bytes is larger than {LARGEST_RECORD}"
+            )
+        self._buffer += PREFIX.pack(len(payload), zlib.crc32(payload)) + payload
+        self.next_number += 1
+        return number
+
+    @property
+    def pending(self) -> bool:
+        """Whether records wait for the next sync."""
+        return bool(self._buffer) or self._unsynced
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether records would be lost with this process."""
+        return bool(self._buffer)
+
+    def flush(self) -> None:
+        """Hand what was appended to the operating system: it survives the death of this process,
+        not of the machine."""
+        if not self._buffer:
+            return
+        self._unsynced = True
+        try:
+            if self._torn is not None:
+                os.ftruncate(self._file, self._torn)
+                self._torn = None
+            while (
+                self._buffer
+            ):  # what a full disk has taken of it stays taken: another try goes on behind that
+                del self._buffer[: os.write(self._file, self._buffer)]
+        except OSError as fault:
+            raise JournalError(
+                f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
+            ) from fault
+
+    def sync(self) -> None:
+        """Make all that was appended durable; costs nothing if it is already."""
+        self.flush()
+        if self._unsynced:
+            try:
+                os.fdatasync(self._file)
+            except OSError as fault:
+                raise JournalError(
+                    f"{self.path}: {fault.strerror}; nothing was sent on the strength of it"
+                ) from fault
+            self.syncs += 1
+            self._unsynced = False
+
+    def close(self) -> None:
+        """Sync and close; closed it is in any case."""
+        try:
+            self.sync()
+        finally:
+            os.close(self._file)
+
+
+def read_journal(path: Path) -> Journal:
+    """Read a journal; a torn tail is dropped and counted. Raises JournalError for anything worse,
+    OSError if unreadable."""
+    raw = path.read_bytes()
+    if not raw.startswith(MAGIC):
+        raise JournalError(f"{path}: {_foreign(raw)}")
+    records: list[Record] = []
+    offset = len(MAGIC)
+    while (payload := _payload(raw, offset)) is not None:
+        records.append(_record(path, payload, len(records)))
+        offset += PREFIX.size + len(payload)
+    if (behind := _next_record(raw, offset + 1, len(records))) is not None:
+        text = (
+            f"record {len(records)} at byte {offset} is damaged: record {behind} behind it is whole"
+        )
+        raise JournalError(f"{path}: {text}; restore the file from a copy")
+    if not records:
+        raise JournalError(f"{path}: ends inside its header; the run had not begun")
+    written = records[0].data.get("format", FORMAT)
+    if written != FORMAT:
+        raise JournalError(f"{path}: {_other_format(written)}")
+    return Journal(path, records[0].data, tuple(records[1:]), len(raw) - offset, offset)
+
+
+def _foreign(raw: bytes) -> str:
+    """What a file is that does not begin as a journal of ours does."""
+    known = _FAMILY.match(raw)
+    if known is None:
+        return "no journal of a mission run"
+    return _other_format(int(known[1]))
+
+
+def _other_format(written: object) -> str:
+    remedy = (
+        "a newer petrobot"
+        if isinstance(written, int) and written > FORMAT
+        else "the petrobot that wrote it"
+    )
+    return f"a journal of format {written}, and this petrobot reads format {FORMAT}; use {remedy}"
+
+
+def _payload(raw: bytes, offset: int) -> bytes | None:
+    """The payload of the record that begins there; None if none does that is whole."""
+    if offset + PREFIX.size > len(raw):
+        return None
+    length, checksum = PREFIX.unpack_from(raw, offset)
+    begin = offset + PREFIX.size
+    if not SMALLEST_RECORD <= length <= min(LARGEST_RECORD, len(raw) - begin):
+        return None
+    payload = raw[begin : begin + length]
+    return payload if zlib.crc32(payload) == checksum else None
+
+
+def _next_record(raw: bytes, offset: int, after: int) -> int | None:
+    """Number of the first whole record from there on that comes after record `after`, None if there
+    is none."""
+    for begin in range(offset, len(raw) - PREFIX.size):
+        payload = _payload(raw, begin)
+        if payload is not None and payload[0] == _ARRAY_OF_THREE:
+            number = msgpack.unpackb(payload, raw=False, strict_map_key=False)[0]
+            if number > after:
+                return int(number)
+    return None
+
+
+def _record(path: Path, payload: bytes, expected: int) -> Record:
+    try:
+        number, kind, data = msgpack.unpackb(payload, raw=False, strict_map_key=False)
+    except (ValueError, TypeError) as fault:
+        raise JournalError(f"{path}: record {expected} is no [number, kind, data]") from fault
+    if number != expected:
+        raise JournalError(f"{path}: record {expected} is numbered {number}; a part is missing")
+    return Record(number, kind, data)

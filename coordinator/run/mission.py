@@ -1,0 +1,396 @@
+"""A mission run from beginning to end: prepare the cell, execute the task, ask for the score. A
+machine like its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any
+
+from petrobot.coordinator.engine import Mode, State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Fired,
+    Instruction,
+    Report,
+    RunRecorded,
+    Severity,
+    StartRun,
+)
+from petrobot.coordinator.engine.stimuli import Begin, Point, Stimulus
+from petrobot.coordinator.run.executor import Executor
+from petrobot.coordinator.run.recording import PREPARED, SCORED, Step
+from petrobot.coordinator.task import Status
+from petrobot.coordinator.task.net import Marking
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.notices import Ended, Notice, PeerBack, PeerLost, Progress
+from petrobot.services.comm.calls.verdicts import VerdictSaid
+from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.protocol.messages import Call, Outcome
+
+SERVICE_DEADLINE = 20.0
+TOLD_ERRORS = 6
+"""How many of the last runs that ended in ERROR the result of a mission run tells that ended so
+itself."""
+VERDICTS = "verdicts"
+"""Key of a score under which it judges runs that ended provisionally: {run: {status, cause,
+text}}."""
+
+
+class Stage(Enum):
+    """Where a mission run stands."""
+
+    CONNECTING = "connecting"
+    PREPARING = "preparing"
+    RUNNING = "running"
+    SCORING = "scoring"
+    OVER = "over"
+
+
+class MissionError(Exception):
+    """A mission run could not be prepared or scored: which service said what."""
+
+    def __init__(self, text: str, *, bad_input: bool = False) -> None:
+        super().__init__(text)
+        self.bad_input = bad_input
+
+
+@dataclass(slots=True)
+class Cycle:
+    """One token taken out of the runs place, and what became of the runs that followed."""
+
+    number: int
+    begun: float
+    ended: float | None = None
+    ends: dict[str, tuple[Status, str, str]] = field(default_factory=dict)
+    """By run, in the order in which they ended: status, cause and text."""
+
+    def count(self, run: str, status: Status | None, cause: str, text: str) -> None:
+        """Take a run into account, or the verdict on one that was before."""
+        if status is not None:
+            self.ends[run] = (status, cause, text)
+
+    @property
+    def worst(self) -> tuple[Status, str, str]:
+        """The worst status of its runs; of several that are as bad the first, with its cause and
+        text."""
+        rank = {Status.SUCCESS: 0, Status.FAILURE: 1, Status.ERROR: 2}
+        worst = max(self.ends.values(), key=lambda end: rank[end[0]], default=None)
+        return (Status.SUCCESS, "", "") if worst is None or worst[0] is Status.SUCCESS else worst
+
+    @property
+    def status(self) -> Status:
+        """The worst status of its runs."""
+        return self.worst[0]
+
+    @property
+    def cause(self) -> str:
+        """Why it was that."""
+        return self.worst[1]
+
+    def plain(self, now: float) -> dict[str, Any]:
+        """Plain data; times as ages, since only durations cross the wire (s)."""
+        ended = now if self.ended is None else self.ended
+        ages = {"begun_ago": now - self.begun, "ended_ago": now - ended}
+        status, cause, text = self.worst
+        return {"n": self.number, **ages, "status": status.value, "cause": cause, "text": text}
+
+
+@dataclass
+class Tally:
+    """An observer that counts what the result needs: firings, cycles, runs and reports."""
+
+    runs_place: int | None
+    firings: int = 0
+    cycles: list[Cycle] = field(default_factory=list)
+    runs: list[RunRecorded] = field(default_factory=list)
+    reports: list[Report] = field(default_factory=list)
+    chosen: dict[str, str] = field(default_factory=dict)
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Count."""
+        if isinstance(instruction, Fired):
+            self.firings += 1
+            self._cycle(now, instruction.before, instruction.after)
+        elif isinstance(instruction, RunRecorded):
+            self.runs.append(instruction)
+            if self.cycles:
+                self.cycles[-1].count(
+                    instruction.run, instruction.status, instruction.cause, instruction.text
+                )
+        elif isinstance(instruction, Corrected):
+            self._correct(instruction)
+        elif isinstance(instruction, StartRun):
+            self.chosen[instruction.run] = instruction.action
+        elif isinstance(instruction, Report) and instruction.severity is not Severity.NOTE:
+            self.reports.append(instruction)
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """Nothing to count."""
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Nothing to count."""
+
+    def settled(self, now: float, state: State) -> None:
+        """Nothing to count."""
+
+    def last_errors(self, directory: Directory) -> list[dict[str, Any]]:
+        """The last runs that ended in ERROR, in the order in which they ended: which action, on
+        which node, and why."""
+        failed = [record for record in self.runs if record.status is Status.ERROR][-TOLD_ERRORS:]
+        return [
+            {
+                "run": record.run,
+                "primitive_task": record.primitive_task,
+                "action": record.action,
+                "node": _node_of(record.action, directory),
+                "cause": record.cause,
+                "text": record.text,
+            }
+            for record in failed
+        ]
+
+    def _correct(self, corrected: Corrected) -> None:
+        run, said = corrected.run, (corrected.status, corrected.cause, corrected.text)
+        for n in reversed(range(len(self.runs))):
+            if self.runs[n].run == run:
+                self.runs[n] = replace(
+                    self.runs[n], status=said[0], cause=said[1], text=said[2], deferred=False
+                )
+                break
+        for cycle in reversed(self.cycles):
+            if run in cycle.ends:
+                cycle.count(run, *said)
+                break
+
+    def _cycle(self, now: float, before: Marking, after: Marking) -> None:
+        if self.runs_place is None or after[self.runs_place] >= before[self.runs_place]:
+            return
+        if self.cycles:
+            self.cycles[-1].ended = now
+        self.cycles.append(Cycle(len(self.cycles) + 1, now))
+
+
+def _node_of(action: str, directory: Directory) -> str:
+    """Where an action runs; empty for a run that never came to one."""
+    try:
+        return directory.where(action)
+    except DirectoryError:
+        return ""
+
+
+class Mission:
+    """One mission run over its executor's callers."""
+
+    def __init__(self, executor: Executor, parameters: Mapping[str, Any], runs: int) -> None:
+        self.executor = executor
+        self.parameters = dict(parameters)
+        self.runs = runs
+        self.stage = Stage.CONNECTING
+        self.score: Mapping[str, Any] = {}
+        self.begun = self.ended = 0.0
+        self.point: Point | None = None
+        """Where the task begins, if not at its own beginning (a simulated run alone: no real world
+        stands elsewhere at will)."""
+        self.lost: dict[str, str] = {}
+        """Nodes that are away, with the reason."""
+        self.remarks: dict[str, str] = {}
+        """What else the result tells, from whoever drives the mission run: that the host was too
+        busy for it."""
+        self._early: list[tuple[str, Notice]] = []
+        self._resumed = False
+        """Whether an earlier process may have asked for the preparation or the score."""
+        task = executor.task.flat
+        index = task.net.place_index.get(task.runs_place) if task.runs_place else None
+        self.tally = Tally(index)
+        executor.observers.append(self.tally)
+
+    @property
+    def callers(self) -> Mapping[str, Caller]:
+        """One caller for each node."""
+        return self.executor.callers
+
+    def start(self, now: float) -> None:
+        """The nodes are there: prepare the cell, or begin at once when nothing is to be
+        prepared."""
+        if not self._ask(now, "prepare", self.executor.task.prepare, self._preparation()):
+            self._begin(now)
+        else:
+            self.stage = Stage.PREPARING
+
+    def relive(self, now: float, step: Step) -> None:
+        """Take in a step that another process recorded at `now` (on this process's clock)."""
+        if isinstance(step.stimulus, Begin):
+            self.begun = now
+        self.executor.relive(now, step)
+        if self.executor.finished is not None and not self.ended:
+            self.ended = now
+
+    def resume(self, now: float, stages: Mapping[str, Mapping[str, Any]]) -> None:
+        """Go on behind the last step relived; `stages` are those that the journal says to be
+        over."""
+        self._resumed = True
+        if SCORED in stages:
+            self.score, self.stage = stages[SCORED], Stage.OVER
+        elif self.executor.finished is not None:
+            self._finish(now, self.ended)
+        elif self.executor.state.mode is not Mode.FRESH:
+            self.stage = Stage.RUNNING
+            self.executor.subscribe(now)
+            self.executor.adopt(now)
+            self.advance(now)
+        elif PREPARED in stages:
+            self._begin(now)
+        else:
+            self.start(now)
+        early, self._early = self._early, []
+        for node, notice in early:
+            self.take(now, node, [notice])
+
+    def take(self, now: float, node: str, notices: Sequence[Notice]) -> None:
+        """Take what a node's caller noticed. What comes before every node is there waits: nothing
+        is led by halves."""
+        self._note_links(node, notices)
+        if self.stage is Stage.CONNECTING:
+            self._early.extend(
+                (node, notice) for notice in notices if not isinstance(notice, PeerBack | PeerLost)
+            )
+            notices = [notice for notice in notices if isinstance(notice, PeerBack | PeerLost)]
+        own = [n for n in notices if isinstance(n, Ended) and self._is_own(n.outcome)]
+        for notice in own:
+            self._answered(now, notice.outcome)
+            self.callers[node].acknowledge(now, notice.outcome.id)
+        self.executor.take(now, node, [n for n in notices if n not in own])
+        self.advance(now)
+
+    def advance(self, now: float) -> None:
+        """Do what is due."""
+        if self.stage is Stage.RUNNING:
+            self.executor.advance(now)
+            if self.executor.finished is not None:
+                self._finish(now, now)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next."""
+        return self.executor.due() if self.stage is Stage.RUNNING else None
+
+    def result(self, mode: str, wall_s: float) -> dict[str, Any]:
+        """The result as the command line writes it; the score's own keys stand beside the general
+        ones.
+
+        A mission run that ended in ERROR also has `last_errors`: the actions that ended so, the
+        last one last.
+        """
+        finished = self.executor.finished
+        failed = finished is None or finished.status is Status.ERROR
+        errors = self.tally.last_errors(self.executor.directory) if failed else []
+        general = {
+            "task": self.executor.task.name,
+            "mode": mode,
+            **self.parameters,
+            "seed": self.executor.seed,
+            "runs": self.runs,
+            "status": finished.status.value if finished else Status.ERROR.value,
+            "reason": finished.reason if finished else "not finished",
+            **({"last_errors": errors} if errors else {}),
+            **self.remarks,
+        }
+        durations = {
+            "wall_s": round(wall_s, 3),
+            "sim_s": round(self.ended - self.begun, 6),
+            "firings": self.tally.firings,
+        }
+        return {**general, **self.score, **durations}
+
+    # --- stages -------------------------------------------------------------------------------
+
+    def _preparation(self) -> dict[str, Any]:
+        return {**self.parameters, "seed": self.executor.seed, "runs": self.runs}
+
+    def _begin(self, now: float) -> None:
+        self.stage, self.begun = Stage.RUNNING, now
+        self.executor.subscribe(now)
+        self.executor.stimulate(now, Begin(self.parameters, point=self.point))
+
+    def _finish(self, now: float, ended: float) -> None:
+        self.ended = ended
+        if self.tally.cycles:
+            self.tally.cycles[-1].ended = ended
+        cycles = [cycle.plain(now) | self._provisional(cycle) for cycle in self.tally.cycles]
+        asked = self._ask(now, "score", self.executor.task.score, {"cycles": cycles})
+        self.stage = Stage.SCORING if asked else Stage.OVER
+
+    def _provisional(self, cycle: Cycle) -> dict[str, Any]:
+        """What the score is told of a cycle's runs that are not judged yet; nothing if there are
+        none."""
+        open_, call_id = self.executor.state.deferred, self.executor.dispatch.call_id
+        runs = [
+            {
+                "run": call_id(run),
+                "place": open_[run].place,
+                "action": open_[run].action,
+                "status": open_[run].status.value,
+            }
+            for run in cycle.ends
+            if run in open_
+        ]
+        return {"provisional": runs} if runs else {}
+
+    def _ask(self, now: float, what: str, service: str, arguments: Mapping[str, Any]) -> bool:
+        """Call a service of the task's; False when it names none, or none is placed (a real cell
+        has no referee)."""
+        if not service or service not in self.executor.directory.services:
+            return False
+        caller = self.callers[self.executor.directory.where(service)]
+        identity = f"{self.executor.mission}/{what}"
+        seed = self.executor.seed
+        caller.call(
+            now,
+            Call(identity, service, arguments, SERVICE_DEADLINE, seed=seed, again=self._resumed),
+        )
+        return True
+
+    def _is_own(self, outcome: Outcome) -> bool:
+        return outcome.id in (f"{self.executor.mission}/prepare", f"{self.executor.mission}/score")
+
+    def _answered(self, now: float, outcome: Outcome) -> None:
+        if outcome.status != Status.SUCCESS:
+            what = outcome.id.rpartition("/")[2]
+            raise MissionError(
+                f"{what}: {outcome.text or outcome.cause}",
+                bad_input=outcome.cause == "bad_arguments",
+            )
+        store = self.executor.store
+        if self.stage is Stage.PREPARING:
+            store.stage(PREPARED, {})
+            store.sync()
+            self._begin(now)
+        elif self.stage is Stage.SCORING:
+            score = {key: value for key, value in outcome.values.items() if key != VERDICTS}
+            self.executor.stimulate(
+                now, *map(self.executor.verdict, _verdicts(outcome.values.get(VERDICTS, {})))
+            )
+            store.stage(SCORED, score)
+            store.sync()
+            self.score, self.stage = score, Stage.OVER
+
+    def _note_links(self, node: str, notices: Sequence[Notice]) -> None:
+        for notice in notices:
+            if isinstance(notice, PeerLost):
+                self.lost[node] = notice.reason
+            elif isinstance(notice, PeerBack):
+                self.lost.pop(node, None)
+                self.executor.store.node(node, notice.boot)
+
+
+def _verdicts(said: Any) -> list[VerdictSaid]:
+    """What a score says of runs. Raises MissionError when it is not {run: {status, cause,
+    text}}."""
+    try:
+        return [VerdictSaid.of_data({**verdict, "run": run}) for run, verdict in said.items()]
+    except (AttributeError, TypeError, ValueError) as fault:
+        text = (
+            f"score: {VERDICTS}: {fault}; give {{run: {{status, cause, text}}}} with the runs' ids"
+        )
+        raise MissionError(text) from fault

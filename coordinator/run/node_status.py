@@ -1,0 +1,91 @@
+"""Asks the nodes of services.toml whether they are up, what they offer and how their devices
+are."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from datetime import UTC, datetime
+from typing import Any
+
+from petrobot.coordinator.run.realtime import credentials_of
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.notices import Answered, Notice, PeerLost
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.protocol.messages import Command, Hello
+from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
+
+
+async def ask_all(directory: Directory, timeout: float) -> dict[str, Any]:
+    """What each node answers within `timeout` s: address, whether it is up, what it offers, its
+    status; else why not.
+
+    `status` has the node's `devices`, those that an emergency stop holds in `emergency`, and what
+    is told of its actions without a device in `general`.
+
+    With mutual TLS also when the certificate ends that the node shows.
+    """
+    asked = await asyncio.gather(*(_ask(directory, node, timeout) for node in directory.nodes))
+    return dict(zip(directory.nodes, asked, strict=True))
+
+
+async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any]:
+    entry, name = directory.nodes[node], f"asking-{secrets.token_hex(4)}"
+    caller = Caller(
+        node,
+        Hello(OLDEST_VERSION, NEWEST_VERSION, "client", name, name, 0, directory.hash),
+        auto_ack=True,
+    )
+    told: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+    refused: list[str] = []
+
+    def hear(_: float, notices: list[Notice]) -> None:
+        for notice in notices:
+            if isinstance(notice, Answered) and not told.done():
+                told.set_result(dict(notice.answer.data))
+            elif isinstance(notice, PeerLost):
+                refused.append(notice.reason)
+
+    proves = credentials_of(directory)
+    client = Client(
+        entry.host, entry.port, caller, on_notices=hear, key=proves.key, tls=proves.client()
+    )
+    client.start()
+    answer: dict[str, Any] = {
+        "address": f"{entry.host}:{entry.port}",
+        "up": await client.connected(timeout),
+    }
+    try:
+        if answer["up"]:
+            caller.command(client.now(), Command(f"{name}/status", "status"))
+            client.flush()
+            status = await asyncio.wait_for(told, timeout)
+            if (ends := client.certificate_ends) is not None:
+                answer["certificate_ends"] = datetime.fromtimestamp(ends, UTC).isoformat()
+            answer |= {
+                "offers": list(caller.offers),
+                "boot": caller.boot,
+                "version": NEWEST_VERSION,
+                "status": _status(status, node, directory),
+            }
+        else:
+            answer["why"] = refused[-1] if refused else client.trouble
+    except TimeoutError:
+        answer |= {
+            "up": False,
+            "why": f"it welcomed us, but did not say how it is within {timeout:g} s",
+        }
+    finally:
+        await client.close()
+    return answer
+
+
+def _status(status: dict[str, Any], node: str, directory: Directory) -> dict[str, Any]:
+    """A node's status with devices alone under `devices`: it tells of its actions without one under
+    its own name."""
+    answers, devices = dict(status.get("answers", {})), dict(status.get("devices", {}))
+    general = {}
+    if node not in directory.devices and node in answers:
+        general = {"general": {"answer": answers.pop(node), **devices.pop(node, {})}}
+    return {**status, "answers": answers, "devices": devices, **general}

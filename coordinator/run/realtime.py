@@ -1,0 +1,239 @@
+"""The coordinator on the wall clock: one client for each node, timers on the asyncio loop."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from shlex import quote
+from typing import Final
+
+from petrobot.coordinator.run.journal import JournalError
+from petrobot.coordinator.run.mission import Mission, MissionError, Stage
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.notices import Notice, PeerBack, PeerLost
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.tls.credentials import COORDINATOR, Credentials, credentials
+
+# How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to wake up in time.
+
+PERIOD: Final = 0.05
+"""Seconds between looks."""
+LATE: Final = 0.02
+"""Seconds of delay from which a look counts as late: a period of a set-point stream at 50 Hz."""
+SHARE: Final = 0.01
+"""Share of late looks from which the host counts as too busy for a run in real time,"""
+WORST: Final = 3 * LATE
+"""and a single delay (s) from which it does: so long a gap takes a set point of such a stream out
+of force."""
+
+
+@dataclass
+class Punctuality:
+    """Counts looks that were to happen every `PERIOD` seconds; a machine without clock."""
+
+    looks: int = 0
+    late: int = 0
+    worst: float = 0.0
+    """The longest delay (s)."""
+
+    def look(self, due: float, now: float) -> float:
+        """Take in that the look that was due came now; gives when the next one is due (s)."""
+        self.looks += 1
+        self.late += now - due > LATE
+        self.worst = max(self.worst, now - due)
+        return now + PERIOD
+
+    def remark(self) -> str:
+        """What to say of it: empty if the host was not too busy."""
+        if self.worst < WORST and self.late <= SHARE * self.looks:
+            return ""
+        return (
+            f"too busy for real time: the coordinator woke up more than {1e3 * LATE:g} ms "
+            f"late {self.late} of {self.looks} times, "
+            f"by {1e3 * self.worst:.0f} ms at most; what failed may be due to that"
+        )
+
+
+LINGER = 1.0
+"""Seconds that nothing at the end of a run waits for."""
+LEAVE: Final = 2.5
+"""Seconds after the loss of a node in which it may come back to be told good-bye: a little
+longer than it keeps the leases of one who has gone without a word
+(`services.comm.results.Keeping.lease`)."""
+
+KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
+"""Refusals (docs/protocol.md) of one whose key is not that of the node."""
+
+
+class UnreachableError(Exception):
+    """Nodes that should be there are not; `nodes` names them."""
+
+    def __init__(self, nodes: Sequence[str], text: str) -> None:
+        super().__init__(text)
+        self.nodes = tuple(nodes)
+
+
+class RealtimeMission:
+    """Drives a mission run: what clients notice goes in, what it calls goes out, timers wake it."""
+
+    def __init__(
+        self, mission: Mission, directory: Directory, proves: Credentials | None = None
+    ) -> None:
+        self.mission = mission
+        self._loop = asyncio.get_running_loop()
+        self._over = asyncio.Event()
+        self._closed = False
+        self._fault: BaseException | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._lost_at: dict[str, float] = {}
+        self._punctuality = Punctuality()
+        self._looking: asyncio.TimerHandle | None = None
+        key, tls = (proves.key, proves.client()) if proves is not None else (None, None)
+        self.clients: Mapping[str, Client] = {
+            name: Client(
+                node.host,
+                node.port,
+                mission.callers[name],
+                on_notices=self._hear(name),
+                key=key,
+                tls=tls,
+            )
+            for name, node in directory.nodes.items()
+        }
+
+    async def connect(self, timeout: float = 5.0) -> None:
+        """Reach every node. Raises UnreachableError that names those that are not there."""
+        for client in self.clients.values():
+            client.start()
+        reached = await asyncio.gather(
+            *(client.connected(timeout) for client in self.clients.values())
+        )
+        missing = [name for name, up in zip(self.clients, reached, strict=True) if not up]
+        if missing:
+            raise UnreachableError(missing, "; ".join(self._missed(missing)))
+
+    def _missed(self, missing: Sequence[str]) -> Iterator[str]:
+        """Why nodes are not reached and what to do: those that run and refuse us need something
+        else than to be launched."""
+        source = quote(os.path.normpath(self.mission.executor.directory.source))
+        refusing = [name for name in missing if self.clients[name].answered]
+        if away := [name for name in missing if name not in refusing]:
+            yield (
+                f"no answer from {', '.join(map(self._tried, away))}; launch them with "
+                f"`petrobot up --services {source}`"
+            )
+        if refusing:
+            keys = any(
+                code in self.clients[name].trouble for name in refusing for code in KEY_CODES
+            )
+            remedy = (
+                f"; give both sides the same key file: that which keys.file of {source} names"
+                if keys
+                else ""
+            )
+            yield f"not let in by {', '.join(map(self._tried, refusing))}{remedy}"
+
+    def _tried(self, node: str) -> str:
+        client = self.clients[node]
+        return f"{node} at {client.host}:{client.port}" + (
+            f" ({client.trouble})" if client.trouble else ""
+        )
+
+    async def run(self, begin: Callable[[float], None] | None = None) -> None:
+        """Run the mission to its end, from its start or from whatever `begin(now)` makes of it.
+
+        Raises MissionError, and JournalError when the journal cannot be written.
+        """
+        (begin or self.mission.start)(self._loop.time())
+        self.settle()
+        self._look_again(self._loop.time() + PERIOD)
+        await self._over.wait()
+        if remark := self._punctuality.remark():
+            self.mission.remarks["host"] = remark
+        if self._fault is not None:
+            raise self._fault
+
+    async def close(self) -> None:
+        """Leave the nodes in good order: each hears what was not acknowledged yet and a good-bye,
+        which frees its devices for the next run at once. One that was just lost is waited for as
+        long as it would keep them for this one."""
+        self._closed = True
+        for timer in (self._timer, self._looking):
+            if timer is not None:
+                timer.cancel()
+        await asyncio.gather(*(self._leave(name, client) for name, client in self.clients.items()))
+
+    async def _leave(self, name: str, client: Client) -> None:
+        if (lost := self._lost_at.get(name)) is not None:
+            await client.connected(max(0.0, lost + LEAVE - self._loop.time()))
+        client.flush(self._loop.time() + LINGER)  # acknowledgements that wait for others go now
+        await client.close()
+
+    def now(self) -> float:
+        """The mission's clock (s)."""
+        return self._loop.time()
+
+    def flush(self, node: str) -> None:
+        """Send what was said to a node."""
+        self.clients[node].flush(self.now())
+
+    def fail(self, fault: BaseException) -> None:
+        """End with this fault; nothing more leaves."""
+        self._fault = self._fault or fault
+        self._over.set()
+
+    def settle(self) -> None:
+        """Send what was said, and wake up in time for what is due next; call it after each use of
+        the mission."""
+        if self._closed:
+            return
+        for client in self.clients.values():
+            client.flush()
+        if self.mission.stage is Stage.OVER:
+            self._over.set()
+            return
+        due = self.mission.due()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None if due is None else self._loop.call_at(due, self._wake)
+
+    def _look_again(self, due: float) -> None:
+        """See how late the loop comes to what is due: if it is, so are the other processes of this
+        host."""
+
+        def look() -> None:
+            self._look_again(self._punctuality.look(due, self._loop.time()))
+
+        self._looking = self._loop.call_at(due, look)
+
+    def _wake(self) -> None:
+        self._guarded(lambda now: self.mission.advance(now))
+
+    def _hear(self, node: str) -> Callable[[float, list[Notice]], None]:
+        def hear(_: float, notices: list[Notice]) -> None:
+            for notice in notices:
+                if isinstance(notice, PeerLost):
+                    self._lost_at[node] = self._loop.time()
+                elif isinstance(notice, PeerBack):
+                    self._lost_at.pop(node, None)
+            if not self._closed:
+                self._guarded(lambda now: self.mission.take(now, node, notices))
+
+        return hear
+
+    def _guarded(self, step: Callable[[float], None]) -> None:
+        try:
+            step(self._loop.time())
+        except (MissionError, JournalError) as fault:
+            # What is not safe has not left: the nodes end its runs as orphans, and `resume` goes on
+            # from what is.
+            self.fail(fault)
+            return
+        self._loop.call_soon(self.settle)
+
+
+def credentials_of(directory: Directory) -> Credentials:
+    """What the coordinator proves itself with, as services.toml says. Raises KeyFileError."""
+    return credentials(directory, COORDINATOR)

@@ -1,0 +1,242 @@
+"""Mission runs in the journal: what is written of each stimulus, and how a run is derived from it
+again.
+
+Kinds of records behind the header: `stimulus` (seconds since the origin, the stimulus, the marking
+after it, a digest of the instructions), `node` (which boot of a node is spoken to from here on),
+`stage` (the mission run was prepared, or scored, with what that gave), `epoch` (a coordinator took
+the run over).
+"""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgpack
+
+from petrobot.coordinator.engine import (
+    Engine,
+    Instruction,
+    State,
+    Stimulus,
+    stimulus_from_plain,
+    to_plain,
+)
+from petrobot.coordinator.engine.step import RECORDED
+from petrobot.coordinator.run.folder import TIMELESS
+from petrobot.coordinator.run.journal import Journal, JournalError, JournalWriter
+
+STIMULUS = "stimulus"
+NODE = "node"
+EPOCH = "epoch"
+STAGE = "stage"
+PREPARED, SCORED = "prepared", "scored"
+
+
+def digest(instructions: Sequence[Instruction]) -> int:
+    """CRC-32 of the instructions as plain data: replay compares it."""
+    packed: bytes = msgpack.packb(
+        [to_plain(instruction) for instruction in instructions], use_bin_type=True
+    )
+    return zlib.crc32(packed)
+
+
+class JournalStore:
+    """The executor's store over a journal: each stimulus with the marking and a digest of the
+    instructions that followed."""
+
+    def __init__(self, writer: JournalWriter, origin: float, *, durable: bool = False) -> None:
+        """`origin` is when the journal's clock began, on the clock of whoever appends; with
+        `durable` no effect at all leaves before its cause is synced."""
+        self.writer = writer
+        self.durable = durable
+        self._origin = origin
+
+    def append(
+        self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
+    ) -> None:
+        """Keep a stimulus and what came of it with the next sync; `t` is seconds since the
+        journal's origin."""
+        data = {
+            "t": round(now - self._origin, 6),
+            "stimulus": to_plain(stimulus),
+            "marking": list(state.marking),
+            "instructions": digest(instructions),
+        }
+        self._write(STIMULUS, data)
+
+    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+        self.writer.append(kind, data)
+
+    def node(self, name: str, boot: str) -> None:
+        """Keep which boot of a node was spoken to: after a resume another boot is never asked to
+        run a call again."""
+        self._write(NODE, {"node": name, "boot": boot})
+
+    def stage(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep that the mission run has come to a stage of its own: what follows it does not happen
+        again after a resume."""
+        self._write(STAGE, {"stage": name, "values": dict(values)})
+
+    def flush(self) -> None:
+        """What was appended survives the end of this process."""
+        self.writer.flush()
+
+    def sync(self) -> None:
+        """Make all that was appended durable."""
+        self.writer.sync()
+
+    @property
+    def safe(self) -> bool:
+        """Whether nothing waits for a sync."""
+        return not self.writer.pending
+
+
+class ReplayError(Exception):
+    """What the engine does now differs from what the journal says it did: number of the record, and
+    both."""
+
+
+class RetracingStore(JournalStore):
+    """The store of a lock-step run that is made again from its beginning: the same seed gives the
+    same run, so what the journal holds already is compared, and what comes after it is written.
+    Raises ReplayError at the first difference.
+    """
+
+    def __init__(self, writer: JournalWriter, journal: Journal) -> None:
+        super().__init__(writer, 0.0)
+        self._path = journal.path
+        self._expected = deque(record for record in journal.records if record.kind != EPOCH)
+
+    def _write(self, kind: str, data: Mapping[str, Any]) -> None:
+        if not self._expected:
+            super()._write(kind, data)
+            return
+        then = self._expected.popleft()
+        if (then.kind, _unmeasured(then.data)) != (kind, _unmeasured(data)):
+            raise ReplayError(
+                f"{self._path}: record {then.number} was {then.kind} {then.data}, is {kind} "
+                f"{data} now: sources or files have "
+                "changed since; run it anew"
+            )
+
+
+def _unmeasured(data: Mapping[str, Any]) -> Any:
+    """A record without what differs between two equal runs: measured times, and a score's own
+    words."""
+    plain = msgpack.unpackb(
+        msgpack.packb(dict(data), use_bin_type=True), raw=False, strict_map_key=False
+    )
+    plain.pop("values", None)
+    if isinstance(plain.get("stimulus"), dict):
+        plain["stimulus"].pop("cpu_seconds", None)
+    return plain
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One stimulus derived again."""
+
+    number: int
+    time: float
+    stimulus: Stimulus
+    instructions: tuple[Instruction, ...]
+    state: State
+    boots: Mapping[str, str]
+    """The boot of each node that was spoken to then."""
+
+
+def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
+    """The engine with the policy under which a journal was recorded: what it did then it does
+    again."""
+    return engine if TIMELESS in header else Engine(engine.task, engine.compiled.devices, RECORDED)
+
+
+def replay(journal: Journal, engine: Engine) -> Iterator[Step]:
+    """Derive every state and instruction of a journal again. Raises ReplayError at the first
+    difference."""
+    engine = as_recorded(engine, journal.header)
+    state, boots = engine.initial(), dict[str, str]()
+    for record in journal.records:
+        if record.kind == NODE:
+            boots = {**boots, record.data["node"]: record.data["boot"]}
+        if record.kind != STIMULUS:
+            continue
+        try:
+            stimulus = stimulus_from_plain(record.data["stimulus"])
+        except (KeyError, ValueError) as fault:
+            raise JournalError(
+                f"{journal.path}: record {record.number} holds no stimulus: {fault}"
+            ) from fault
+        state, instructions = engine.handle(state, stimulus)
+        _compare(journal.path, record.number, record.data, engine, state, instructions)
+        yield Step(record.number, record.data["t"], stimulus, instructions, state, boots)
+
+
+def _compare(
+    path: Path,
+    number: int,
+    data: Mapping[str, Any],
+    engine: Engine,
+    state: State,
+    instructions: Sequence[Instruction],
+) -> None:
+    written = tuple(data["marking"])
+    where = f"{path}: record {number} ({data['stimulus'].get('kind')})"
+    if written != state.marking:
+        net = engine.compiled.net
+        raise ReplayError(
+            f"{where}: marking was {net.describe(written)}, is now {net.describe(state.marking)}"
+        )
+    if data["instructions"] != digest(instructions):
+        now = "; ".join(f"{type(i).__name__} {to_plain(i)}" for i in instructions) or "none"
+        raise ReplayError(
+            f"{where}: the instructions differ from those of then; now they are: {now}"
+        )
+
+
+def stages(journal: Journal) -> dict[str, Mapping[str, Any]]:
+    """The stages that the mission run has come to, with their values."""
+    return {r.data["stage"]: r.data["values"] for r in journal.records if r.kind == STAGE}
+
+
+def last_epoch(journal: Journal) -> int:
+    """The newest epoch in which the run was coordinated."""
+    return max([1, *(int(r.data["epoch"]) for r in journal.records if r.kind == EPOCH)])
+
+
+def clock_reading(now: float) -> dict[str, Any]:
+    """What a header keeps of the moment at which its journal's clock begins, so that another
+    process can count on from it.
+
+    `monotonic` (s) holds for all processes of one boot of the host, `unix` (s) for longer, as well
+    as the host's clock is set.
+    """
+    return {"monotonic": now, "host_boot": _host_boot(), "unix": time.time()}
+
+
+def origin_of(header: Mapping[str, Any], now: float, last: float) -> float:
+    """When a journal's clock began (s), on this process's clock, which reads `now`; its last record
+    is of the time `last`.
+
+    In lock step the clock of simulated time is every process's own. In real time what passed while
+    nobody coordinated counts.
+    """
+    if header["mode"] == "lockstep":
+        return 0.0
+    clock = header.get("clock")
+    if not clock:
+        return now - last
+    if clock["host_boot"] == _host_boot() and clock["monotonic"] <= now:
+        return float(clock["monotonic"])
+    return now - max(0.0, time.time() - float(clock["unix"]))
+
+
+def _host_boot() -> str:
+    path = Path("/proc/sys/kernel/random/boot_id")
+    return path.read_text(encoding="ascii").strip() if path.exists() else ""

@@ -1,0 +1,256 @@
+"""Launches the node processes of this host, watches them, and starts dead ones again with a growing
+pause."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import functools
+import os
+import signal
+import socket
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, BinaryIO
+
+from petrobot.services.host.whole_file import make_folder
+
+PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
+FIRST_PAUSE = 0.25
+LONGEST_PAUSE = 8.0
+# for the rest of what an ended program has said (s); what it has left running may never stop
+# talking
+LAST_WORDS = 0.5
+STABLE_AFTER = 10.0  # a node that ran so long (s) starts again without pause
+
+
+class LaunchError(Exception):
+    """A node did not come up: which, and what it printed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """One process to keep alive: its name and command line."""
+
+    name: str
+    command: Sequence[str]
+    first: bool = False
+    """Others need it: they are started when it is ready."""
+
+
+@dataclass
+class _Child:
+    program: Program
+    log: Path
+    ready: asyncio.Event = field(default_factory=asyncio.Event)
+    process: asyncio.subprocess.Process | None = None
+    begun_at: int = 0
+    """Where the newest start begins in the log (bytes)."""
+    starts: int = 0
+    log_fault: OSError | None = None
+    """Why its log could not be written before it was ready."""
+    task: asyncio.Task[None] | None = None
+
+
+def is_local(host: str) -> bool:
+    """Whether an address belongs to this host: only then can a socket be bound to it."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except OSError:
+        return False
+    return True
+
+
+_LIBC = ctypes.CDLL(None)
+
+
+def _end_with(launcher: int) -> None:
+    """In the child, before it becomes the program: a launcher that ended meanwhile would send no
+    signal any more."""
+    _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != launcher:
+        os._exit(0)
+
+
+class Supervisor:
+    """Keeps programs alive. Each writes to its own log and says `ready` in the first line that it
+    prints."""
+
+    def __init__(
+        self,
+        programs: Sequence[Program],
+        logs: Path,
+        *,
+        respawn: bool = True,
+        notice: Callable[[str], None] | None = None,
+    ) -> None:
+        make_folder(logs)
+        self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
+        self._respawn = respawn
+        self._notice = notice or (lambda _: None)
+        self._stopping = False
+        self._over = asyncio.Event()
+
+    async def __aenter__(self) -> Supervisor:
+        """Start all programs; raises LaunchError when one does not get ready within 60 s."""
+        try:
+            await self.start()
+        except BaseException:
+            await self.stop()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Stop them all."""
+        await self.stop()
+
+    async def start(self, timeout: float = 60.0) -> None:
+        """Start all programs and wait until each is ready."""
+        for first in (True, False):
+            group = [child for child in self._children if child.program.first is first]
+            for child in group:
+                child.task = asyncio.create_task(
+                    self._keep(child), name=f"keep {child.program.name}"
+                )
+            for child in group:
+                await self._until_ready(child, timeout)
+
+    async def stop(self) -> None:
+        """Ask all to end, and kill those that do not within 5 s."""
+        self._stopping = True
+        self._over.set()
+        for child in self._children:
+            _signal(child, signal.SIGTERM)
+        waiting = [child.task for child in self._children if child.task]
+        if not waiting:
+            return
+        _, late = await asyncio.wait(waiting, timeout=5.0)
+        for child in self._children:
+            if child.task in late:
+                _signal(child, signal.SIGKILL)
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+    async def ended(self) -> None:
+        """Wait until all programs have ended for good."""
+        await asyncio.wait([child.task for child in self._children if child.task])
+
+    def process_ids(self) -> dict[str, int]:
+        """Process id of each running program by name."""
+        return {
+            c.program.name: c.process.pid
+            for c in self._children
+            if c.process and c.process.returncode is None
+        }
+
+    def starts(self, name: str) -> int:
+        """How often a program has been started."""
+        return next(c.starts for c in self._children if c.program.name == name)
+
+    async def _until_ready(self, child: _Child, timeout: float) -> None:
+        ready = asyncio.create_task(child.ready.wait())
+        assert child.task is not None
+        done, _ = await asyncio.wait(
+            {ready, child.task}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED
+        )
+        if ready in done:
+            return
+        ready.cancel()
+        if child.task in done and isinstance(fault := child.task.exception(), OSError):
+            raise fault
+        said = child.log.read_bytes()[child.begun_at :] if child.log.exists() else b""
+        tail = "\n".join(said.decode(errors="replace").splitlines()[-12:])
+        why = "ended" if child.task in done else f"was not ready after {timeout:g} s"
+        raise LaunchError(
+            f"node {child.program.name} {why}; its log {child.log} ends with:\n{tail}"
+        )
+
+    async def _keep(self, child: _Child) -> None:
+        loop, pause = asyncio.get_running_loop(), FIRST_PAUSE
+        while not self._stopping:
+            started = loop.time()
+            await self._run_once(child)
+            if self._stopping or not self._respawn or not child.ready.is_set():
+                return
+            pause = (
+                FIRST_PAUSE
+                if loop.time() - started > STABLE_AFTER
+                else min(2 * pause, LONGEST_PAUSE)
+            )
+            self._notice(f"node {child.program.name} died; starting it again in {pause:g} s")
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._over.wait()
+
+    async def _run_once(self, child: _Child) -> None:
+        with child.log.open("ab", buffering=0) as log:
+            child.begun_at = log.seek(0, os.SEEK_END)
+            async with output_pipe() as (end, output):
+                process = await asyncio.create_subprocess_exec(
+                    *child.program.command,
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=end,
+                    stderr=log,
+                    preexec_fn=functools.partial(_end_with, os.getpid()),
+                )
+                end.close()
+                child.process, child.starts = process, child.starts + 1
+                if self._stopping:
+                    _signal(child, signal.SIGTERM)
+                copying = asyncio.create_task(_copy(child, output, log))
+                await process.wait()
+                await asyncio.wait({copying}, timeout=LAST_WORDS)
+                copying.cancel()
+                fault = child.log_fault
+                if fault is not None and not child.ready.is_set():
+                    raise fault
+
+
+@asynccontextmanager
+async def output_pipe(limit: int = 1 << 16) -> AsyncIterator[tuple[BinaryIO, asyncio.StreamReader]]:
+    """A pipe for the output of a child: the end to pass to it, to be closed once it is started, and
+    what comes out.
+
+    A pipe of asyncio's own (`stdout=PIPE`) would be part of the process: `wait` would then wait for
+    the end of the pipe, which whatever the child has left running may hold open for ever.
+    """
+    reading, writing = os.pipe()
+    reader = asyncio.StreamReader(limit)
+    connected = asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), os.fdopen(reading, "rb", 0)
+    )
+    transport, _ = await connected
+    with os.fdopen(writing, "wb", 0) as end:
+        try:
+            yield end, reader
+        finally:
+            transport.close()
+
+
+async def _copy(child: _Child, output: asyncio.StreamReader, log: IO[bytes]) -> None:
+    """Write what a program prints to its log. It is ready when it says so.
+
+    A program is ended if its log cannot be written before it is ready; later it matters more than
+    its log.
+    """
+    async for line in output:
+        try:
+            log.write(line)
+        except OSError as fault:
+            if not child.ready.is_set():
+                child.log_fault = child.log_fault or OSError(
+                    fault.errno, fault.strerror, str(child.log)
+                )
+                _signal(child, signal.SIGTERM)
+        if b"ready" in line and child.log_fault is None:
+            child.ready.set()
+
+
+def _signal(child: _Child, number: signal.Signals) -> None:
+    if child.process and child.process.returncode is None:
+        with contextlib.suppress(ProcessLookupError):
+            child.process.send_signal(number)

@@ -1,0 +1,106 @@
+"""An observer that keeps when each run and firing happened, for reports and pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from petrobot.coordinator.engine import State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Fired,
+    Instruction,
+    Report,
+    RunRecorded,
+    StartRun,
+)
+from petrobot.coordinator.engine.stimuli import Stimulus
+from petrobot.coordinator.task import Status
+from petrobot.services.comm.calls.notices import Progress
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A run on the time axis (s since the mission began)."""
+
+    run: str
+    place: str
+    action: str
+    begun: float
+    ended: float | None = None
+    status: Status | None = None
+    """None while it goes on, and for a run that was preempted and counts none."""
+    cause: str = ""
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Firing:
+    """A transition that fired at a time (s since the mission began)."""
+
+    time: float
+    number: int
+    transition: str
+    cause: str
+    marking: tuple[int, ...]
+
+
+@dataclass
+class Timeline:
+    """All runs and firings of a mission run, in order."""
+
+    bars: dict[str, Bar] = field(default_factory=dict)
+    firings: list[Firing] = field(default_factory=list)
+    reports: list[tuple[float, Report]] = field(default_factory=list)
+    origin: float | None = None
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Keep starts, ends and firings."""
+        time = self._since(now)
+        if isinstance(instruction, StartRun):
+            self.bars[instruction.run] = Bar(
+                instruction.run, instruction.place, instruction.action, time
+            )
+        elif isinstance(instruction, RunRecorded):
+            bar = self.bars.get(
+                instruction.run, Bar(instruction.run, instruction.place, instruction.action, time)
+            )
+            self.bars[instruction.run] = replace(
+                bar,
+                ended=time,
+                status=instruction.status,
+                cause=instruction.cause,
+                text=instruction.text,
+            )
+        elif isinstance(instruction, Corrected) and instruction.run in self.bars:
+            judged = (instruction.status, instruction.cause, instruction.text)
+            bar = self.bars[instruction.run]
+            self.bars[instruction.run] = replace(
+                bar, status=judged[0], cause=judged[1], text=judged[2] or bar.text
+            )
+        elif isinstance(instruction, Fired):
+            self.firings.append(
+                Firing(
+                    time,
+                    instruction.number,
+                    instruction.transition,
+                    instruction.cause,
+                    instruction.after,
+                )
+            )
+        elif isinstance(instruction, Report):
+            self.reports.append((time, instruction))
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """The first stimulus begins the time axis."""
+        self._since(now)
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Progress is not kept."""
+
+    def settled(self, now: float, state: State) -> None:
+        """States are not kept."""
+
+    def _since(self, now: float) -> float:
+        if self.origin is None:
+            self.origin = now
+        return now - self.origin

@@ -1,0 +1,1 @@
+"""Studies of many runs: campaigns, forecasts made from them, and reports."""

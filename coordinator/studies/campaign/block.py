@@ -1,0 +1,216 @@
+"""One block of a campaign: a mission run in a lock-step cell of its own, from plain data to plain
+data."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.engine.instructions import RunRecorded
+from petrobot.coordinator.launch import (
+    SCRIPTED,
+    Setting,
+    load_object,
+    lockstep_mission,
+    lockstep_party,
+)
+from petrobot.coordinator.learning.estimate import COUNT
+from petrobot.coordinator.run.lockstep import CoordinatorParty
+from petrobot.coordinator.run.mission import Mission, MissionError
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan, digest
+from petrobot.coordinator.studies.campaign.trials import CostOf, ThrowLog
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file import TaskFileError
+from petrobot.coordinator.task.file import load as load_task
+from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.location_file import load as load_directory
+from petrobot.services.comm.lockstep.cell import Cell, CellError, Delays
+from petrobot.services.comm.lockstep.party import TICK, Party
+
+Weights = Mapping[str, Mapping[str, float]]
+"""By primitive task: the probability of each action."""
+LONGEST_THROW = 3600.0
+"""Simulated seconds after which a throw counts as one that never ends."""
+PLOTS = "plots"
+"""Key of a score under which a task declares pictures of its own (docs/campaigns.md)."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Everything that the blocks of one plan share: read once in each process."""
+
+    plan: Plan
+    task: Task
+    directory: Directory
+
+    @classmethod
+    def of(cls, plan: Plan) -> Bench:
+        """Read the plan's files. Raises CampaignError, also when they are not those that the
+        campaign began with."""
+        for key, said in plan.digests.items():
+            path = str(getattr(plan, key))
+            if path and digest(path) != said:
+                raise CampaignError(
+                    f"{path} has changed since the campaign began; start it anew in another folder"
+                )
+        try:
+            return cls(plan, load_task(Path(plan.task)), load_directory(Path(plan.services)))
+        except (OSError, TaskFileError, DirectoryError) as fault:
+            raise CampaignError(str(fault)) from fault
+
+
+class BlockSelector:
+    """Draws each choice from probabilities that were fixed before the block, keyed by mission seed,
+    throw and occurrence."""
+
+    def __init__(self, seed: int, weights: Sequence[Weights]) -> None:
+        self._seed, self._weights = seed, weights
+        self._counts: dict[tuple[int, str], int] = {}
+        self.throw: Callable[[], int] = lambda: 0
+        """Index of the throw that goes on, from 0."""
+
+    def choose(
+        self,
+        task: str,
+        run: str,
+        alternatives: tuple[str, ...],
+        variables: Mapping[str, Any] | None = None,
+    ) -> tuple[str, str]:
+        """One alternative and why."""
+        k = max(0, min(self.throw(), len(self._weights) - 1))
+        given = self._weights[k].get(task, {}) if self._weights else {}
+        offered = [
+            (action, given[action]) for action in alternatives if given.get(action, 0.0) > 0.0
+        ]
+        if not offered:
+            return alternatives[0], "first of the task file"
+        occurrence = self._counts[k, task] = self._counts.get((k, task), -1) + 1
+        if len(offered) == 1:
+            return offered[0][0], "fixed by the campaign"
+        key = [self._seed, k, occurrence, *task.encode()]
+        bounds = np.cumsum([p for _, p in offered])
+        draw = np.random.default_rng(key).random() * bounds[-1]
+        index = min(int(np.searchsorted(bounds, draw, side="right")), len(offered) - 1)
+        return offered[index][0], f"drawn with probability {offered[index][1] / bounds[-1]:.3f}"
+
+
+def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
+    """Run a block. `weights`: for each of its throws, the probabilities of each primitive task's
+    actions.
+
+    Gives `throws` (see Throw.to_plain), `score` (one map for each throw), `plots`, `mission_s`,
+    `cpu_s`, `wall_s`, `rss_mb`. Raises CampaignError.
+    """
+    cpu, wall = time.process_time(), time.perf_counter()
+    selector = BlockSelector(block.seed, weights)
+    mission, parties = _cell(bench, block, selector)
+    log = ThrowLog(bench.task, costs(bench.task, bench.directory))
+    mission.executor.observers.append(log)
+    selector.throw = lambda: len(log.throws) - 1
+    coordinator = CoordinatorParty(bench.directory, mission)
+    try:
+        cell = Cell([coordinator, *parties], Delays(bench.directory.delays()))
+        limit = round(LONGEST_THROW * block.count / TICK)
+        if not cell.run(lambda: coordinator.over, limit):
+            raise CampaignError(
+                f"seed {block.seed}: not over after {limit * TICK:.0f} s of simulated time"
+            )
+    except (CellError, MissionError) as fault:
+        raise CampaignError(
+            f"seed {block.seed}, regime {block.regime or 'of the task file'}: {fault}"
+        ) from fault
+    finally:
+        for party in parties:
+            close = getattr(party, "close", None)
+            if close is not None:
+                close()
+    return {
+        "index": block.index,
+        "throws": [throw.to_plain() for throw in log.throws],
+        "score": scores(mission.score, block.count),
+        PLOTS: dict(mission.score.get(PLOTS, {})),
+        "mission_s": round(mission.ended - mission.begun, 6),
+        "cpu_s": round(time.process_time() - cpu, 4),
+        "wall_s": round(time.perf_counter() - wall, 4),
+        "rss_mb": resident_mb(),
+    }
+
+
+def resident_mb() -> float:
+    """Memory that this process holds now (MiB); 0 where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0.0
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
+
+
+def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission, list[Party]]:
+    plan, directory = bench.plan, bench.directory
+    regime = {"regime": block.regime} if block.regime else {}
+    setting = Setting(bench.task, {**plan.parameters, **regime}, block.count, block.seed, selector)
+    substitutes = load_object(SCRIPTED)(plan.mock) if plan.mock else None
+    try:
+        parties = [
+            lockstep_party(directory, node, substitutes) for node in directory.nodes.values()
+        ]
+    except (DirectoryError, ImportError, ValueError, OSError) as fault:
+        raise CampaignError(f"{plan.services}: {fault}") from fault
+    return lockstep_mission(directory, setting), parties
+
+
+def costs(task: Task, directory: Directory) -> CostOf:
+    """The declared cost measure of each primitive task. In lock step computing costs what
+    services.toml declares."""
+
+    def cost(record: RunRecorded, values: Mapping[str, Any]) -> float | None:
+        measure = task.primitive_tasks[record.primitive_task].cost
+        if measure == "wall":
+            return record.seconds
+        if measure == "cpu":
+            entry = directory.actions.get(record.action)
+            return None if entry is None else entry.compute_time
+        value = values.get(COUNT, 1) if measure == COUNT else values.get(measure.partition(":")[2])
+        return float(value) if isinstance(value, bool | int | float) else None
+
+    return cost
+
+
+def scores(score: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
+    """The task's own results for each throw, as `table.column` by the score's lists of rows.
+
+    A row belongs to the throw that its `run` says (its `n` if it has none). If no list has such
+    rows and there is only one throw, the plain values of the score are its results, as
+    `score.name`.
+    """
+    out: list[dict[str, Any]] = [{} for _ in range(count)]
+    tables = {name: rows for name, rows in score.items() if _is_table(rows)}
+    for name, rows in tables.items():
+        for row in rows:
+            k = row["run"] if "run" in row else row.get("n")
+            if isinstance(k, int) and 1 <= k <= count and f"{name}.n" not in out[k - 1]:
+                out[k - 1] |= {
+                    f"{name}.{key}": value for key, value in row.items() if key != "run"
+                } | {f"{name}.n": row.get("n")}
+    if not tables and count == 1:
+        out[0] = {
+            f"score.{k}": v
+            for k, v in score.items()
+            if isinstance(v, bool | int | float | str | None)
+        }
+    return out
+
+
+def _is_table(rows: Any) -> bool:
+    return (
+        isinstance(rows, Sequence)
+        and bool(rows)
+        and not isinstance(rows, str | bytes)
+        and all(isinstance(row, Mapping) and ("run" in row or "n" in row) for row in rows)
+    )

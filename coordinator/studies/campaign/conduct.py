@@ -1,0 +1,195 @@
+"""Conducts a campaign: blocks out to a pool of workers, rows into the table in order, what is
+learned batch by batch."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+from petrobot.coordinator.studies.campaign.block import PLOTS, Bench
+from petrobot.coordinator.studies.campaign.observed import write_estimates
+from petrobot.coordinator.studies.campaign.plan import (
+    MANIFEST,
+    TABLE,
+    Block,
+    CampaignError,
+    Plan,
+    differences,
+    identity,
+    read_manifest,
+    write_manifest,
+)
+from petrobot.coordinator.studies.campaign.policies import Policy, policy_of
+from petrobot.coordinator.studies.campaign.rows import Row, rows_of
+from petrobot.coordinator.studies.campaign.summary import Summary, result_of
+from petrobot.coordinator.studies.campaign.table import Table, note_block, note_sessions, sessions
+from petrobot.services.host.json_text import json_text
+from petrobot.services.host.whole_file import make_folder, write_whole
+
+AHEAD = 3
+"""Blocks handed out beyond those that the workers are busy with, so that none waits while a slow
+one is awaited."""
+
+
+class Pool(Protocol):
+    """Whoever does blocks."""
+
+    count: int
+    lost: int
+
+    async def run(self, order: Mapping[str, Any]) -> dict[str, Any]:
+        """Do a block; the result of `run_block`. Raises CampaignError."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a campaign is."""
+
+    done: int
+    """Throws in the table."""
+    of: int
+    already: int
+    """Throws that had been done before this session."""
+    goals: int
+    seconds: float
+    """Since this session began (wall clock)."""
+
+
+Watch = Callable[[Progress], None]
+
+
+def open_folder(folder: Path, plan: Plan) -> None:
+    """Make the folder of a campaign, or see that what it holds is the same campaign. Raises
+    CampaignError."""
+    try:
+        make_folder(folder)
+    except OSError as fault:
+        raise CampaignError(
+            f"{folder}: {fault.strerror or fault}; give --out a folder that can be written"
+        ) from fault
+    if (folder / TABLE).exists() or (folder / MANIFEST).exists():
+        other = differences(read_manifest(folder), plan)
+        if other:
+            raise CampaignError(
+                f"{folder} holds another campaign: {', '.join(other)} differ; give another --out"
+            )
+    else:
+        write_manifest(folder, plan)
+
+
+class Campaign:
+    """One campaign in its folder."""
+
+    def __init__(self, folder: Path, plan: Plan, watch: Watch | None = None) -> None:
+        """Raises CampaignError for files, choices or a folder that do not fit."""
+        self.plan, self.folder = plan, folder
+        self.bench = Bench.of(plan)
+        self.policy: Policy = policy_of(plan, self.bench.task, self.bench.directory)
+        open_folder(folder, plan)
+        self.table = Table(folder, self.bench.task)
+        self._watch = watch
+        self._goals = self._throws = self._already = 0
+        self._began = time.monotonic()
+        self._sessions: list[dict[str, str]] = []
+        self._session: dict[str, Any] = {}
+
+    @property
+    def complete(self) -> bool:
+        """Whether the table holds all runs already."""
+        blocks = self.plan.blocks
+        return self.table.recover(blocks) == len(blocks)
+
+    async def run(self, pool: Pool) -> None:
+        """Do what is left. Interrupted at any point, the next `run` in the same folder goes on.
+        Raises CampaignError."""
+        blocks = self.plan.blocks
+        done = self.table.recover(blocks)
+        if done == len(blocks) and not self.policy.learns:
+            return
+        self._sessions = sessions(self.folder)
+        self._session = {
+            "began_at": datetime.now(UTC).isoformat(timespec="seconds"),
+            "workers": pool.count,
+            "blocks": 0,
+        }
+        self._began = time.monotonic()
+        self._already = self._throws = sum(block.count for block in blocks[:done])
+        if self.policy.learns:
+            await self._learn(pool, done)
+        else:
+            async for _ in self._results(pool, self._orders(blocks[done:])):
+                pass
+
+    async def _learn(self, pool: Pool, done: int) -> None:
+        """Batch by batch; what had been done before is learned again from the table."""
+        before = self.table.rows()
+        for batch in self.plan.batches:
+            orders = list(self._orders(batch))
+            known = list(islice(before, sum(block.count for block in batch if block.index < done)))
+            left = iter([order for order in orders if order[0].index >= done])
+            fresh = [row async for rows in self._results(pool, left) for row in rows]
+            self.policy.update([*known, *fresh])
+
+    def result(self) -> dict[str, Any]:
+        """The result so far, as the command line writes it; the estimates file is written beside
+        the table."""
+        name = identity(self.plan)
+        summary = Summary.of(self.bench.task, self.table.rows(), name, self.plan.options)
+        write_estimates(
+            self.folder, summary.estimates, self.policy.selectors(), name, summary.asked()
+        )
+        return result_of(self.folder, self.plan, summary, self.policy.state())
+
+    async def _results(
+        self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]
+    ) -> AsyncIterator[list[Row]]:
+        """The rows of blocks in order; each block's are in the table before they are given."""
+        going: deque[tuple[Block, asyncio.Task[dict[str, Any]]]] = deque()
+        try:
+            while True:
+                for block, order in islice(orders, pool.count + AHEAD - len(going)):
+                    going.append((block, asyncio.create_task(pool.run(order))))
+                if not going:
+                    return
+                block, task = going[0]
+                result = await task
+                going.popleft()
+                yield self._keep(pool, block, result)
+        finally:
+            for _, task in going:
+                task.cancel()
+            await asyncio.gather(*(task for _, task in going), return_exceptions=True)
+
+    def _orders(self, blocks: Iterable[Block]) -> Iterator[tuple[Block, dict[str, Any]]]:
+        for block in blocks:
+            yield block, {"block": block.to_plain(), "weights": self.policy.weights(block)}
+
+    def _keep(self, pool: Pool, block: Block, result: Mapping[str, Any]) -> list[Row]:
+        if "fault" in result:
+            raise CampaignError(str(result["fault"]))
+        rows = rows_of(block, result)
+        plots = self.folder / f"{PLOTS}.json"
+        if result[PLOTS] and not plots.exists():
+            write_whole(plots, json_text(result[PLOTS], indent=2) + "\n")
+        note_block(self.folder, block, result)
+        self._note_session(pool)
+        self.table.append(rows)
+        self._throws += len(rows)
+        self._goals += sum(1 for row in rows if row.throw is not None and row.throw.goals > 0)
+        if self._watch is not None:
+            now = time.monotonic() - self._began
+            self._watch(Progress(self._throws, self.plan.runs, self._already, self._goals, now))
+        return rows
+
+    def _note_session(self, pool: Pool) -> None:
+        """Write down this session so far, so that one that is killed is known, too."""
+        self._session["blocks"] += 1
+        self._session |= {"wall_s": round(time.monotonic() - self._began, 3), "lost": pool.lost}
+        note_sessions(self.folder, [*self._sessions, self._session])

@@ -1,0 +1,102 @@
+"""Rows of a campaign's table as estimates and learners take them, and the estimates file made of
+them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.waits import Flow, PassageKey
+from petrobot.coordinator.studies.campaign.plan import CampaignError
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.trials import RunEntry
+from petrobot.coordinator.task import Executed, Status, Task
+
+ESTIMATES = "estimates.db"
+
+
+def context_of(regime: str) -> str:
+    """A regime as the context of estimates and selectors; as `petrobot run --learn` names it."""
+    return f"regime={regime}" if regime else ""
+
+
+def regime_of(context: str) -> str:
+    """Back from `context_of`."""
+    return context.removeprefix("regime=")
+
+
+def observation(task: Task, run: RunEntry) -> Observation:
+    """A run that was preempted and counts none, or had not ended, is censored. CPU time is what
+    services.toml declares."""
+    measure = task.primitive_task_of(run.place).cost
+    preempted = run.cancelled and bool(run.taken)
+    return Observation(
+        Status(run.status) if run.status else None,
+        run.took if preempted else max(0.0, run.seconds),
+        run.cause,
+        Executed(run.executed),
+        run.cost if measure == "cpu" else None,
+        run.values,
+        run.taken if run.cancelled else None,
+        None if run.cancelled else max(0.0, round(run.took - run.seconds, 6)),
+    )
+
+
+def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
+    """Count a row's runs and firings."""
+    if row.throw is None:
+        return
+    context = context_of(row.regime)
+    for run in row.throw.runs:
+        key = Key(task.primitive_task_of(run.place).name, run.action, context)
+        name = f"{salt}/{row.regime}/{row.seed}/{row.k}"
+        estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(
+            observation(task, run), name
+        )
+    waits: dict[str, list[float]] = {}
+    for transition, seconds in row.throw.waits:
+        waits.setdefault(transition, []).append(seconds)
+    for transition, count in row.throw.fired.items():
+        where = PassageKey(task.name, transition, context)
+        flow = estimates.flows.get(where, Flow())
+        known = waits.get(transition, [])
+        for i in range(count):
+            flow = flow.adding(known[i] if i < len(known) else None)
+        estimates.flows[where] = flow
+
+
+def estimates_of(task: Task, rows: Iterable[Row], salt: str) -> Estimates:
+    """The estimates of a whole table. `salt` names the campaign."""
+    made = Estimates()
+    for row in rows:
+        add_row(made, task, row, salt)
+    return made
+
+
+def write_estimates(
+    folder: Path,
+    estimates: Estimates,
+    selectors: Mapping[str, Mapping[str, Any]],
+    campaign: str,
+    asked: Mapping[str, Question] | None = None,
+) -> Path:
+    """Write the campaign's runs into its estimates file, under an origin of the campaign's own.
+
+    So merging it twice counts nothing twice, and what others have learned into the file stays.
+    `asked`: by what the actions of each primitive task are judged. Raises CampaignError.
+    """
+    path = folder / ESTIMATES
+    try:
+        origin = CAMPAIGN + campaign
+        EstimatesFile(path, origin).put_closed(origin, estimates, selectors, asked or {})
+    except EstimatesError as fault:
+        raise CampaignError(
+            f"{fault}. If it is removed, the same command makes it again from the table"
+        ) from fault
+    return path

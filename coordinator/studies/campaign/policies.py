@@ -1,0 +1,303 @@
+"""Who chooses actions in a campaign: for each throw, the probabilities of each primitive task's
+actions.
+
+A policy is asked before a batch and told all rows of the batch after it, in the order of the table;
+so what is chosen depends on neither the number of workers nor on who was faster.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from petrobot.coordinator.learning.learning import Learning
+from petrobot.coordinator.learning.objective import Question
+from petrobot.coordinator.learning.records import Choice, End
+from petrobot.coordinator.learning.selectors import RULES
+from petrobot.coordinator.studies.campaign.block import Weights
+from petrobot.coordinator.studies.campaign.observed import context_of, observation, regime_of
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.location_file import Directory
+
+
+class Policy(Protocol):
+    """Chooses before a batch, learns after it."""
+
+    learns: bool
+    """Whether `update` changes what is chosen."""
+
+    def weights(self, block: Block) -> list[Weights]:
+        """For each throw of a block, the probabilities of each primitive task's actions."""
+
+    def update(self, rows: Sequence[Row]) -> None:
+        """Take the rows of a whole batch, in the order of the table."""
+
+    def state(self) -> dict[str, Any]:
+        """What it knows, as plain data for the result."""
+
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """States of selectors for the estimates file, by primitive task."""
+
+
+def offered(task: Task, directory: Directory) -> dict[str, tuple[str, ...]]:
+    """By primitive task: its alternatives that some node offers."""
+    return {
+        p.name: tuple(a for a in p.alternatives if a in directory.actions) or p.alternatives
+        for p in task.primitive_tasks.values()
+    }
+
+
+class Fixed:
+    """The actions chosen by hand; the first alternative of every other primitive task.
+
+    `by_regime`: further choices, by regime (what a learning campaign has come to).
+    """
+
+    learns = False
+
+    def __init__(
+        self,
+        alternatives: Mapping[str, Sequence[str]],
+        chosen: Mapping[str, str],
+        by_regime: Mapping[str, Mapping[str, str]] | None = None,
+    ) -> None:
+        self._weights: Weights = {
+            t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()
+        }
+        self._by_regime = {
+            regime: {**self._weights, **{t: {a: 1.0} for t, a in more.items() if t not in chosen}}
+            for regime, more in (by_regime or {}).items()
+        }
+
+    def weights(self, block: Block) -> list[Weights]:
+        """The same for every throw of a regime."""
+        return [self._by_regime.get(block.regime, self._weights)] * block.count
+
+    def update(self, rows: Sequence[Row]) -> None:
+        """Nothing is learned."""
+
+    def state(self) -> dict[str, Any]:
+        """The actions."""
+        return {task: next(iter(actions)) for task, actions in self._weights.items()}
+
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
+
+
+class RoundRobin:
+    """All combinations of alternatives in turn (of those not chosen by hand), from throw to throw
+    of a regime."""
+
+    learns = False
+
+    def __init__(
+        self, alternatives: Mapping[str, Sequence[str]], chosen: Mapping[str, str]
+    ) -> None:
+        self._alternatives = {
+            t: ([chosen[t]] if t in chosen else list(a)) for t, a in alternatives.items()
+        }
+
+    def combination(self, index: int) -> dict[str, str]:
+        """Combination number `index` (counted on and on): the first primitive task changes with
+        each throw."""
+        out = {}
+        for task, actions in self._alternatives.items():
+            index, which = divmod(index, len(actions))
+            out[task] = actions[which]
+        return out
+
+    def weights(self, block: Block) -> list[Weights]:
+        """One combination for each throw."""
+        combinations = [self.combination(block.regime_first + k) for k in range(block.count)]
+        return [{task: {action: 1.0} for task, action in c.items()} for c in combinations]
+
+    def update(self, rows: Sequence[Row]) -> None:
+        """Nothing is learned."""
+
+    def state(self) -> dict[str, Any]:
+        """The alternatives."""
+        return dict(self._alternatives)
+
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """None."""
+        return {}
+
+
+class Random(RoundRobin):
+    """Every alternative with the same probability, drawn anew at each choice: what estimates and
+    forecasts train on."""
+
+    def weights(self, block: Block) -> list[Weights]:
+        """The same for every throw."""
+        even: Weights = {
+            task: dict.fromkeys(actions, 1.0 / len(actions))
+            for task, actions in self._alternatives.items()
+        }
+        return [even] * block.count
+
+
+class Learned:
+    """A learner for each primitive task with alternatives and each regime (docs/learning.md).
+
+    One choice for each throw and primitive task: a run that is repeated within its throw takes the
+    same action again.
+    """
+
+    learns = True
+
+    def __init__(
+        self,
+        task: Task,
+        selector: str,
+        alternatives: Mapping[str, Sequence[str]],
+        chosen: Mapping[str, str],
+        question: Question,
+    ) -> None:
+        self._task, self._alternatives, self._chosen = task, alternatives, chosen
+        self._learning = Learning(task, selector, question)
+        self._before: dict[str, Any] | None = None
+        """The selectors' states before the batch that is being given out."""
+        self._fixed: Weights = {
+            t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()
+        }
+
+    def weights(self, block: Block) -> list[Weights]:
+        """A choice for each throw. Each is counted as a trial for the others of its batch, until
+        the batch is known."""
+        if self._before is None:
+            self._before = self._learning.state()
+        return [{**self._fixed, **self._choices(block, k)} for k in range(block.count)]
+
+    def _choices(self, block: Block, k: int) -> dict[str, dict[str, float]]:
+        out, context = {}, context_of(block.regime)
+        for name in self._learning.selectors:
+            if name in self._chosen:
+                continue
+            random = np.random.default_rng([block.seed, k, *name.encode()])
+            action, _ = self._learning.choose(name, context, self._alternatives[name], random)
+            self._learning.apply(Choice(name, action, context))
+            out[name] = {action: 1.0}
+        return out
+
+    def update(self, rows: Sequence[Row]) -> None:
+        """Take what was really run, in the order of the table."""
+        for selector in self._learning.selectors.values():
+            selector.reset()
+        self._learning.restore(self._before or {})
+        self._before = None
+        for row in rows:
+            context = context_of(row.regime)
+            for run in row.throw.runs if row.throw is not None else ():
+                name = self._task.primitive_task_of(run.place).name
+                self._learning.apply(Choice(name, run.action, context))
+                self._learning.apply(End(name, run.action, context, observation(self._task, run)))
+
+    def state(self) -> dict[str, Any]:
+        """By regime and primitive task: learned probabilities, J from the learner's sums, and the
+        best action."""
+        contexts = sorted({c for s in self._learning.selectors.values() for c in s.learners})
+        return {
+            regime_of(c): {n: self._of(n, c) for n in self._learning.selectors} for c in contexts
+        }
+
+    def selectors(self) -> dict[str, dict[str, Any]]:
+        """The learners' states: `petrobot run --learn` goes on from them."""
+        return self._learning.state()
+
+    def _of(self, name: str, context: str) -> dict[str, Any]:
+        selector = self._learning.selectors[name]
+        p = selector.learned(context)
+        j = {
+            a: (round(v, 6) if np.isfinite(v) else None)
+            for a, v in selector.objective(context).items()
+        }
+        return {
+            "best": max(p, key=lambda a: p[a]),
+            "p": {a: round(v, 6) for a, v in p.items()},
+            "J": j,
+        }
+
+
+PLAIN: Mapping[str, type[Fixed] | type[RoundRobin]] = {
+    "fixed": Fixed,
+    "round_robin": RoundRobin,
+    "random": Random,
+}
+
+
+def learns(selector: str) -> bool:
+    """Whether a selector learns, so that a campaign goes on in batches."""
+    return selector not in PLAIN
+
+
+def check_chosen(task: Task, directory: Directory, chosen: Mapping[str, str]) -> None:
+    """Raises CampaignError for a primitive task or an action that is not known, or that no node
+    offers."""
+    for name, action in chosen.items():
+        primitive = task.primitive_tasks.get(name)
+        if primitive is None or action not in primitive.alternatives:
+            known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
+            raise CampaignError(
+                f"--choose {name}={action}: not known to {task.name}; choose among {known}"
+            )
+        if action not in directory.actions:
+            raise CampaignError(
+                f"--choose {name}={action}: {directory.source} places no action {action}"
+            )
+
+
+def policy_of(plan: Plan, task: Task, directory: Directory) -> Policy:
+    """The policy that a plan names. Raises CampaignError."""
+    check_chosen(task, directory, plan.chosen)
+    alternatives = offered(task, directory)
+    if plan.selector == "fixed":
+        by_regime = plan.options.get("by_regime", {})
+        for more in by_regime.values():
+            check_chosen(task, directory, more)
+        return Fixed(alternatives, plan.chosen, by_regime)
+    if plan.selector in PLAIN:
+        return PLAIN[plan.selector](alternatives, plan.chosen)
+    if plan.selector not in RULES:
+        known = ", ".join(dict.fromkeys([*PLAIN, *RULES]))
+        raise CampaignError(f"--selector {plan.selector}: not known; choose among {known}")
+    question = Question(target=plan.options.get("target"), rho=plan.options.get("rho"))
+    return Learned(task, plan.selector, alternatives, plan.chosen, question)
+
+
+def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
+    """By regime: the best action of each primitive task that a learning campaign has come to.
+    Raises CampaignError."""
+    path = folder / "result.json"
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as fault:
+        remedy = (
+            "give the folder of a campaign that has ended, as `petrobot campaign --out "
+            "FOLDER` leaves it"
+        )
+        raise CampaignError(
+            f"{path}: no finished campaign: {fault.strerror or fault}; {remedy}"
+        ) from fault
+    except ValueError as fault:
+        raise CampaignError(f"{path}: no finished campaign: it is no JSON ({fault})") from fault
+    try:
+        if result["selector"] in PLAIN:
+            raise CampaignError(
+                f"{folder}: the selector {result['selector']} has learned nothing; give one "
+                "that learns"
+            )
+        return {
+            regime: {t: known["best"] for t, known in tasks.items()}
+            for regime, tasks in result["policy"].items()
+        }
+    except (KeyError, TypeError, AttributeError) as fault:
+        raise CampaignError(
+            f"{path}: no result of a campaign: selector and policy are missing"
+        ) from fault

@@ -1,0 +1,175 @@
+"""Local worker processes of a campaign: a lost one is replaced and its block done again, an old one
+retires."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.run.supervisor import LAST_WORDS, output_pipe
+from petrobot.coordinator.studies.campaign.plan import CampaignError, Plan
+from petrobot.services.host.parent_death import until_ended
+
+RETIRES_AFTER = 200
+"""Blocks after which a worker is replaced, so that what a user's action or a native library may
+leak does not add up."""
+TRIES = 3
+"""Workers that a block may take with it before it counts as the block's fault."""
+LONGEST_LINE = 1 << 26
+ONE_THREAD = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1"
+)
+"""Workers share the cores among themselves; threads of libraries would only get in their way."""
+
+
+class WorkerLost(Exception):  # noqa: N818 - what happened
+    """A worker process ended while it had a block."""
+
+
+class _Worker:
+    """One process and the way to it."""
+
+    def __init__(
+        self,
+        process: asyncio.subprocess.Process,
+        said: asyncio.StreamReader,
+        closing: contextlib.AsyncExitStack,
+    ) -> None:
+        self.process = process
+        self.done = 0
+        self._said = said
+        self._closing = closing
+
+    @classmethod
+    async def start(cls, plan: str, log: Path) -> _Worker:
+        """Launch a process and tell it the plan; what it says beside its answers goes to `log`."""
+        command = (
+            sys.executable,
+            "-m",
+            "petrobot.coordinator.studies.campaign.worker",
+            str(os.getpid()),
+        )
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+            **ONE_THREAD,
+        }
+        async with contextlib.AsyncExitStack() as closing:
+            end, said = await closing.enter_async_context(output_pipe(LONGEST_LINE))
+            with log.open("ab") as words:
+                process = await asyncio.create_subprocess_exec(
+                    *command,
+                    stdin=asyncio.subprocess.PIPE,
+                    stdout=end,
+                    stderr=words,
+                    env=environment,
+                    start_new_session=True,
+                )
+            end.close()
+            worker = cls(process, said, closing.pop_all())
+        await worker._tell(plan)
+        return worker
+
+    async def ask(self, order: str) -> dict[str, Any]:
+        """Hand over a block and wait for its result. Raises WorkerLost."""
+        await self._tell(order)
+        line = await self._line()
+        if not line.endswith(b"\n"):
+            raise WorkerLost(f"worker {self.process.pid} ended")
+        self.done += 1
+        return json.loads(line)  # type: ignore[no-any-return]
+
+    async def _line(self) -> bytes:
+        """What it says next; what there is of it when the process ends. What it has left running
+        may hold the pipe open."""
+        reading = asyncio.create_task(self._said.readline())
+        ended = asyncio.create_task(until_ended(self.process.pid))
+        try:
+            await asyncio.wait({reading, ended}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({reading}, timeout=LAST_WORDS)
+            return reading.result() if reading.done() else b""
+        finally:
+            reading.cancel()
+            ended.cancel()
+
+    async def _tell(self, line: str) -> None:
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.write(line.encode() + b"\n")
+            await self.process.stdin.drain()
+        except (BrokenPipeError, ConnectionResetError) as fault:
+            raise WorkerLost(f"worker {self.process.pid} ended") from fault
+
+    async def end(self) -> None:
+        """Kill the process if it is still there, and what its actions have left in its session."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, signal.SIGKILL)
+        assert self.process.stdin is not None
+        self.process.stdin.close()  # `wait` waits for that, too
+        await self.process.wait()
+        await self._closing.aclose()
+
+
+class LocalPool:
+    """`count` worker processes; use as an async context."""
+
+    def __init__(self, plan: Plan, count: int, log: Path) -> None:
+        self.count = count
+        self._log = log
+        self.lost = 0
+        """Workers that ended while they had a block."""
+        self._plan = json.dumps(plan.to_plain())
+        self._idle: list[_Worker] = []
+        self._all: set[_Worker] = set()
+        self._room = asyncio.Semaphore(count)
+
+    @property
+    def pids(self) -> list[int]:
+        """Of the processes that are there."""
+        return [worker.process.pid for worker in self._all]
+
+    async def __aenter__(self) -> LocalPool:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await asyncio.gather(*(worker.end() for worker in self._all))
+
+    async def run(self, order: Mapping[str, Any]) -> dict[str, Any]:
+        """Have a block done; waits for a worker. Raises CampaignError."""
+        text = json.dumps(order)
+        async with self._room:
+            for _ in range(TRIES):
+                try:
+                    return await self._once(text)
+                except WorkerLost:
+                    self.lost += 1
+        what = f"block {order['block']['index']} (seed {order['block']['seed']})"
+        raise CampaignError(
+            f"{what} ended {TRIES} workers; the last words of each are in {self._log}"
+        )
+
+    async def _once(self, text: str) -> dict[str, Any]:
+        if self._idle:
+            worker = self._idle.pop()
+        else:
+            worker = await _Worker.start(self._plan, self._log)
+            self._all.add(worker)
+        try:
+            answer = await worker.ask(text)
+        except BaseException:
+            self._all.discard(worker)
+            await worker.end()
+            raise
+        if worker.done >= RETIRES_AFTER:
+            self._all.discard(worker)
+            await worker.end()
+        else:
+            self._idle.append(worker)
+        return answer

@@ -1,0 +1,188 @@
+"""One row of a campaign's table: what the columns are, and a throw as a row and back. Columns come
+from task and score."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from petrobot.coordinator.studies.campaign.plan import Block
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.task import Kind, Task
+from petrobot.services.host.json_text import json_text
+
+GENERAL = (
+    "n",
+    "regime",
+    "seed",
+    "k",
+    "block",
+    "begun",
+    "status",
+    "cause",
+    "completed",
+    "goals",
+    "time",
+    "at",
+    "mission_s",
+)
+"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the throw took; `at`: s
+since the mission began."""
+BY_PLACE = ("status", "cause", "seconds", "cost")
+"""Of the throw's first run in a place; all runs stand in the column `runs`."""
+LAST = ("more", "runs", "waits", "fired")
+"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run;
+Throw.waits, Throw.fired."""
+
+Cell = str | int | float | None
+
+
+@dataclass
+class Row:
+    """A throw of a campaign. `throw` is None when the mission run was given up before it."""
+
+    n: int
+    regime: str
+    seed: int
+    k: int
+    block: int
+    mission_s: float
+    throw: Throw | None
+    score: dict[str, Any] = field(default_factory=dict)
+    """The task's own results, as `table.column`."""
+
+
+def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
+    """The rows of a block's result."""
+    throws = {t["k"]: Throw.from_plain(t) for t in result["throws"]}
+    return [
+        Row(
+            block.first + k,
+            block.regime,
+            block.seed,
+            k,
+            block.index,
+            result["mission_s"],
+            throws.get(k),
+            dict(result["score"][k - 1]),
+        )
+        for k in range(1, block.count + 1)
+    ]
+
+
+def columns(task: Task, rows: Sequence[Row]) -> list[str]:
+    """The table's columns: the general ones, those of the task file, and those of the task's score
+    in these first rows."""
+    chosen = [f"chosen.{name}" for name in task.primitive_tasks]
+    places = [
+        f"{p.name}.{part}"
+        for p in task.flat.places.values()
+        if p.kind is Kind.ACTION
+        for part in BY_PLACE
+    ]
+    own = list(dict.fromkeys(key for row in rows for key in row.score))
+    return [*GENERAL, *chosen, *places, *own, *LAST]
+
+
+def cells(task: Task, row: Row, names: Sequence[str]) -> list[str]:
+    """A row as texts, in the order of the columns."""
+    found = {**_general(row), **_runs(task, row.throw), **row.score}
+    more = {k: v for k, v in row.score.items() if k not in names}
+    found["more"] = _json(more) if more else ""
+    return [_text(found.get(name)) for name in names]
+
+
+def _general(row: Row) -> dict[str, Any]:
+    base = {name: getattr(row, name) for name in ("n", "regime", "seed", "k", "block", "mission_s")}
+    throw = row.throw
+    if throw is None:
+        return {**base, "begun": False}
+    own = {
+        "begun": True,
+        "at": throw.begun,
+        "waits": _json([list(w) for w in throw.waits]),
+        "fired": _json(throw.fired),
+    }
+    own |= {
+        name: getattr(throw, name) for name in ("status", "cause", "completed", "goals", "time")
+    }
+    return {**base, **own, "runs": _json([run.to_plain() for run in throw.runs])}
+
+
+def _runs(task: Task, throw: Throw | None) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for run in throw.runs if throw else ():
+        primitive = task.primitive_task_of(run.place).name
+        found.setdefault(f"chosen.{primitive}", run.action)
+        if f"{run.place}.status" not in found:
+            found |= {f"{run.place}.{part}": getattr(run, part) for part in BY_PLACE}
+    return found
+
+
+def _json(data: Any) -> str:
+    return json_text(data, separators=(",", ":"), ensure_ascii=False)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return repr(round(value, 9))
+    if isinstance(value, str):
+        return value.replace("\r\n", "\n").replace(
+            "\r", "\n"
+        )  # a bare carriage return would end a line of the CSV file
+    return str(value) if isinstance(value, int) else _json(value)
+
+
+def read_row(record: Mapping[str, str]) -> Row:
+    """A row back from its texts. Raises KeyError or ValueError for a record that is none."""
+    throw = None
+    if record["begun"] == "true":
+        throw = Throw(
+            int(record["k"]),
+            float(record["at"]),
+            _number(record["time"]),
+            record["completed"] == "true",
+            int(record["goals"]),
+            record["status"],
+            record["cause"],
+            [RunEntry.from_plain(run) for run in json.loads(record["runs"])],
+            [(str(name), float(wait)) for name, wait in json.loads(record["waits"])],
+            json.loads(record["fired"]),
+        )
+    own = {key: value_of(text) for key, text in record.items() if _is_own(key) and text != ""}
+    own |= json.loads(record["more"]) if record.get("more") else {}
+    return Row(
+        int(record["n"]),
+        record["regime"],
+        int(record["seed"]),
+        int(record["k"]),
+        int(record["block"]),
+        float(record["mission_s"]),
+        throw,
+        own,
+    )
+
+
+def _is_own(key: str) -> bool:
+    """Whether a column may be the score's: those of places are read from `runs`."""
+    return "." in key and not key.startswith("chosen.") and key.rpartition(".")[2] not in BY_PLACE
+
+
+def _number(text: str) -> float | None:
+    return float(text) if text else None
+
+
+def value_of(text: str) -> Any:
+    """A cell's text as the value that it was written from, as far as a text tells."""
+    if text in ("true", "false"):
+        return text == "true"
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

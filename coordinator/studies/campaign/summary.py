@@ -1,0 +1,226 @@
+"""What a campaign's table says in numbers: shares with intervals, times, choices, estimates and J
+of every action."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.objective import Comparison, Question, compare
+from petrobot.coordinator.learning.statistics import wilson
+from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
+from petrobot.coordinator.studies.campaign.plan import TABLE, Plan
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.table import sessions, times
+from petrobot.coordinator.task import PrimitiveTask, Task
+
+
+@dataclass
+class Counts:
+    """Throws of one regime, or of all."""
+
+    runs: int = 0
+    """Throws that were begun."""
+    not_begun: int = 0
+    """Throws for which the mission run was given up before."""
+    goals: int = 0
+    completed: int = 0
+    all_success: int = 0
+    times: list[float] = field(default_factory=list)
+    """s, of the completed ones."""
+
+    def add(self, row: Row) -> None:
+        """Count a throw."""
+        if row.throw is None:
+            self.not_begun += 1
+            return
+        self.runs += 1
+        self.goals += row.throw.goals > 0
+        self.completed += row.throw.completed
+        self.all_success += row.throw.all_success
+        if row.throw.completed and row.throw.time is not None:
+            self.times.append(row.throw.time)
+
+    def to_plain(self, has_goal: bool) -> dict[str, Any]:
+        """Plain data; R_goal of a task without goal transitions is none."""
+        met = self.goals if has_goal else self.completed
+        low, high = wilson(met, self.runs)
+        return {
+            "runs": self.runs,
+            "not_begun": self.not_begun,
+            "R_goal": _share(self.goals, self.runs) if has_goal else None,
+            "wilson": [round(low, 6), round(high, 6)],
+            "P_complete": _share(self.completed, self.runs),
+            "R_conj": _share(self.all_success, self.runs),
+            "mean": round(float(np.mean(self.times)), 6) if self.times else None,
+            "q90": round(float(np.quantile(self.times, 0.9)), 6) if self.times else None,
+        }
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 6) if whole else None
+
+
+def question_of(
+    primitive: PrimitiveTask, options: Mapping[str, Any], declared: bool = True
+) -> Question:
+    """What is asked of a primitive task's actions: target and rho as a plan's options give them.
+
+    Without a target in the options it is the one that the task file declares, unless `declared` is
+    off.
+    """
+    target = options.get("target", primitive.target_reliability if declared else None)
+    return Question(primitive.cost, target, options.get("rho"))
+
+
+def comparisons(
+    task: Task,
+    tallies: Mapping[Key, Tally],
+    regime: str | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> dict[str, Comparison]:
+    """By primitive task: all its alternatives with runs judged together, over all regimes as
+    scenarios or in one.
+
+    `options`: those of the campaign's plan. In one regime a target counts only if it was given (as
+    in `Learning.comparison`).
+    """
+    out = {}
+    for primitive in task.primitive_tasks.values():
+        by_action: dict[str, dict[str, Tally]] = {}
+        for key, tally in tallies.items():
+            if key.primitive_task == primitive.name and (
+                regime is None or key.context == context_of(regime)
+            ):
+                by_action.setdefault(key.action, {})[key.context] = tally
+        if by_action:
+            ordered = {a: by_action[a] for a in primitive.alternatives if a in by_action}
+            out[primitive.name] = compare(
+                ordered, question_of(primitive, options or {}, regime is None)
+            )
+    return out
+
+
+@dataclass
+class Summary:
+    """Everything that is counted in one pass over the rows."""
+
+    task: Task
+    whole: Counts = field(default_factory=Counts)
+    by_regime: dict[str, Counts] = field(default_factory=dict)
+    chosen: dict[str, dict[str, int]] = field(default_factory=dict)
+    estimates: Estimates = field(default_factory=Estimates)
+    salt: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the campaign's plan: target reliability and rho, where they were given."""
+    mission_s: dict[int, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        rows: Iterable[Row],
+        salt: str = "",
+        options: Mapping[str, Any] | None = None,
+    ) -> Summary:
+        """Of a table's rows. `salt` names the campaign in the estimates; `options` are its
+        plan's."""
+        made = cls(task, salt=salt, options=options or {})
+        for row in rows:
+            made.add(row)
+        return made
+
+    def add(self, row: Row) -> None:
+        """Count a row."""
+        self.whole.add(row)
+        self.by_regime.setdefault(row.regime, Counts()).add(row)
+        self.mission_s[row.block] = row.mission_s
+        for run in row.throw.runs if row.throw is not None else ():
+            primitive = self.task.primitive_task_of(run.place).name
+            actions = self.chosen.setdefault(primitive, {})
+            actions[run.action] = actions.get(run.action, 0) + 1
+        add_row(self.estimates, self.task, row, self.salt)
+
+    def asked(self) -> dict[str, Question]:
+        """By what the actions of each primitive task are judged."""
+        return {p.name: question_of(p, self.options) for p in self.task.primitive_tasks.values()}
+
+    def comparisons(self) -> dict[str, Comparison]:
+        """The actions of each primitive task judged over all regimes, as the campaign's options
+        ask."""
+        return comparisons(self.task, self.estimates.tallies, options=self.options)
+
+    def _judged(self, name: str, found: Comparison) -> dict[str, Any]:
+        """What J of a primitive task was made with: measure, target, rho, regimes, who meets the
+        target where."""
+        asked = question_of(self.task.primitive_tasks[name], self.options)
+        return {
+            "cost": asked.measure,
+            "target": asked.target,
+            "rho": round(found.rho, 9),
+            "regimes": [regime_of(s) for s in found.scenarios],
+            "meet_target": {
+                f.action: [regime_of(s) for s in f.scenarios] for f in found.figures if f.admissible
+            },
+            "uncosted": list(found.uncosted),
+        }
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain data."""
+        has_goal, found = bool(self.task.goal_transitions), self.comparisons()
+        return {
+            **self.whole.to_plain(has_goal),
+            "by_regime": {
+                name: counts.to_plain(has_goal) for name, counts in self.by_regime.items()
+            },
+            "chosen": {
+                t: dict(sorted(self.chosen[t].items()))
+                for t in self.task.primitive_tasks
+                if t in self.chosen
+            },
+            "J": {
+                name: {f.action: _finite(f.j) for f in judged.figures}
+                for name, judged in found.items()
+            },
+            "judged": {name: self._judged(name, judged) for name, judged in found.items()},
+            "sim_s": round(sum(self.mission_s.values()), 6),
+        }
+
+
+def result_of(folder: Path, plan: Plan, made: Summary, policy: Mapping[str, Any]) -> dict[str, Any]:
+    """The result of a campaign as the command line writes it."""
+    summary, task = made.to_plain(), made.task
+    held, took = sessions(folder), times(folder)
+    wall = sum(float(s["wall_s"]) for s in held)
+    core_s = sum(float(s["wall_s"]) * int(s["workers"]) for s in held)
+    cpu = sum({int(t["block"]): float(t["cpu_s"]) for t in took}.values())
+    sim = summary["sim_s"]
+    return {
+        "task": task.name,
+        "regimes": list(plan.regimes),
+        "seed": plan.seed,
+        "selector": plan.selector,
+        "workers": int(held[-1]["workers"]) if held else 0,
+        "rows": str(folder / TABLE),
+        "estimates": str(folder / ESTIMATES),
+        **summary,
+        "runs": plan.runs,
+        "begun": summary["runs"],
+        "policy": dict(policy),
+        "lost_workers": sum(int(s["lost"]) for s in held),
+        "wall_s": round(wall, 3),
+        "cpu_s": round(cpu, 3),
+        "times_real_time_per_core": round(sim / core_s, 3) if core_s else None,
+        "times_real_time_per_cpu_s": round(sim / cpu, 3) if cpu else None,
+    }
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None

@@ -1,0 +1,312 @@
+"""What one throw was: one token out of the runs place and all that came of it, as plain data; and
+who writes it down.
+
+A *throw* here is one run of a task, whatever the task does (design: "mission run" is a whole
+execution, which may hold several). A task without a runs place has one throw in each mission run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from petrobot.coordinator.engine import State
+from petrobot.coordinator.engine.instructions import (
+    Corrected,
+    Finished,
+    Fired,
+    Instruction,
+    RunRecorded,
+    StartRun,
+)
+from petrobot.coordinator.engine.stimuli import RunEnded, Stimulus
+from petrobot.coordinator.task import End, Executed, Kind, Status, Task
+from petrobot.coordinator.task.net import Marking
+from petrobot.services.comm.calls.notices import Progress
+
+DIGITS = 6
+"""Decimals of every time and cost in the table (us)."""
+
+_RANK = {status: n for n, status in enumerate(("", *(status.value for status in Status)))}
+"""How bad a status is."""
+
+CostOf = Callable[[RunRecorded, Mapping[str, Any]], float | None]
+"""Cost of a run that was recorded, from its record and the values of its result."""
+
+
+@dataclass(slots=True)
+class RunEntry:
+    """One run of an action within a throw. Times in s."""
+
+    place: str
+    action: str
+    begun: float
+    """When its token came into the place, since the throw's begin."""
+    took: float = 0.0
+    """From there until the coordinator knew its end, or a preempting transition took the token:
+    with all waiting."""
+    status: str = ""
+    """success, failure, error; empty for a censored run (it was preempted and counts none, or had
+    not ended)."""
+    cause: str = ""
+    text: str = ""
+    seconds: float = 0.0
+    """How long it took on its node's clock."""
+    cost: float | None = None
+    executed: str = Executed.YES.value
+    taken: str = ""
+    """The transition that took its token."""
+    cancelled: bool = False
+    values: dict[str, float] = field(default_factory=dict)
+    """Numbers of its result."""
+
+    def to_plain(self) -> list[Any]:
+        """A list in the order of the fields."""
+        return [getattr(self, name) for name in self.__slots__]
+
+    @classmethod
+    def from_plain(cls, data: Sequence[Any]) -> RunEntry:
+        """Back from `to_plain`."""
+        return cls(*data)
+
+
+@dataclass(slots=True)
+class Throw:
+    """One run of the task. Times in s."""
+
+    k: int
+    """Its number in its mission run, from 1."""
+    begun: float
+    """Since the mission run began."""
+    time: float | None = None
+    """Until every token was back where it stood before; None if it never was."""
+    completed: bool = False
+    """The task could go on, or was over as designed; False when it was given up in this throw."""
+    goals: int = 0
+    """Firings of goal transitions."""
+    status: str = Status.SUCCESS.value
+    """The worst status of its runs."""
+    cause: str = ""
+    runs: list[RunEntry] = field(default_factory=list)
+    waits: list[tuple[str, float]] = field(default_factory=list)
+    """(transition, s) for each firing of a transition that waited for an event or a timer, from
+    when it could have fired."""
+
+    fired: dict[str, int] = field(default_factory=dict)
+    """How often each transition fired."""
+
+    @property
+    def all_success(self) -> bool:
+        """Every run ended with SUCCESS: what R_conj counts."""
+        return self.completed and all(run.status in (Status.SUCCESS.value, "") for run in self.runs)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain data for the way from a worker to the campaign."""
+        plain = {
+            name: getattr(self, name) for name in self.__slots__ if name not in ("runs", "waits")
+        }
+        return plain | {
+            "runs": [run.to_plain() for run in self.runs],
+            "waits": [list(wait) for wait in self.waits],
+        }
+
+    @classmethod
+    def from_plain(cls, data: Mapping[str, Any]) -> Throw:
+        """Back from `to_plain`."""
+        runs = [RunEntry.from_plain(run) for run in data["runs"]]
+        return cls(
+            **{
+                **data,
+                "runs": runs,
+                "waits": [(str(name), float(wait)) for name, wait in data["waits"]],
+            }
+        )
+
+
+class ThrowLog:
+    """An observer of the executor that writes down each throw."""
+
+    def __init__(self, task: Task, cost_of: CostOf) -> None:
+        flat = task.flat
+        self._net, self._cost_of = flat.net, cost_of
+        self._goals = frozenset(flat.goal_transitions)
+        self._runs_place = self._net.place_index[flat.runs_place] if flat.runs_place else None
+        self._actions = {p.name for p in flat.places.values() if p.kind is Kind.ACTION}
+        self._waiting = {
+            t.name: [(a.place, a.end) for a in t.inputs]
+            for t in flat.transitions.values()
+            if (t.events or t.after is not None)
+            and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
+        }
+        self.throws: list[Throw] = []
+        self._since = dict.fromkeys(self._net.places, 0.0)
+        self._entries: dict[str, tuple[Throw, RunEntry]] = {}
+        self._going: dict[str, float] = {}
+        self._values: dict[str, Mapping[str, Any]] = {}
+        self._ends: dict[int, list[RunEntry]] = {}
+        """By throw: its runs in the order in which they ended."""
+        self._given_up: str | None = None
+        """Why the mission run ended before its last throw was completed, if it did."""
+        self._origin: float | None = None
+
+    # --- an observer --------------------------------------------------------------------------
+
+    def stimulus(self, now: float, stimulus: Stimulus) -> None:
+        """The first one begins the time axis; results are kept until their runs are recorded."""
+        if self._origin is None:
+            self._origin = now
+            self._since = dict.fromkeys(self._net.places, now)
+            if self._runs_place is None:
+                self._begin(now)
+        if isinstance(stimulus, RunEnded):
+            self._values[stimulus.run] = stimulus.values
+
+    def instruction(self, now: float, instruction: Instruction) -> None:
+        """Keep what a throw is made of."""
+        if isinstance(instruction, Fired):
+            self._fired(now, instruction)
+        elif isinstance(instruction, StartRun):
+            self._entry(now, instruction)
+        elif isinstance(instruction, RunRecorded):
+            self._recorded(now, instruction)
+        elif isinstance(instruction, Corrected) and instruction.run in self._entries:
+            self._corrected(instruction)
+        elif isinstance(instruction, Finished):
+            self._finished(now, instruction)
+
+    def progress(self, now: float, run: str, notice: Progress) -> None:
+        """Nothing to keep."""
+
+    def settled(self, now: float, state: State) -> None:
+        """Nothing to keep."""
+
+    # --- what happened ------------------------------------------------------------------------
+
+    def _begin(self, now: float) -> None:
+        if self.throws:
+            self.throws[-1].completed = True
+        assert self._origin is not None
+        self.throws.append(Throw(len(self.throws) + 1, round(now - self._origin, DIGITS)))
+
+    def _fired(self, now: float, fired: Fired) -> None:
+        if (
+            self._runs_place is not None
+            and fired.after[self._runs_place] < fired.before[self._runs_place]
+        ):
+            self._begin(now)
+        for run in fired.runs:
+            if run in self._entries:
+                self._entries[run][1].taken = fired.transition
+                if run in self._going:  # preempted
+                    self._ended(now, run)
+        if not self.throws:
+            return
+        throw = self.throws[-1]
+        throw.goals += fired.transition in self._goals
+        throw.fired[fired.transition] = throw.fired.get(fired.transition, 0) + 1
+        if fired.transition in self._waiting:
+            since = max(
+                (self._since[place] for place, _ in self._waiting[fired.transition]), default=now
+            )
+            throw.waits.append((fired.transition, round(now - since, DIGITS)))
+        for name, before, after in zip(self._net.places, fired.before, fired.after, strict=True):
+            if after > before:
+                self._since[name] = now
+        if throw.time is None and self._idle(fired.after):
+            throw.completed = True
+            throw.time = self._span(now, throw)
+
+    def _idle(self, marking: Marking) -> bool:
+        """Whether all but the runs left is as it was at first."""
+        if self._runs_place is None:
+            return False
+        own = self._runs_place
+        return (
+            marking[:own] == self._net.initial[:own]
+            and marking[own + 1 :] == self._net.initial[own + 1 :]
+        )
+
+    def _span(self, now: float, throw: Throw) -> float:
+        assert self._origin is not None
+        return round(now - self._origin - throw.begun, DIGITS) + 0.0  # no -0.0
+
+    def _entry(self, now: float, start: StartRun) -> RunEntry:
+        throw = self.throws[-1] if self.throws else None
+        came = self._since[start.place]
+        entry = RunEntry(start.place, start.action, self._span(came, throw) if throw else 0.0)
+        if throw is not None:
+            throw.runs.append(entry)
+            self._entries[start.run], self._going[start.run] = (throw, entry), came
+        return entry
+
+    def _ended(self, now: float, run: str) -> None:
+        came = self._going.pop(run, None)
+        if came is not None:
+            self._entries[run][1].took = round(now - came, DIGITS)
+
+    def _recorded(self, now: float, record: RunRecorded) -> None:
+        known = self._entries.get(record.run)
+        if known is None:  # it ended without ever having been sent to a node
+            self._entry(
+                now,
+                StartRun(record.run, record.place, record.primitive_task, record.action, {}, 0.0),
+            )
+            known = self._entries.get(record.run)
+            if known is None:
+                return
+        if (
+            record.run in self._going
+        ):  # else a preemption has taken its token, and the place may hold a later one
+            self._since[record.place] = now
+        self._ended(now, record.run)
+        throw, entry = known
+        values = self._values.pop(record.run, {})
+        entry.status = record.status.value if record.status is not None else ""
+        entry.cause = record.cause if record.status is not Status.SUCCESS else ""
+        entry.text, entry.cancelled = record.text, record.cancelled
+        entry.executed, entry.seconds = record.executed.value, round(record.seconds, DIGITS)
+        entry.values = _numbers(values)
+        cost = self._cost_of(record, values)
+        entry.cost = None if cost is None else round(cost, DIGITS)
+        self._ends.setdefault(throw.k, []).append(entry)
+        if _RANK[entry.status] > _RANK[throw.status]:
+            throw.status, throw.cause = entry.status, entry.cause
+
+    def _corrected(self, corrected: Corrected) -> None:
+        """The verdict on a run replaces its status, and the throw is what its runs really came
+        to."""
+        throw, entry = self._entries[corrected.run]
+        entry.status, entry.text = corrected.status.value, corrected.text or entry.text
+        entry.cause = corrected.cause if corrected.status is not Status.SUCCESS else ""
+        worst = max(self._ends[throw.k], key=lambda one: _RANK[one.status])
+        bad = _RANK[worst.status] > _RANK[Status.SUCCESS.value]
+        throw.status, throw.cause = (
+            (worst.status, worst.cause) if bad else (Status.SUCCESS.value, "")
+        )
+        if throw is self.throws[-1]:
+            self._give_up(throw)
+
+    def _give_up(self, last: Throw) -> None:
+        if self._given_up is not None:
+            last.status, last.cause = Status.ERROR.value, last.cause or self._given_up
+
+    def _finished(self, now: float, finished: Finished) -> None:
+        if not self.throws:
+            return
+        last = self.throws[-1]
+        last.completed = last.completed or finished.status is Status.SUCCESS
+        if last.completed and last.time is None:
+            last.time = self._span(now, last)
+        if not last.completed:
+            self._given_up = finished.reason
+            self._give_up(last)
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers and truth values of a result."""
+    return {
+        name: round(float(value), DIGITS)
+        for name, value in values.items()
+        if isinstance(value, bool | int | float) and abs(float(value)) < 1e300
+    }

@@ -1,0 +1,230 @@
+"""Whether a measurement agrees with a forecast that was registered before: predictive tests, Holm,
+equivalence, whole law.
+
+Shares: a beta-binomial predictive law whose weight is that of the forecast's own uncertainty
+(Jeffreys prior), so a share of 1 that was forecast from n throws still expects a miss in a further
+n. Times: normal with the bootstrap's predictive deviation. Many comparisons: S. Holm, Scandinavian
+Journal of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is the
+measurement's 90 % interval lies within the margin about the forecast number (D. J. Schuirmann,
+1987).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import betabinom, binom, chi2_contingency, norm, t
+
+from petrobot.coordinator.learning.statistics import wilson
+from petrobot.coordinator.studies.forecast.history import Training, Values
+from petrobot.coordinator.studies.forecast.predict import GRID, SHARES, figures
+from petrobot.coordinator.studies.forecast.residual import measured, routing, ways_table
+
+# What tests of shares need: the predictive law of a share of new throws, and Holm's adjustment for many tests.
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjusted p-values: each may be compared with the level for all of them together."""
+    order = np.argsort(p_values, kind="stable")
+    out, largest = [0.0] * len(p_values), 0.0
+    for rank, i in enumerate(order):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
+        out[i] = largest
+    return out
+
+
+def share_weight(value: float, sd: float, runs: int, training: int) -> float:
+    """How many throws the forecast of a share weighs: from its predictive deviation less the noise
+    of `runs` new throws.
+
+    At most as much as the training throws themselves; exactly that where the bootstrap saw no
+    variation.
+    """
+    noise = value * (1.0 - value)
+    own = sd * sd - noise / runs
+    return float(training) if noise <= 0.0 or own <= noise / training else max(2.0, noise / own)
+
+
+def _beta(value: float, weight: float) -> tuple[float, float]:
+    return value * weight + 0.5, (1.0 - value) * weight + 0.5
+
+
+def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
+    """In which a share of n new throws is expected."""
+    a, b = _beta(value, weight)
+    low, high = betabinom.ppf([(1 - level) / 2, (1 + level) / 2], n, a, b)
+    return [round(float(low) / n, 6), round(float(high) / n, 6)]
+
+
+def share_p_value(value: float, weight: float, count: int, n: int) -> float:
+    """Two-sided p-value of `count` successes among n new throws."""
+    a, b = _beta(value, weight)
+    below, above = float(betabinom.cdf(count, n, a, b)), float(betabinom.sf(count - 1, n, a, b))
+    return min(1.0, 2.0 * min(below, above))
+
+
+FAMILY = ("R_goal", "P_complete", "mean", "q90")
+"""What is judged together by Holm, in all regimes."""
+LEVEL = 0.01
+MARGIN_SHARE = 0.02
+MARGIN_TIME = 0.05
+EQUIVALENCE = 0.90
+
+
+def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> dict[str, Any]:
+    """Compare each regime's forecast with what was measured. Raises ValueError if they have no
+    regime in common."""
+    common = [name for name in forecast["regimes"] if name in regimes]
+    if not common:
+        raise ValueError(
+            f"the campaign ran {', '.join(regimes)}, the forecast is of "
+            f"{', '.join(forecast['regimes'])}"
+        )
+    rows, controls, laws, ways = [], [], [], []
+    for name in common:
+        said, training = forecast["regimes"][name], regimes[name]
+        rows += [_row(name, figure, said, training) for figure in (*FAMILY, "R_conj")]
+        controls.append(_product(name, said, training))
+        laws.append(_law(name, said, training))
+        ways += _routing(name, said["routing"], routing(training))
+    family = [row for row in rows if row["figure"] in FAMILY and row["p"] is not None]
+    for row, p in zip(family, holm([row["p"] for row in family]), strict=True):
+        row["p_holm"] = p
+    for row, p in zip(ways, holm([row["p"] for row in ways]), strict=True):
+        row["p_holm"] = p
+    return {
+        "rows": rows,
+        "negative_control": controls,
+        "law": laws,
+        "routing": ways,
+        "agrees": all(row["p_holm"] >= LEVEL for row in family),
+        "equivalent": all(row["equivalent"] for row in family),
+        "product_rejected": [row["regime"] for row in controls if row["rejected"]],
+    }
+
+
+def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
+    played = measured(training)
+    value, found = figures(played)[figure], said["figures"][figure]
+    times = played.time[~np.isnan(played.time)]
+    n = len(training.throws)
+    row: dict[str, Any] = {
+        "regime": regime,
+        "figure": figure,
+        "forecast": found["value"],
+        "interval": found["interval"],
+        "measured": None if math.isnan(value) else round(value, 6),
+        "runs": n,
+        "p": None,
+        "p_holm": None,
+        "margin": None,
+        "measured_90": None,
+        "equivalent": False,
+    }
+    if found["value"] is None or row["measured"] is None:
+        return row
+    if figure in SHARES:
+        weight = share_weight(found["value"], found["sd"], said["runs"], said["training_throws"])
+        row["interval"] = predictive_interval(found["value"], weight, n)
+        row["p"] = share_p_value(found["value"], weight, round(value * n), n)
+        low, high = wilson(round(value * n), n, EQUIVALENCE)
+        row["margin"] = MARGIN_SHARE
+    else:
+        row["p"] = time_p_value(
+            found["value"], found["sd"], value, said["runs"], len(times), said["training_throws"]
+        )
+        low, high = mean_interval(times) if figure == "mean" else quantile_interval(times, 0.9)
+        row["margin"] = round(MARGIN_TIME * found["value"], 6)
+    row["measured_90"] = [round(low, 6), round(high, 6)]
+    row["equivalent"] = (
+        abs(low - found["value"]) <= row["margin"] and abs(high - found["value"]) <= row["margin"]
+    )
+    return row
+
+
+def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, training: int) -> float:
+    """Two-sided p-value of a time of n new throws, given the predictive deviation for `runs` of
+    them (both from n^-1/2 laws)."""
+    scaled = sd * math.sqrt((1.0 / n + 1.0 / training) / (1.0 / runs + 1.0 / training))
+    if scaled <= 0.0:
+        return 1.0 if seen == value else 0.0
+    return float(2.0 * norm.sf(abs(seen - value) / scaled))
+
+
+def mean_interval(times: Values, level: float = EQUIVALENCE) -> tuple[float, float]:
+    """Student's interval of the mean."""
+    half = (
+        float(t.ppf((1 + level) / 2, len(times) - 1) * times.std(ddof=1) / math.sqrt(len(times)))
+        if len(times) > 1
+        else math.inf
+    )
+    middle = float(times.mean())
+    return middle - half, middle + half
+
+
+def quantile_interval(times: Values, q: float, level: float = EQUIVALENCE) -> tuple[float, float]:
+    """Interval of a quantile between two order statistics."""
+    ordered, n = np.sort(times), len(times)
+    low = int(binom.ppf((1 - level) / 2, n, q))
+    high = int(binom.ppf((1 + level) / 2, n, q)) + 1
+    return (float(ordered[low - 1]) if low >= 1 else -math.inf), (
+        float(ordered[high - 1]) if high <= n else math.inf
+    )
+
+
+def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
+    """The negative control: the product of marginal reliabilities as a forecast of R_conj."""
+    value, n = said["product"]["R_conj"], len(training.throws)
+    seen = figures(measured(training))["R_conj"]
+    p = share_p_value(value, float(said["training_throws"]), round(seen * n), n)
+    return {
+        "regime": regime,
+        "forecast": value,
+        "measured": round(seen, 6),
+        "p": p,
+        "rejected": p < LEVEL,
+    }
+
+
+def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
+    """Kolmogorov's distance between the measured and the forecast law of the time; its 99 % point
+    is the bootstrap's."""
+    played = measured(training)
+    times = np.sort(played.time[~np.isnan(played.time)])
+    if not len(times) or not said["law"]["s"]:
+        return {"regime": regime, "distance": None, "limit": said["distance_99"], "agrees": None}
+    grid = np.array(said["law"]["s"])
+    at = np.searchsorted(times, grid, side="right") / len(times)
+    below = np.searchsorted(times, grid, side="left") / len(times)
+    q = np.array(GRID)
+    distance = float(np.max(np.maximum(q - at, 0.0) + np.maximum(below - q, 0.0)))
+    limit = said["distance_99"] * max(1.0, math.sqrt(said["runs"] / len(times)))
+    return {
+        "regime": regime,
+        "distance": round(distance, 4),
+        "limit": round(limit, 4),
+        "agrees": distance <= limit,
+    }
+
+
+def _routing(
+    regime: str, before: Mapping[str, Any], after: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """For each place: chi-square test that training and new throws left it by the same ways equally
+    often."""
+    rows = []
+    for place in before:
+        table = ways_table(before[place], after.get(place, {}))
+        if table.shape[1] > 1 and table.sum(axis=1).min() > 0:
+            rows.append(
+                {
+                    "regime": regime,
+                    "place": place,
+                    "p": float(chi2_contingency(table).pvalue),
+                    "p_holm": None,
+                }
+            )
+    return rows

@@ -1,0 +1,86 @@
+"""Whether a campaign chooses as a forecast says that it will: other actions are another forecast's
+matter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2_contingency
+
+from petrobot.coordinator.studies.forecast.history import Training
+
+Counts = Mapping[str, Mapping[str, float]]
+"""By primitive task and action: runs."""
+OTHER = 1e-6
+"""Level below which two mixes of actions are not the same one: far beyond any chance, since
+refusing is not a test's verdict."""
+FEW = 30
+"""Runs in which a mix shows; fewer runs of one action alone say nothing about the others."""
+
+
+def choice_counts(training: Training) -> dict[str, dict[str, int]]:
+    """How often each action was run."""
+    counts: dict[str, dict[str, int]] = {}
+    for throw in training.throws:
+        for run in throw.runs:
+            actions = counts.setdefault(training.task.primitive_task_of(run.place).name, {})
+            actions[run.action] = actions.get(run.action, 0) + 1
+    return counts
+
+
+def choices_of(training: Training) -> dict[str, dict[str, float]]:
+    """How often each action was chosen, as shares."""
+    counts = choice_counts(training)
+    return {
+        t: {a: n / sum(actions.values()) for a, n in actions.items()}
+        for t, actions in counts.items()
+    }
+
+
+def misfit(said: Mapping[str, Any], run: Counts) -> list[str]:
+    """Primitive tasks whose actions a campaign chooses otherwise than a regime's forecast says."""
+    return [
+        name
+        for name, counts in run.items()
+        if name in said["choices"] and not _alike(said, name, counts)
+    ]
+
+
+def _alike(said: Mapping[str, Any], name: str, counts: Mapping[str, float]) -> bool:
+    chosen: Mapping[str, float] = {a: p for a, p in said["choices"][name].items() if p > 0}
+    trained = said.get("choice_runs", {}).get(name, said["training_throws"])
+    others = sum(n for action, n in counts.items() if action not in chosen)
+    if len(chosen) == 1 and (name in said.get("asked", [name]) or trained >= FEW):
+        return others == 0
+    known = [a for a in {**chosen, **counts} if chosen.get(a, 0.0) > 0 or counts.get(a, 0) > 0]
+    if len(known) < 2 or not sum(counts.values()):
+        return True
+    table = np.array(
+        [[chosen.get(a, 0.0) * trained for a in known], [counts.get(a, 0.0) for a in known]]
+    )
+    return float(chi2_contingency(table).pvalue) >= OTHER
+
+
+def in_words(choices: Counts, names: Iterable[str]) -> str:
+    """Actions of some primitive tasks, for people."""
+    out = []
+    for name in names:
+        whole = sum(choices[name].values())
+        shares = {a: n / whole for a, n in choices[name].items() if n > 0}
+        sole = next(iter(shares)) if len(shares) == 1 else ""
+        out.append(
+            f"{name}={sole}"
+            if sole
+            else f"{name}: " + ", ".join(f"{a} {p:.0%}" for a, p in shares.items())
+        )
+    return "; ".join(out)
+
+
+def remedy(choices: Counts, names: Iterable[str]) -> str:
+    """How a campaign chooses as a forecast says."""
+    sole = [f"{name}={next(iter(choices[name]))}" for name in names if len(choices[name]) == 1]
+    if len(sole) < len(list(names)):
+        return "run it with the selector of the training campaign"
+    return "run it with --choose " + ",".join(sole)

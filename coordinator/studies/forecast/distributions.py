@@ -1,0 +1,489 @@
+"""Laws of runs: empirical competing risks of (outcome, duration) in contexts that chi-square tests
+tell apart.
+
+Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on
+which the response depends most significantly splits the runs, again and again, until no test
+rejects independence. Factors are what had ended before in the same throw: in each action place
+outcome, action and duration of the latest run, and the number of runs. First the outcome is
+unfolded so, then, for each outcome of each of these contexts, the duration: so a strong dependence
+among durations never hides one among outcomes. Within a context a duration keeps its linear trend
+with an earlier one. Runs that were cut off are censored: the ends that were seen weigh what the
+Aalen-Johansen estimate gives them. What it leaves beyond the longest run goes on at a constant rate
+(B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974), and whoever
+draws it is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, chi2_contingency
+
+from petrobot.coordinator.studies.forecast.history import (
+    CENSORED,
+    CUT,
+    NONE,
+    Codes,
+    Runs,
+    Seen,
+    Training,
+    Values,
+    Vocabulary,
+)
+
+ALPHA = 0.01
+"""Level at which dependence counts, over all factors of a node (Bonferroni)."""
+LEAST = 30
+"""Runs in a context at least."""
+DEEPEST = 6
+OWN = 0.7
+"""A factor of the runs' own place goes before the best one if the logarithm of its p-value is at
+least this share of its."""
+SURE = 3.0
+"""Standard errors beyond which a trend within a context counts."""
+GROUPS = 6
+"""Classes of an earlier duration at most, where durations are told apart by it; half of them for
+outcomes."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """Ends that were seen in one context. Arrays over its members."""
+
+    outcome: Codes
+    preempted: np.ndarray
+    took: Values
+    weight: Values
+    throw: Codes
+    trend: Trend | None = None
+    """Durations only: how they go with an earlier one, within this context."""
+
+    @property
+    def beyond(self) -> np.ndarray:
+        """Members that stand for what comes after the longest run that was seen: their own ends are
+        not known."""
+        found: np.ndarray = self.outcome == NONE
+        return found
+
+    @property
+    def rate(self) -> float:
+        """Ends a second beyond the longest run; 0 where no end was seen at all."""
+        left, longest = float(self.weight[self.beyond].sum()), float(self.took.max(initial=0.0))
+        return -math.log(left) / longest if 0.0 < left < 1.0 and longest > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier` is
+    that of each member (s)."""
+
+    place: int
+    slope: float
+    earlier: Values
+
+
+@dataclass(frozen=True)
+class Split:
+    """What tells the contexts below a node apart."""
+
+    kind: str
+    """outcome, action, visits or took."""
+    place: int
+    edges: tuple[float, ...] = ()
+    """took: where its classes end (s)."""
+    missing: bool = False
+    """took: the first child is for throws in which no such run had ended."""
+    groups: Mapping[int, int] = field(default_factory=dict)
+    """outcome, action, visits: child of each code; any other code has the last child."""
+    p_value: float = 1.0
+
+    def child(self, seen: Seen, count: int) -> Codes:
+        """Child of each column, from what was seen in all places."""
+        if self.kind == "took":
+            seconds = seen.took[self.place]
+            group = np.searchsorted(np.array(self.edges), np.nan_to_num(seconds), side="right")
+            return np.where(np.isnan(seconds), 0, group + self.missing)
+        codes = codes_of(seen, self.kind)[self.place]
+        out = np.full(len(codes), count - 1)
+        for code, group in self.groups.items():
+            out[codes == code] = group
+        return out
+
+
+def codes_of(seen: Seen, kind: str) -> Codes:
+    """Codes (q, n) of a factor."""
+    return {"outcome": seen.outcome, "action": seen.action, "visits": seen.visits}[kind]
+
+
+@dataclass
+class Context:
+    """A node of the tree: a law, and a split with children unless it is a leaf."""
+
+    law: Law
+    number: int
+    split: Split | None = None
+    children: list[Context] = field(default_factory=list)
+    durations: dict[int, Context] = field(default_factory=dict)
+    """In a leaf of an outcome tree: the tree of the durations of each outcome."""
+
+    def leaves(self) -> list[Context]:
+        """All contexts that no test splits further."""
+        return (
+            [leaf for child in self.children for leaf in child.leaves()]
+            if self.children
+            else [self]
+        )
+
+
+class Laws:
+    """Laws of all actions of one regime: `contexts[(place code, action code)]`."""
+
+    def __init__(self, training: Training, *, unfold: bool = True) -> None:
+        self.vocabulary = training.vocabulary
+        self.contexts: dict[tuple[int, int], Context] = {}
+        self._numbers = 0
+        runs = training.runs
+        for key in sorted(set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))):
+            own = runs.of((runs.place == key[0]) & (runs.action == key[1]))
+            self.contexts[key] = self._grow(own, DEEPEST if unfold else 0, outcomes=True)
+
+    @property
+    def count(self) -> int:
+        """Nodes of all trees."""
+        return self._numbers
+
+    def _grow(self, runs: Runs, deepest: int, *, outcomes: bool) -> Context:
+        ended = with_weights(runs) if outcomes else runs
+        context = Context(_law(ended, trend=not outcomes and bool(deepest)), self._numbers)
+        self._numbers += 1
+        found = best_split(runs, outcomes=outcomes) if deepest and len(runs) >= 2 * LEAST else None
+        if found is not None:
+            context.split, child = found
+            parts = [runs.of(child == c) for c in range(int(child.max()) + 1)]
+            context.children = [self._grow(part, deepest - 1, outcomes=outcomes) for part in parts]
+        elif outcomes:
+            deepest = DEEPEST if deepest else 0
+            for code in np.unique(ended.outcome[ended.outcome != NONE]):
+                context.durations[int(code)] = self._grow(
+                    ended.of(ended.outcome == code), deepest, outcomes=False
+                )
+        return context
+
+    def splits(self) -> list[dict[str, Any]]:
+        """What was told apart, for people: place, action, by what, how many contexts, p-value."""
+        names, out = self.vocabulary, []
+        for (place, action), top in self.contexts.items():
+            stack, outcomes = [top], {top.number}
+            while stack:
+                node = stack.pop()
+                if node.number in outcomes:
+                    outcomes |= {child.number for child in node.children}
+                if node.split is not None:
+                    out.append(
+                        {
+                            "place": names.places[place],
+                            "action": names.actions[action - 1],
+                            "of": "outcome" if node.number in outcomes else "duration",
+                            "by": f"{node.split.kind} of {names.places[node.split.place]}",
+                            "contexts": len(node.children),
+                            "runs": len(node.law.took),
+                            "p": node.split.p_value,
+                        }
+                    )
+                stack += [*node.children, *node.durations.values()]
+        return out
+
+
+def with_weights(runs: Runs) -> Runs:
+    """The runs that ended, weighing their steps of the Aalen-Johansen estimate; the weights sum to
+    1.
+
+    What it leaves is shared by the runs that were cut off after the last end, which stay as members
+    without an outcome (NONE).
+    """
+    ordered = runs.of(np.lexsort((runs.censored, runs.took)))
+    n, ended = len(runs), ~ordered.censored
+    stays = np.where(ended, 1.0 - 1.0 / (n - np.arange(n)), 1.0)
+    left = np.concatenate([[1.0], np.cumprod(stays)])
+    last = int(np.flatnonzero(ended)[-1]) + 1 if ended.any() else 0
+    beyond = np.arange(n) >= last
+    weight = np.where(beyond, left[last] / max(1, n - last), -np.diff(left))
+    return replace(ordered, weight=weight, outcome=np.where(beyond, NONE, ordered.outcome)).of(
+        ended | beyond
+    )
+
+
+def _law(runs: Runs, *, trend: bool) -> Law:
+    whole = runs.weight.sum()
+    weight = runs.weight / whole if whole else runs.weight
+    return Law(
+        runs.outcome, runs.preempted, runs.took, weight, runs.throw, _trend(runs) if trend else None
+    )
+
+
+def _trend(runs: Runs) -> Trend | None:
+    """The strongest linear dependence on an earlier duration, if it is beyond three standard
+    errors."""
+    best: Trend | None = None
+    strongest, n = SURE, len(runs)
+    for place, earlier in enumerate(runs.seen.took):
+        if n < LEAST // 2 or np.isnan(earlier).any() or earlier.std() == 0 or runs.took.std() == 0:
+            continue
+        slope = float(np.cov(earlier, runs.took)[0, 1] / earlier.var(ddof=1))
+        left = float(np.var(runs.took - slope * earlier)) * n / (n - 2)
+        surety = abs(slope) * float(earlier.std()) * np.sqrt(n / max(left, 1e-18))
+        if surety > strongest:
+            best, strongest = Trend(place, slope, earlier), float(surety)
+    return best
+
+
+def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
+    """The most significant split of runs and the child of each run; None if no test rejects
+    independence.
+
+    Of factors that tell about as much, one of the runs' own place: branches side by side go on in
+    step, so the visits of one tell those of the other in every throw that was run, but the branches
+    drift apart where they are played.
+    """
+    response = runs.outcome if outcomes else _classes(runs.took)
+    groups = GROUPS // 2 if outcomes else GROUPS
+    candidates: list[tuple[float, Split, Codes]] = []
+    for place in range(len(runs.seen.outcome)):
+        for kind in ("outcome", "action", "visits", "took"):
+            made = (
+                _by_duration(runs, place, groups)
+                if kind == "took"
+                else _candidate(runs, kind, place)
+            )
+            if made is not None:
+                candidates.append((_log_p(made[1], response), *made))
+    if not candidates:
+        return None
+    best = min(candidates, key=lambda c: c[0])
+    place = int(runs.place[0])
+    own = min((c for c in candidates if c[1].place == place), key=lambda c: c[0], default=best)
+    log_p, split, child = own if own[0] < OWN * best[0] else best
+    p = min(1.0, math.exp(log_p) * len(candidates))
+    return (replace(split, p_value=p), child) if p < ALPHA else None
+
+
+def _classes(took: Values) -> Codes:
+    """Durations in four classes of about equal size."""
+    return np.searchsorted(np.quantile(took, (0.25, 0.5, 0.75)), took, side="right")
+
+
+def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
+    codes = codes_of(runs.seen, kind)[place]
+    found, counts = np.unique(codes, return_counts=True)
+    large = [int(c) for c, n in zip(found, counts, strict=True) if n >= LEAST]
+    if len(found) - len(large) and len(codes) - counts[counts >= LEAST].sum() < LEAST and large:
+        # The rest joins the most visits that are frequent: a fourth visit is more like a third one
+        # than like a first one. Of classes without an order it joins the smallest large one.
+        large.remove(
+            max(large) if kind == "visits" else min(large, key=lambda c: int(counts[found == c][0]))
+        )
+    groups = {code: i for i, code in enumerate(large)}
+    rest = bool(len(found) > len(large))
+    if len(groups) + rest < 2:
+        return None
+    split = Split(kind, place, groups=groups)
+    return split, split.child(runs.seen, len(groups) + rest)
+
+
+def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | None:
+    seconds = runs.seen.took[place]
+    known = ~np.isnan(seconds)
+    if known.sum() < 2 * LEAST or 0 < (~known).sum() < LEAST:
+        return None
+    groups = int(min(most, known.sum() // LEAST))
+    edges = np.unique(np.quantile(seconds[known], np.arange(1, groups) / groups))
+    missing = not bool(known.all())
+    split = Split("took", place, tuple(float(e) for e in edges), missing)
+    child = split.child(runs.seen, 0)
+    counts = np.bincount(child, minlength=len(edges) + 1 + missing)
+    return (split, child) if len(counts) > 1 and counts.min() >= LEAST // 2 else None
+
+
+def _log_p(child: Codes, response: Codes) -> float:
+    """Logarithm of the p-value of the chi-square test of independence; 0 where one of them does not
+    vary."""
+    table = crossed(child, response)
+    if min(table.shape) < 2:
+        return 0.0
+    test = chi2_contingency(table)
+    return float(chi2.logsf(test.statistic, test.dof))
+
+
+def crossed(one: Codes, other: Codes) -> np.ndarray:
+    """Contingency table of two codes, only of those that occur."""
+    _, a = np.unique(one, return_inverse=True)
+    _, b = np.unique(other, return_inverse=True)
+    table = np.zeros((a.max() + 1, b.max() + 1), np.int64)
+    np.add.at(table, (a, b), 1)
+    return table
+
+
+def dependences(training: Training) -> list[dict[str, Any]]:
+    """Chi-square tests of the statuses of two places within one throw (first runs), the most
+    significant first."""
+    vocabulary, runs = training.vocabulary, training.runs
+    status = first_statuses(vocabulary, runs, len(training.throws))
+    out = []
+    for i, one in enumerate(vocabulary.places):
+        for j in range(i + 1, len(vocabulary.places)):
+            both = (status[i] >= 0) & (status[j] >= 0)
+            table = (
+                crossed(status[i][both], status[j][both])
+                if both.any()
+                else np.zeros((1, 1), np.int64)
+            )
+            if min(table.shape) < 2:
+                continue
+            p = float(chi2_contingency(table).pvalue)
+            out.append({"places": [one, vocabulary.places[j]], "throws": int(both.sum()), "p": p})
+    return sorted(out, key=lambda d: float(d["p"]))
+
+
+def first_statuses(vocabulary: Vocabulary, runs: Runs, throws: int) -> Codes:
+    """(q, throws): status code of the first run in each place of each throw; CENSORED - 1 where
+    there is none."""
+    out = np.full((len(vocabulary.places), throws), CENSORED - 1)
+    status, _ = vocabulary.parts(runs.outcome)
+    for i in range(len(runs) - 1, -1, -1):
+        out[runs.place[i], runs.throw[i]] = status[i]
+    return out
+
+
+# Draws ends of runs and waits from laws, for many replicas at once, each with its own bootstrap weights of the throws.
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Drawn ends of runs. Arrays (columns,)."""
+
+    outcome: Codes
+    preempted: Mask
+    took: Values
+    """s; infinite where no run was ever seen to end."""
+    beyond: Mask
+    """It lasts longer than any run that was seen: its end is an extrapolation."""
+
+
+class Drawer:
+    """`weights` (replicates, throws): how often each training throw counts in each replicate; `of`
+    each column's replicate."""
+
+    def __init__(
+        self,
+        laws: Laws,
+        waits: Mapping[str, tuple[Values, Codes]],
+        weights: Values,
+        random: np.random.Generator,
+    ) -> None:
+        self._laws, self._waits, self._weights, self._random = laws, waits, weights, random
+        self._bounds: dict[object, Values] = {}
+
+    def ends(self, place: int, action: Codes, replicate: Codes, seen: Seen) -> Ends:
+        """Ends of runs that begin now in a place, given what had ended before.
+
+        Raises KeyError for an action that was never run there.
+        """
+        n = len(action)
+        out = Ends(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n), np.zeros(n, np.bool_))
+        for code in np.unique(action):
+            top = self._laws.contexts[place, int(code)]
+            self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
+        return out
+
+    def _descend(
+        self, node: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+    ) -> None:
+        if node.split is None:
+            self._draw_leaf(node, columns, replicate, seen, out)
+            return
+        child = node.split.child(seen.of(columns), len(node.children))
+        for c, below in enumerate(node.children):
+            own = columns[child == c]
+            if len(own):
+                self._descend(below, own, replicate, seen, out)
+
+    def _draw_leaf(
+        self, leaf: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+    ) -> None:
+        """First the outcome, then the duration from the outcome's own tree."""
+        law = leaf.law
+        index = self._draw(leaf.number, law.weight, law.throw, replicate[columns])
+        if not leaf.durations and not law.beyond.any():
+            out.took[columns] = law.took[index] + _along(law, index, seen.took[:, columns])
+            np.clip(out.took, 0.0, None, out=out.took)
+            return
+        out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
+        beyond = law.beyond[index]
+        if beyond.any():
+            self._draw_beyond(leaf, columns[beyond], replicate, out)
+        for code, tree in leaf.durations.items():
+            own = columns[law.outcome[index] == code]
+            if len(own):
+                self._descend(tree, own, replicate, seen, out)
+
+    def _draw_beyond(self, leaf: Context, columns: Codes, replicate: Codes, out: Ends) -> None:
+        """Longer than the longest run: at a constant rate, with outcomes in the shares of those
+        that were seen."""
+        law, seen = leaf.law, np.flatnonzero(~leaf.law.beyond)
+        out.beyond[columns] = True
+        if not law.rate or not len(seen):
+            out.outcome[columns], out.preempted[columns], out.took[columns] = CUT, False, np.inf
+            return
+        index = seen[
+            self._draw(
+                (leaf.number, "beyond"), law.weight[seen], law.throw[seen], replicate[columns]
+            )
+        ]
+        out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
+        out.took[columns] = law.took.max() - np.log1p(-self._random.random(len(columns))) / law.rate
+
+    def wait(self, transition: str, replicate: Codes) -> Values | None:
+        """Waits of a transition (s), one for each column; None if it was never measured."""
+        if transition not in self._waits:
+            return None
+        seconds, throws = self._waits[transition]
+        index = self._draw(transition, np.full(len(seconds), 1.0 / len(seconds)), throws, replicate)
+        drawn: Values = seconds[index]
+        return drawn
+
+    def _draw(self, key: object, weight: Values, throws: Codes, replicate: Codes) -> Codes:
+        """A member for each column, by its replicate's weights; by the plain ones where those leave
+        none."""
+        bounds = self._bounds.get(key)
+        if bounds is None:
+            each = weight * self._weights[:, throws]
+            each = np.where(each.sum(axis=1, keepdims=True) > 0, each, weight)
+            bounds = np.cumsum(each, axis=1)
+            bounds = bounds / bounds[:, -1:] + np.arange(len(bounds))[:, None]
+            self._bounds[key] = bounds
+        members = bounds.shape[1]
+        at = np.searchsorted(
+            bounds.ravel(), replicate + self._random.random(len(replicate)), side="right"
+        )
+        index: Codes = np.clip(at - replicate * members, 0, members - 1)
+        return index
+
+    def chance(self, n: int) -> Values:
+        """Uniform numbers."""
+        return self._random.random(n)
+
+
+def _along(law: Law, index: Codes, took: Values) -> Values:
+    """What the trend of a law adds to drawn durations, for columns in which other runs took other
+    times before."""
+    if law.trend is None:
+        return np.zeros(len(index))
+    now = took[law.trend.place]
+    return law.trend.slope * np.where(np.isnan(now), 0.0, now - law.trend.earlier[index])

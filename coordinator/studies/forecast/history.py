@@ -1,0 +1,366 @@
+"""Runs of a campaign as arrays: what each came to, how long it took, and what had ended before it
+in its throw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.coordinator.analysis.time.stochastic import is_cause
+from petrobot.coordinator.learning.estimate import CENSORED as CENSORED_CAUSE
+from petrobot.coordinator.learning.estimate import Tally
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.forecast.registered import ForecastError
+from petrobot.coordinator.task import End, Kind, Status, Task, Transition
+
+Codes = NDArray[np.int64]
+Values = NDArray[np.float64]
+
+CENSORED = -1
+"""Status code of a run that was preempted and counts none."""
+NONE = 0
+"""Outcome and action code of a place where no run has ended in this throw yet."""
+CUT = 1
+"""Outcome code of a run that nothing is known to end: no status, and no transition took it."""
+STATUSES: Final[tuple[Status, ...]] = tuple(Status)
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Numbers for names: action places, transitions and actions of a flat task."""
+
+    places: tuple[str, ...]
+    transitions: tuple[str, ...]
+    actions: tuple[str, ...]
+    open: frozenset[str] = frozenset()
+    """Places whose ended runs the marking alone does not lead on (an event, a timer or a variable
+    decides): there the transition that took a run belongs to its outcome; elsewhere it follows from
+    the statuses and from what else has ended."""
+    cutting: frozenset[str] = frozenset()
+    """Transitions that preempt as soon as the marking allows it: they cut runs off, whose own ends
+    are then not known."""
+
+    @classmethod
+    def of(cls, task: Task) -> Vocabulary:
+        """Of a task."""
+        flat = task.flat
+        taking = [
+            t
+            for t in flat.transitions.values()
+            if t.events or t.after is not None or reads_variables(t)
+        ]
+        cutting = [
+            t.name
+            for t in flat.transitions.values()
+            if any(a.end is End.PREEMPT for a in t.inputs) and not is_cause(t)
+        ]
+        actions = dict.fromkeys(a for p in flat.primitive_tasks.values() for a in p.alternatives)
+        places = tuple(p.name for p in flat.places.values() if p.kind is Kind.ACTION)
+        undecided = frozenset(
+            a.place for t in taking for a in t.inputs if a.end in (End.NORMAL, End.ERROR)
+        )
+        return cls(places, tuple(flat.transitions), tuple(actions), undecided, frozenset(cutting))
+
+    def outcome(self, status: int, taken: int) -> int:
+        """One code, above 0, for a status code and the transition that took the token (-1: none
+        did)."""
+        return CUT + (status + 1) * (len(self.transitions) + 1) + taken + 1
+
+    def parts(self, outcome: Codes) -> tuple[Codes, Codes]:
+        """Status codes and transitions behind outcome codes above 0."""
+        status, taken = np.divmod(outcome - CUT, len(self.transitions) + 1)
+        return status - 1, taken - 1
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What had ended before in the same throw. Arrays (q places, n columns)."""
+
+    outcome: Codes
+    """Of the latest run in each place; NONE without any."""
+    action: Codes
+    took: Values
+    """s; nan without any."""
+    visits: Codes
+    """How many runs had ended there."""
+
+    @classmethod
+    def nothing(cls, q: int, n: int) -> Seen:
+        """Nothing has ended yet."""
+        return cls(
+            np.zeros((q, n), np.int64),
+            np.zeros((q, n), np.int64),
+            np.full((q, n), np.nan),
+            np.zeros((q, n), np.int64),
+        )
+
+    def of(self, which: NDArray[np.bool_] | Codes) -> Seen:
+        """Some columns."""
+        return Seen(
+            self.outcome[:, which],
+            self.action[:, which],
+            self.took[:, which],
+            self.visits[:, which],
+        )
+
+    def note(self, q: int, columns: Codes, outcome: Codes, action: Codes, took: Values) -> None:
+        """Runs have ended in a place."""
+        self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = (
+            outcome,
+            action,
+            took,
+        )
+        self.visits[q, columns] += 1
+
+
+@dataclass(frozen=True)
+class Runs:
+    """All runs of some throws. `n` runs, `q` action places."""
+
+    place: Codes
+    action: Codes
+    """Code of the action, above 0."""
+    outcome: Codes
+    preempted: NDArray[np.bool_]
+    """A transition took its token while it went on."""
+    censored: NDArray[np.bool_]
+    """Something cut it off: its own end is not known, only that it had lasted so long."""
+    took: Values
+    """s from the token's coming to its end."""
+    throw: Codes
+    """Index of its throw."""
+    weight: Values
+    seen: Seen
+
+    def of(self, which: NDArray[np.bool_] | Codes) -> Runs:
+        """Some of them."""
+        return Runs(
+            self.place[which],
+            self.action[which],
+            self.outcome[which],
+            self.preempted[which],
+            self.censored[which],
+            self.took[which],
+            self.throw[which],
+            self.weight[which],
+            self.seen.of(which),
+        )
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a regime's throws are known to be."""
+
+    task: Task
+    vocabulary: Vocabulary
+    throws: tuple[Throw, ...]
+    runs: Runs
+    waits: dict[str, tuple[Values, Codes]]
+    """By waiting transition: seconds of each firing, and the throw that it belongs to."""
+    whole: bool = True
+    """Its throws are those that were run; else each holds a single run or wait, and what a throw
+    came to is not known."""
+
+    @classmethod
+    def of(cls, task: Task, throws: Iterable[Throw], *, whole: bool = True) -> Training:
+        """Of throws. Raises ValueError without any."""
+        kept, vocabulary = tuple(throws), Vocabulary.of(task)
+        if not kept:
+            raise ValueError("no throw to learn from")
+        waits: dict[str, list[tuple[float, int]]] = {}
+        timers = _cutting_timers(task)
+        for i, throw in enumerate(kept):
+            for name, seconds in (
+                *throw.waits,
+                *((t, s) for t in timers for s in _waited(t, throw)),
+            ):
+                waits.setdefault(name, []).append((seconds, i))
+        return cls(
+            task,
+            vocabulary,
+            kept,
+            _runs(vocabulary, kept),
+            {
+                name: (np.array([s for s, _ in w]), np.array([i for _, i in w]))
+                for name, w in waits.items()
+            },
+            whole,
+        )
+
+
+def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
+    """The training of each regime of a table."""
+    throws: dict[str, list[Throw]] = {}
+    for row in rows:
+        if row.throw is not None:
+            throws.setdefault(row.regime, []).append(row.throw)
+    return {regime: Training.of(task, kept) for regime, kept in throws.items()}
+
+
+def _cutting_timers(task: Task) -> list[str]:
+    """Timers that preempt beside other runs and wait for nothing but runs: their waits follow from
+    those that they took."""
+    return [
+        t.name
+        for t in task.flat.transitions.values()
+        if t.after is not None
+        and not t.events
+        and not is_cause(t)
+        and any(a.end is End.PREEMPT for a in t.inputs)
+        and all(a.end in (End.PREEMPT, End.NORMAL, End.ERROR) for a in t.inputs)
+    ]
+
+
+def _waited(timer: str, throw: Throw) -> list[float]:
+    """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended,
+    where it takes ended ones)."""
+    by_place: dict[str, list[RunEntry]] = {}
+    for run in throw.runs:
+        if run.taken == timer:
+            by_place.setdefault(run.place, []).append(run)
+    out = []
+    for taken in zip(*by_place.values(), strict=False):
+        fired = max(run.begun + run.took for run in taken)
+        out.append(fired - max(run.begun + (0.0 if run.cancelled else run.took) for run in taken))
+    return out
+
+
+def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
+    places = {name: i for i, name in enumerate(vocabulary.places)}
+    actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
+    flat = [(i, run) for i, throw in enumerate(throws) for run in throw.runs if run.place in places]
+    codes = [_outcome(vocabulary, run) for _, run in flat]
+    n, q = len(flat), len(places)
+    seen = Seen.nothing(q, n)
+    begin = 0
+    while begin < n:
+        end = begin
+        while end < n and flat[end][0] == flat[begin][0]:
+            end += 1
+        for j in range(begin, end):
+            for i in _ended_before(flat, j, begin, end):
+                run = flat[i][1]
+                one = (
+                    np.array([codes[i]]),
+                    np.array([actions.get(run.action, 0)]),
+                    np.array([run.took]),
+                )
+                seen.note(places[run.place], np.array([j]), *one)
+        begin = end
+    return Runs(
+        np.array([places[run.place] for _, run in flat], np.int64),
+        np.array([actions.get(run.action, 0) for _, run in flat], np.int64),
+        np.array(codes, np.int64),
+        np.array([run.cancelled for _, run in flat], np.bool_),
+        np.array([_is_cut_off(vocabulary, run) for _, run in flat], np.bool_),
+        np.array([run.took for _, run in flat]),
+        np.array([i for i, _ in flat], np.int64),
+        np.ones(n),
+        seen,
+    )
+
+
+def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int) -> list[int]:
+    """Runs of the same throw that had ended when run j began, in the order of their ends."""
+    came = flat[j][1].begun
+    over = [
+        i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9
+    ]
+    return sorted((i for i in over if i < j), key=lambda i: flat[i][1].begun + flat[i][1].took)
+
+
+def _outcome(vocabulary: Vocabulary, run: RunEntry) -> int:
+    status = STATUSES.index(Status(run.status)) if run.status else CENSORED
+    told = run.taken in vocabulary.transitions and (run.cancelled or run.place in vocabulary.open)
+    return vocabulary.outcome(status, vocabulary.transitions.index(run.taken) if told else -1)
+
+
+def _is_cut_off(vocabulary: Vocabulary, run: RunEntry) -> bool:
+    """By a transition that fires as the marking allows, or by nothing of the task (an abort, the
+    end of the records)."""
+    if run.cancelled and run.taken in vocabulary.transitions:
+        return run.taken in vocabulary.cutting
+    return not run.status
+
+
+def reads_variables(t: Transition) -> bool:
+    """Whether its condition looks at more than the statuses of the runs that it takes."""
+    return t.when is not None and not t.when.names <= {
+        f"{a.place}.status" for a in t.inputs if a.end is not None
+    }
+
+
+# Training from an estimates file, where only sums and samples of runs are left: every run stands for itself, without history.
+
+
+def read_estimates(path: Path) -> Estimates:
+    """What an estimates file holds. Raises ForecastError."""
+    try:
+        kept = EstimatesFile(path).read() if path.exists() else None
+    except EstimatesError as fault:
+        raise ForecastError(str(fault)) from fault
+    if kept is None or not kept.estimates.tallies:
+        raise ForecastError(
+            f"{path} holds no estimates; give a campaign's folder or a file that `run "
+            "--learn` wrote"
+        )
+    return kept.estimates
+
+
+def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
+    """Of estimates, by regime."""
+    regimes = sorted({regime_of(key.context) for key in estimates.tallies})
+    return {
+        regime: Training.of(task, _throws(task, estimates, regime), whole=False)
+        for regime in regimes
+    }
+
+
+def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:
+    """A throw of its own for each run of the samples, as often as it stands for a run that was
+    counted."""
+    flat, context = task.flat, context_of(regime)
+    out: list[Throw] = []
+    for place in flat.places.values():
+        if place.kind is not Kind.ACTION:
+            continue
+        for key, tally in estimates.tallies.items():
+            if (key.primitive_task, key.context) == (place.task, context):
+                out += [
+                    Throw(1, 0.0, runs=[run])
+                    for run in _runs_of_sums(place.name, key.action, tally)
+                ]
+    for where, flow in estimates.flows.items():
+        if (where.task, where.context) == (task.name, context) and flow.waits.n:
+            out.append(Throw(1, 0.0, waits=[(where.transition, flow.waits.mean)]))
+    return out
+
+
+def _runs_of_sums(place: str, action: str, tally: Tally) -> list[RunEntry]:
+    """Runs with the counts of the tally and the durations of its sample (each exit's, again and
+    again; its mean without any)."""
+    out: list[RunEntry] = []
+    for exit_, moments in tally.durations.items():
+        counted, _, transition = exit_.partition(":")
+        seconds = tally.sample.seconds([exit_]) or [moments.mean]
+        status = "" if counted == CENSORED_CAUSE else counted
+        for i in range(moments.n):
+            took = seconds[i % len(seconds)]
+            out.append(
+                RunEntry(
+                    place, action, 0.0, took, status, taken=transition, cancelled=bool(transition)
+                )
+            )
+    return out

@@ -1,0 +1,352 @@
+"""Plays throws of a task through its net, many side by side: runs end as their laws draw, the net
+says what follows.
+
+This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place
+an action is chosen, then how and when its run will end is drawn in one draw (competing risks: of
+itself with a status, or preempted by an event or a timer); transitions that wait for events or
+timers race with their measured waits; everything else fires at once, also what preempts a run
+because another one has ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
+from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
+from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
+from petrobot.coordinator.task import Counts, Status
+from petrobot.coordinator.task.net import Marking
+
+IDLE, GOING, DONE = 0, 1, 2
+LONGEST = 10_000
+"""Firings without time going on, and steps of a throw, after which it counts as one that never
+ends."""
+Choices = Mapping[str, Mapping[str, float]]
+"""By primitive task: the probability of each action."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """What throws came to. Arrays (columns,); a throw that never ended has not completed."""
+
+    goals: Codes
+    completed: Mask
+    all_success: Mask
+    time: Values
+    """s from the taking of the run token to the end; nan for those that did not complete."""
+    endless: int = 0
+    """Throws that were cut off after `longest` steps."""
+    beyond: Mapping[str, int] = field(default_factory=dict)
+    """By action place: throws in which a run went on for longer than any run that was seen, before
+    anything took it."""
+    astray: Mapping[str, int] = field(default_factory=dict)
+    """By transition: throws in which its measured preemption came when the marking did not allow
+    it."""
+    ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """By action place: how often each transition took a token out of it."""
+
+
+class Play:
+    """Throws under way; `replicate` (columns,) says whose bootstrap weights each one draws with."""
+
+    def __init__(
+        self,
+        structure: Structure,
+        drawer: Drawer,
+        choices: Choices,
+        replicate: Codes,
+        longest: int = LONGEST,
+    ) -> None:
+        """`longest`: steps (ends of runs and of waits) of a throw at most. Raises ValueError for a
+        choice without probabilities."""
+        self._longest = longest
+        self._s, self._drawer = structure, drawer
+        n, q = len(replicate), len(structure.vocabulary.places)
+        self._choices = [self._choice(choices, name) for name in structure.vocabulary.places]
+        self._quick = [m for m in structure.moves if not m.waits]
+        self._slow = [m for m in structure.moves if m.waits and not m.cause]
+        self._column = np.arange(n)
+        self._replicate = replicate
+        self._tokens = np.repeat(structure.initial[:, None], n, axis=1)
+        self._phase = np.zeros((q, n), np.int8)
+        self._status, self._want = np.zeros((q, n), np.int64), np.full((q, n), -1)
+        self._came = np.zeros((q, n))
+        self._preempted, self._end = np.zeros((q, n), np.bool_), np.full((q, n), np.inf)
+        self._due = np.full((len(self._slow), n), np.inf)
+        self._action, self._outcome = np.zeros((q, n), np.int64), np.zeros((q, n), np.int64)
+        self._took, self._beyond = np.zeros((q, n)), np.zeros((q, n), np.bool_)
+        self._odd: dict[tuple[str, str], set[int]] = {}
+        self._ways: dict[str, dict[str, int]] = {}
+        self._seen = Seen.nothing(q, n)
+        self._now, self._begun = np.zeros(n), np.zeros(n)
+        self._goals, self._good = np.zeros(n, np.int64), np.ones(n, np.bool_)
+        self._ends: dict[Marking, int] = {}
+        self._out = Played(
+            np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n, np.bool_), np.full(n, np.nan)
+        )
+
+    def _choice(self, choices: Choices, place: str) -> tuple[Codes, Values]:
+        primitive = self._s.task.primitive_task_of(place)
+        known = {a: p for a, p in choices.get(primitive.name, {}).items() if p > 0}
+        codes = [self._s.vocabulary.actions.index(a) + 1 for a in known]
+        bounds = np.cumsum(list(known.values()))
+        return np.array(codes, np.int64), bounds / bounds[-1] if len(bounds) else bounds
+
+    def run(self) -> Played:
+        """Play all to their ends. Raises KeyError and ValueError for what was never measured."""
+        for q, place in enumerate(self._s.action_places):
+            if self._s.initial[place]:
+                self._start(q, np.arange(len(self._column)))
+        for _ in range(self._longest):
+            self._settle()
+            self._finish(self._over())
+            if not len(self._column):
+                break
+            self._wait()
+            self._advance()
+        return replace(
+            self._out,
+            endless=len(self._column),
+            beyond={
+                name: len(columns)
+                for (kind, name), columns in self._odd.items()
+                if kind == "beyond"
+            },
+            astray={
+                name: len(columns)
+                for (kind, name), columns in self._odd.items()
+                if kind == "astray"
+            },
+            ways=self._ways,
+        )
+
+    # --- one step -----------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """Fire what needs no time until nothing does."""
+        for _ in range(LONGEST):
+            able = np.array([self._enabled(m) for m in self._quick])
+            priority = np.array([2 * m.priority - m.yields for m in self._quick])[:, None]
+            highest = np.where(able, priority, np.iinfo(np.int64).min).max(axis=0)
+            able &= priority == highest
+            some: Mask = np.asarray(able.any(axis=0))
+            if not some.any():
+                return
+            weight = able * np.array([m.weight for m in self._quick])[:, None]
+            bounds = np.cumsum(weight, axis=0)
+            draw = self._drawer.chance(len(some)) * bounds[-1]
+            chosen = np.where(some, (bounds <= draw).sum(axis=0), -1)
+            for i, move in enumerate(self._quick):
+                columns = np.flatnonzero(chosen == i)
+                if len(columns):
+                    self._fire(move, columns)
+        raise ValueError(
+            f"{self._s.task.name}: transitions fire for ever without time going on; run "
+            "petrobot check"
+        )
+
+    def _enabled(self, m: Move) -> Mask:
+        out = np.ones(len(self._column), np.bool_)
+        for place, weight in m.take:
+            out &= self._tokens[place] >= weight
+        for place, threshold in m.inhibit:
+            out &= self._tokens[place] < threshold
+        for q in m.normal:
+            out &= (self._phase[q] == DONE) & (self._status[q] != ERROR) & self._wanted(q, m)
+        for q in m.error:
+            out &= (self._phase[q] == DONE) & (self._status[q] == ERROR) & self._wanted(q, m)
+        for q in m.going:
+            out &= self._phase[q] == GOING
+        for q, _ in m.preempt:
+            out &= (self._phase[q] != IDLE) if m.takes_done else (self._phase[q] == GOING)
+        if m.allowed is not None:
+            ended = [np.clip(self._status[q], 0, None) for q in m.normal + m.error]
+            out &= m.allowed[tuple(ended)]
+        return out
+
+    def _wanted(self, q: int, m: Move) -> Mask:
+        free: Mask = (self._want[q] < 0) | (self._want[q] == m.number)
+        return free
+
+    def _fire(self, m: Move, columns: Codes) -> None:
+        for place, weight in m.take:
+            self._tokens[place, columns] -= weight
+        for q, counts in m.preempt:
+            if not m.cause:
+                self._cut(q, m, counts, columns[self._phase[q, columns] == GOING])
+        for q in (*m.normal, *m.error, *(q for q, _ in m.preempt)):
+            self._phase[q, columns], self._end[q, columns] = IDLE, np.inf
+            ways = self._ways.setdefault(self._s.vocabulary.places[q], {})
+            ways[m.name] = ways.get(m.name, 0) + len(columns)
+        for place, weight in m.give:
+            self._tokens[place, columns] += weight
+        if m.takes_run:
+            self._begun[columns] = self._now[columns]
+        self._goals[columns] += m.is_goal
+        for q in m.starts:
+            self._start(q, columns)
+
+    def _cut(self, q: int, m: Move, counts: Counts, columns: Codes) -> None:
+        """Runs that are taken while they go on: they count as the arc says, whatever they would
+        have come to."""
+        status = CENSORED if counts is Counts.NONE else STATUSES.index(Status(counts.value))
+        lasted = self._now[columns] - self._came[q, columns]
+        code = np.full(len(columns), self._s.vocabulary.outcome(status, m.number))
+        self._seen.note(q, columns, code, self._action[q, columns], lasted)
+        self._good[columns] &= status <= SUCCESS
+
+    def _note_odd(self, kind: str, name: str, columns: Codes) -> None:
+        if len(columns):
+            self._odd.setdefault((kind, name), set()).update(self._column[columns].tolist())
+
+    def _start(self, q: int, columns: Codes) -> None:
+        """Choose an action and draw how its run will end."""
+        codes, bounds = self._choices[q]
+        if not len(codes):
+            raise ValueError(f"{self._s.vocabulary.places[q]}: no action has a probability above 0")
+        which = np.searchsorted(bounds, self._drawer.chance(len(columns)), side="right")
+        action = codes[np.minimum(which, len(codes) - 1)]
+        ends = self._drawer.ends(q, action, self._replicate[columns], self._seen.of(columns))
+        status, taken = self._s.vocabulary.parts(ends.outcome)
+        self._phase[q, columns], self._status[q, columns], self._want[q, columns] = (
+            GOING,
+            status,
+            taken,
+        )
+        self._preempted[q, columns], self._end[q, columns] = (
+            ends.preempted,
+            self._now[columns] + ends.took,
+        )
+        self._action[q, columns], self._outcome[q, columns], self._took[q, columns] = (
+            action,
+            ends.outcome,
+            ends.took,
+        )
+        self._came[q, columns], self._beyond[q, columns] = self._now[columns], ends.beyond
+
+    def _wait(self) -> None:
+        """Draw when transitions that wait will fire, as soon as they can; forget it when they
+        cannot any more."""
+        for i, move in enumerate(self._slow):
+            able = self._enabled(move)
+            fresh = np.flatnonzero(able & np.isinf(self._due[i]))
+            if len(fresh):
+                self._due[i, fresh] = self._now[fresh] + self._drawn_wait(move, fresh)
+            self._due[i, ~able] = np.inf
+
+    def _drawn_wait(self, move: Move, columns: Codes) -> Values:
+        drawn = self._drawer.wait(move.name, self._replicate[columns])
+        if drawn is not None:
+            return drawn
+        if move.after is not None:
+            return np.full(len(columns), move.after)
+        if move.mean_wait is None:
+            return np.full(len(columns), 1e12)  # its event was never seen to come
+        return -move.mean_wait * np.log1p(-self._drawer.chance(len(columns)))
+
+    def _advance(self) -> None:
+        """On to the next end of a run or of a wait in each column."""
+        q = self._end.argmin(axis=0)
+        ends = self._end[q, np.arange(len(q))]
+        i = self._due.argmin(axis=0) if len(self._slow) else np.zeros(len(q), np.int64)
+        dues = self._due[i, np.arange(len(q))] if len(self._slow) else np.full(len(q), np.inf)
+        soonest = np.minimum(ends, dues)
+        moving = np.isfinite(soonest)
+        self._now = np.where(moving, soonest, self._now)
+        for number in range(len(self._end)):
+            self._end_runs(number, np.flatnonzero(moving & (ends <= dues) & (q == number)))
+        for number, move in enumerate(self._slow):
+            columns = np.flatnonzero(moving & (dues < ends) & (i == number))
+            if len(columns):
+                self._due[number, columns] = np.inf
+                self._fire(move, columns)
+        self._free(np.flatnonzero(~moving))
+
+    def _end_runs(self, q: int, columns: Codes) -> None:
+        if not len(columns):
+            return
+        self._end[q, columns] = np.inf
+        self._note_odd("beyond", self._s.vocabulary.places[q], columns[self._beyond[q, columns]])
+        self._seen.note(
+            q, columns, self._outcome[q, columns], self._action[q, columns], self._took[q, columns]
+        )
+        self._good[columns] &= self._status[q, columns] <= SUCCESS  # censored ones spoil nothing
+        cut = columns[self._preempted[q, columns]]
+        self._phase[q, columns] = DONE
+        self._phase[q, cut] = GOING
+        for number in np.unique(self._want[q, cut]):
+            own = cut[self._want[q, cut] == number]
+            able = (
+                self._enabled(self._s.moves[number])[own]
+                if number >= 0
+                else np.zeros(len(own), np.bool_)
+            )
+            if able.any():
+                self._fire(self._s.moves[number], own[able])
+            self._phase[q, own[~able]] = (
+                DONE  # what preempts it is not enabled: it ends by itself, with that status
+            )
+            self._note_odd("astray", self._s.moves[number].name, own[~able])
+
+    def _free(self, stuck: Codes) -> None:
+        """Nothing will happen in these columns: let the ended runs go any way that their status
+        allows, else give up."""
+        for q, place in enumerate(self._s.vocabulary.places):
+            self._note_odd(
+                "beyond", place, stuck[(self._phase[q, stuck] == GOING) & self._beyond[q, stuck]]
+            )
+        held = ((self._want[:, stuck] >= 0) & (self._phase[:, stuck] == DONE)).any(axis=0)
+        self._want[:, stuck[held]] = -1
+        dead = np.zeros(len(self._column), np.bool_)
+        dead[stuck[~held]] = True
+        self._finish(np.where(dead, -1, 0))
+
+    # --- ends ---------------------------------------------------------------------------------
+
+    def _over(self) -> Codes:
+        """1: as designed, -1: given up, 0: goes on."""
+        _, first, inverse = np.unique(self._keys(), return_index=True, return_inverse=True)
+        verdicts = np.array(
+            [self._judge(tuple(self._tokens[:, i].tolist())) for i in first], np.int64
+        )
+        return verdicts[inverse.ravel()]
+
+    def _keys(self) -> Codes:
+        """One number for each column's marking: its digits in a base above every count of
+        tokens."""
+        base = int(self._tokens.max(initial=0)) + 1
+        if base ** len(self._tokens) >= 2**62:
+            return np.unique(self._tokens, axis=1, return_inverse=True)[1].ravel()
+        keys: Codes = base ** np.arange(len(self._tokens)) @ self._tokens
+        return keys
+
+    def _judge(self, marking: Marking) -> int:
+        if marking not in self._ends:
+            task = self._s.task
+            values = dict(zip(task.net.places, marking, strict=True))
+            given_up = task.final_error is not None and task.final_error.holds(values)
+            self._ends[marking] = 1 if task.final.holds(values) else -1 if given_up else 0
+        return self._ends[marking]
+
+    def _finish(self, verdict: Codes) -> None:
+        """Note the columns that are over and play on with the others."""
+        over = verdict != 0
+        if not over.any():
+            return
+        own, done = self._column[over], verdict[over] > 0
+        self._out.goals[own], self._out.completed[own] = self._goals[over], done
+        self._out.all_success[own] = self._good[over] & done
+        self._out.time[own] = np.where(done, self._now[over] - self._begun[over], np.nan)
+        kept = ~over
+        self._seen = self._seen.of(kept)
+        for name in ("_column", "_replicate", "_now", "_begun", "_goals", "_good"):
+            setattr(self, name, getattr(self, name)[kept])
+        for name in (
+            "_tokens", "_phase", "_status", "_want", "_preempted", "_end", "_due", "_action", "_outcome", "_took",
+            "_came", "_beyond",
+        ):  # fmt: skip
+            setattr(self, name, getattr(self, name)[:, kept])

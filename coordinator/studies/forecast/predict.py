@@ -1,0 +1,240 @@
+"""The forecast of one regime: expected numbers, predictive samples by a cluster bootstrap, and the
+product rule beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.studies.forecast.agreement import predictive_interval, share_weight
+from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
+from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws, dependences
+from petrobot.coordinator.studies.forecast.history import Training, Values
+from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
+from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
+from petrobot.coordinator.studies.forecast.residual import doubts, residuals, routing
+
+POINT = 40_000
+"""Throws played for the expected numbers: the simulation's own error of a share is then below 0.25
+points."""
+REPLICATES = 200
+TOGETHER = 25_000
+"""Throws played side by side."""
+LEVEL = 0.95
+SHARES = ("R_goal", "P_complete", "R_conj")
+TIMES = ("mean", "q90")
+GRID = tuple(float(q) for q in np.linspace(0.005, 0.995, 100))
+"""Probabilities at which the law of the time is kept."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a forecast."""
+
+    runs: int
+    """Throws that will be run."""
+    choices: Choices
+    seed: int = 1
+    replicates: int = REPLICATES
+    point: int = POINT
+
+
+def figures(played: Played) -> dict[str, float]:
+    """The numbers that are forecast, of played or measured throws; times are nan where no throw
+    completed."""
+    times = played.time[played.completed & ~np.isnan(played.time)]
+    return {
+        "R_goal": float(np.mean(played.goals > 0)),
+        "P_complete": float(np.mean(played.completed)),
+        "R_conj": float(np.mean(played.all_success)),
+        "mean": float(np.mean(times)) if len(times) else float("nan"),
+        "q90": float(np.quantile(times, 0.9)) if len(times) else float("nan"),
+    }
+
+
+def predict(training: Training, request: Request) -> dict[str, Any]:
+    """Forecast further throws of a regime. Raises ValueError for a choice that was never
+    measured."""
+    structure, laws = Structure.of(training.task), Laws(training)
+    _refuse_unmeasured(training, laws, request.choices)
+    random = np.random.default_rng(request.seed)
+    even = np.ones((1, len(training.throws)))
+    residual = (
+        residuals(training, _replayed(training, structure, laws, request)) if training.whole else []
+    )
+    whole = _played(
+        training, structure, laws, request, even, np.zeros(request.point, np.int64), random
+    )
+    samples, distances = _bootstrap(training, structure, laws, request, whole, random)
+    point = figures(whole)
+    times = whole.time[whole.completed]
+    return {
+        "training_throws": len(training.throws),
+        "runs": request.runs,
+        "figures": {
+            name: _figure(name, point[name], samples[name], request, len(training.throws))
+            for name in (*SHARES, *TIMES)
+        },
+        "product": product_rule(training, request.choices),
+        "law": {"q": list(GRID), "s": _rounded(np.quantile(times, GRID)) if len(times) else []},
+        "distance_99": round(float(np.quantile(distances, 0.99)), 6),
+        "contexts": laws.count,
+        "splits": laws.splits(),
+        "dependence": dependences(training),
+        "residual": residual,
+        "doubts": doubts(residual, whole, request.point),
+        "routing": routing(training, request.choices),
+        "choice_runs": {
+            name: sum(actions.values()) for name, actions in choice_counts(training).items()
+        },
+        "asked": sorted(
+            name
+            for name, chosen in request.choices.items()
+            if dict(chosen) != choices_of(training).get(name)
+        ),
+        "not_back": sum(t.completed and t.time is None for t in training.throws),
+        "endless": round(whole.endless / request.point, 6),
+        "assumptions": list(structure.assumptions),
+    }
+
+
+def _refuse_unmeasured(training: Training, laws: Laws, choices: Choices) -> None:
+    names = training.vocabulary
+    for q, place in enumerate(names.places):
+        primitive = training.task.primitive_task_of(place).name
+        for action, probability in choices.get(primitive, {}).items():
+            measured_there = any(key[0] == q for key in laws.contexts)
+            if (
+                probability > 0
+                and measured_there
+                and (q, names.actions.index(action) + 1) not in laws.contexts
+            ):
+                raise ValueError(
+                    f"{primitive}: {action} was never run in {place}; train with --selector random"
+                )
+
+
+def _played(
+    training: Training,
+    structure: Structure,
+    laws: Laws,
+    request: Request,
+    weights: Values,
+    replicate: np.ndarray,
+    random: np.random.Generator,
+) -> Played:
+    drawer = Drawer(laws, training.waits, weights, random)
+    try:
+        return Play(structure, drawer, request.choices, replicate, longest_of(training)).run()
+    except KeyError as fault:
+        place, action = fault.args[0]
+        names = training.vocabulary
+        text = f"{names.places[place]}: no run of {names.actions[action - 1]} was measured"
+        raise ValueError(text) from fault
+
+
+def _replayed(training: Training, structure: Structure, laws: Laws, request: Request) -> Played:
+    """Four times as many throws as were run, with the choices of the training."""
+    n = len(training.throws)
+    own = Request(request.runs, choices_of(training), request.seed)
+    random = np.random.default_rng([request.seed, 1])
+    return _played(
+        training, structure, laws, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random
+    )
+
+
+def longest_of(training: Training) -> int:
+    """Steps after which a played throw counts as endless: twenty times as many as the longest
+    measured one had, and a hundred."""
+    return 100 + 20 * max(len(throw.runs) + len(throw.waits) for throw in training.throws)
+
+
+def _bootstrap(
+    training: Training,
+    structure: Structure,
+    laws: Laws,
+    request: Request,
+    whole: Played,
+    random: np.random.Generator,
+) -> tuple[dict[str, Values], Values]:
+    """Figures of `runs` new throws under resampled training throws, and how far each law of the
+    time is from the whole one."""
+    n = len(training.throws)
+    at_once = max(1, TOGETHER // request.runs)
+    found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
+    distances: list[float] = []
+    reference = np.sort(whole.time[whole.completed])
+    for begin in range(0, request.replicates, at_once):
+        count = min(at_once, request.replicates - begin)
+        weights = random.multinomial(n, np.full(n, 1.0 / n), size=count).astype(np.float64)
+        replicate = np.repeat(np.arange(count), request.runs)
+        played = _played(training, structure, laws, request, weights, replicate, random)
+        for b in range(count):
+            own = replicate == b
+            one = Played(
+                played.goals[own], played.completed[own], played.all_success[own], played.time[own]
+            )
+            for name, value in figures(one).items():
+                found[name].append(value)
+            distances.append(distance(one.time[one.completed], reference))
+    return {name: np.array(values) for name, values in found.items()}, np.array(distances)
+
+
+def distance(sample: Values, reference: Values) -> float:
+    """Kolmogorov's distance of a sample's law from that of a (large, sorted) reference."""
+    if not len(sample) or not len(reference):
+        return 1.0
+    ordered = np.sort(sample)
+    at = np.searchsorted(reference, ordered, side="right") / len(reference)
+    below = np.searchsorted(reference, ordered, side="left") / len(reference)
+    steps = np.arange(len(ordered) + 1) / len(ordered)
+    return float(max(np.max(np.abs(at - steps[1:])), np.max(np.abs(below - steps[:-1]))))
+
+
+def _figure(
+    name: str, value: float, samples: Values, request: Request, training: int
+) -> dict[str, Any]:
+    known = samples[~np.isnan(samples)]
+    if not len(known):
+        return {"value": None, "interval": None, "sd": None}
+    sd = float(known.std(ddof=1)) if len(known) > 1 else 0.0
+    if name in SHARES:
+        interval = predictive_interval(
+            value, share_weight(value, sd, request.runs, training), request.runs, LEVEL
+        )
+    else:
+        interval = _rounded(np.quantile(known, ((1 - LEVEL) / 2, (1 + LEVEL) / 2)))
+    return {"value": round(value, 6), "interval": interval, "sd": round(sd, 8)}
+
+
+def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
+    """The product of reliabilities over the places of the normal flow: R_conj of a series, if all
+    were independent."""
+    names, runs = training.vocabulary, training.runs
+    status, _ = names.parts(runs.outcome)
+    normal = [q for q, p in enumerate(names.places) if p not in training.task.flat.error_elements]
+    value, factors = 1.0, {}
+    for q in normal:
+        chosen = choices.get(training.task.primitive_task_of(names.places[q]).name, {})
+        r = whole = 0.0
+        for action, probability in chosen.items():
+            own = (
+                (runs.place == q)
+                & (runs.action == names.actions.index(action) + 1)
+                & ~runs.censored
+            )
+            if own.any():
+                r, whole = (
+                    r + probability * float(np.mean(status[own] == SUCCESS)),
+                    whole + probability,
+                )
+        if whole:
+            factors[names.places[q]] = round(r / whole, 6)
+            value *= r / whole
+    return {"R_conj": round(value, 6), "factors": factors}
+
+
+def _rounded(values: Values) -> list[float]:
+    return [round(float(v), 6) for v in values]

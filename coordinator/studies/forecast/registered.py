@@ -1,0 +1,158 @@
+"""Forecast files: written before the runs, with the time, a hash of what they rest on, and a hash
+of what they say."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.time.completion import law
+from petrobot.coordinator.analysis.time.stochastic import NoEstimate, stochastic_view
+from petrobot.coordinator.analysis.time.task_forecast import forecast as solve
+from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.propagation import Choice, measured_from
+from petrobot.coordinator.studies.campaign.observed import context_of
+from petrobot.coordinator.studies.forecast.history import Training
+from petrobot.coordinator.studies.forecast.predict import Request, predict
+from petrobot.coordinator.task import Task
+from petrobot.services.host.json_text import finite, json_text
+from petrobot.services.host.whole_file import make_folder, write_whole
+
+SCHEMA = 1
+METHOD = (
+    "Generalised semi-Markov simulation of the net: measured competing risks of each run, in "
+    "contexts told apart by "
+    "chi-square tests, with their measured durations (no phase-type fit); predictive "
+    "intervals by a cluster bootstrap over "
+    "training throws, with the noise of the new runs. Beside it the exact solution of the "
+    "stochastic view (GSPN): phase-type "
+    "durations, statuses of one throw independent of each other."
+)
+LARGEST = 50_000
+"""Markings up to which the stochastic view is solved."""
+JUMPS = 20_000
+"""Jumps of the uniformised chain up to which its quantile is worked out."""
+
+
+class ForecastError(Exception):
+    """A forecast file cannot be made or used; the text says why."""
+
+
+def register(
+    task: Task,
+    trainings: Mapping[str, Training],
+    requests: Mapping[str, Request],
+    about: Mapping[str, Any],
+    estimates: Estimates | None = None,
+) -> dict[str, Any]:
+    """A forecast of the regimes in `requests`; `about` says what it rests on. With `estimates` the
+    stochastic view stands beside.
+
+    Raises ForecastError.
+    """
+    regimes = {}
+    for name, request in requests.items():
+        if name not in trainings:
+            raise ForecastError(
+                f"no throw of regime {name} was measured; there are {', '.join(trainings)}"
+            )
+        try:
+            regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
+            if estimates is not None:
+                regimes[name]["gspn"] = exact(task, estimates, name, request.choices)
+        except ValueError as fault:
+            raise ForecastError(f"regime {name or '-'}: {fault}") from fault
+    told = {
+        "schema": SCHEMA,
+        "task": task.name,
+        "registered_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "method": METHOD,
+        **about,
+        "regimes": regimes,
+    }
+    body = finite(told)  # as the file will say it: the hash must be the same when it is read again
+    return {**body, "sha256": _hash(body)}
+
+
+def _hash(body: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+
+
+def write(path: Path, forecast: Mapping[str, Any]) -> None:
+    """Raises ForecastError; a file that is there already is never written over."""
+    text = json_text(forecast, indent=2) + "\n"
+    try:
+        make_folder(path.parent)
+        write_whole(path, text, fresh=True)
+    except FileExistsError as fault:
+        raise ForecastError(
+            f"{path} is there already: a registered forecast stays as it is; give another --out"
+        ) from fault
+    except OSError as fault:
+        raise ForecastError(f"{path}: {fault.strerror or fault}") from fault
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Raises ForecastError, also when the file was changed after it was written."""
+    try:
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        body = {key: value for key, value in found.items() if key != "sha256"}
+        if found["schema"] != SCHEMA:
+            raise ForecastError(f"{path}: schema {found['schema']!r}, this petrobot reads {SCHEMA}")
+        said = found["sha256"]
+    except OSError as fault:
+        raise _no_forecast(path, fault.strerror or str(fault)) from fault
+    except ValueError as fault:
+        raise _no_forecast(path, f"it is no JSON ({fault})") from fault
+    except (KeyError, TypeError, AttributeError) as fault:
+        raise _no_forecast(path, "a table with schema and sha256 is missing") from fault
+    if said != _hash(body):
+        raise ForecastError(f"{path} was changed after it was registered")
+    return found
+
+
+def _no_forecast(path: Path, why: str) -> ForecastError:
+    return ForecastError(
+        f"{path} is no forecast: {why}; give a file that `petrobot forecast --out FILE` wrote"
+    )
+
+
+def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict[str, Any]:
+    """The numbers of the stochastic view for one run of the task; only `why` where it cannot be
+    solved.
+
+    Its times begin with the initial marking, so they hold the wait for the event that begins the
+    run, too.
+    """
+    try:
+        view = stochastic_view(task, measured_from(task, estimates, context_of(regime), choice))
+        if task.runs_place:
+            view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
+        found = solve(view, limits=Limits(states=LARGEST))
+    except (NoEstimate, ValueError, ArithmeticError) as fault:
+        return {"why": str(fault)}
+    try:
+        q90 = (
+            law(found.chain, found.done.goal, steps=JUMPS).quantile(0.9)
+            if found.completion_probability > 0
+            else None
+        )
+    except ArithmeticError:
+        q90 = None
+    numbers = {
+        "R_goal": found.goal_reliability,
+        "P_complete": found.completion_probability,
+        "R_conj": found.conjunctive_reliability,
+        "mean": found.done.mean,
+        "q90": q90,
+    }
+    return {
+        **{k: None if v is None else round(float(v), 6) for k, v in numbers.items()},
+        "markings": found.chain.n,
+    }

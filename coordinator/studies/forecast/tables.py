@@ -1,0 +1,205 @@
+"""Forecasts and comparisons as tables for terminals and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from petrobot.coordinator.studies.forecast.residual import NEGLIGIBLE
+
+WORDS = {
+    "R_goal": "R_goal",
+    "P_complete": "P_complete",
+    "R_conj": "R_conj",
+    "mean": "mean time (s)",
+    "q90": "90 % quantile (s)",
+}
+HEAD = (
+    "regime",
+    "figure",
+    "forecast",
+    "95 % predictive",
+    "measured",
+    "p (Holm)",
+    "agrees",
+    "equivalent",
+)
+
+
+def forecast_text(made: Mapping[str, Any]) -> str:
+    """A forecast for people."""
+    lines = [f"{made['task']}: forecast of {made['registered_at']}"]
+    for name, said in made["regimes"].items():
+        lines.append(
+            f"  regime {name or '-'}: {said['runs']} runs, from {said['training_throws']} throws"
+        )
+        for figure, found in said["figures"].items():
+            if found["value"] is not None:
+                low, high = found["interval"]
+                lines.append(
+                    f"    {WORDS[figure]:20}{found['value']:.4f}  95 % [{low:.4f}, {high:.4f}]"
+                )
+        lines += _exact_lines(said.get("gspn", {}))
+        lines.append(
+            f"    product of R's      {said['product']['R_conj']:.4f} as R_conj, if statuses "
+            "were independent"
+        )
+        for found in said["dependence"][:3]:
+            if found["p"] < 0.01:
+                lines.append(
+                    f"    {found['places'][0]} and {found['places'][1]} depend on each "
+                    f"other: p = {found['p']:.1e}"
+                )
+        lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
+        if 0.0005 < said["endless"] <= NEGLIGIBLE:
+            lines.append(f"    note: {said['endless']:.1%} of the throws played never end")
+        lines += [f"    note: {note}" for note in said["assumptions"]]
+        lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
+    return "\n".join(lines)
+
+
+def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
+    if "markings" not in gspn:
+        return [f"    stochastic view: {gspn['why']}"] if gspn else []
+    shown = ", ".join(f"{WORDS[k]} {gspn[k]:.4f}" for k in WORDS if gspn.get(k) is not None)
+    return [f"    stochastic view, {gspn['markings']} markings: {shown}"]
+
+
+def _worst(residual: Sequence[Mapping[str, Any]]) -> str:
+    if not residual:
+        return "from an estimates file: no throws to check against"
+    worst = min(residual, key=lambda row: row["p"])
+    return f"played throws against the training's own: least p {worst['p']:.2f} ({worst['of']})"
+
+
+def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The table of a comparison as texts."""
+    return [
+        (
+            row["regime"] or "-",
+            WORDS[row["figure"]],
+            _number(row["forecast"]),
+            _interval(row["interval"]),
+            _number(row["measured"]),
+            _p(row),
+            _agrees(row),
+            f"{'yes' if row['equivalent'] else 'no'} (within {_number(row['margin'])})"
+            if row["margin"]
+            else "",
+        )
+        for row in found["rows"]
+    ]
+
+
+def _agrees(row: Mapping[str, Any]) -> str:
+    p = row["p"] if row["p_holm"] is None else row["p_holm"]
+    return "" if p is None else "yes" if p >= 0.01 else "NO"
+
+
+def _p(row: Mapping[str, Any]) -> str:
+    if row["p"] is None:
+        return ""
+    return (
+        f"{row['p']:.3f} (alone)"
+        if row["p_holm"] is None
+        else f"{row['p']:.3f} ({row['p_holm']:.3f})"
+    )
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def _interval(value: Sequence[float] | None) -> str:
+    return "" if value is None else f"{value[0]:.4f} to {value[1]:.4f}"
+
+
+def control_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """The product rule's table as texts."""
+    return [
+        (
+            row["regime"] or "-",
+            _number(row["forecast"]),
+            _number(row["measured"]),
+            f"{row['p']:.1e}",
+            "rejected" if row["rejected"] else "not rejected",
+        )
+        for row in found["negative_control"]
+    ]
+
+
+def agreement_text(found: Mapping[str, Any]) -> str:
+    """A comparison for a terminal."""
+    before = "before the runs" if found["registered_before"] else "AFTER the runs had begun"
+    lines = [
+        f"{found['task']}: forecast of {found['forecast']['registered_at']} ({before}) and "
+        f"{found['campaign']['folder']}"
+    ]
+    lines += _columns([HEAD, *rows_of(found)])
+    lines.append("negative control, the product of marginal reliabilities as R_conj:")
+    lines += _columns([("regime", "product", "measured", "p", ""), *control_rows(found)])
+    for law in found["law"]:
+        if law["distance"] is not None:
+            verdict = "agrees" if law["agrees"] else "DISAGREES"
+            lines.append(
+                f"law of the time, regime {law['regime'] or '-'}: distance {law['distance']} "
+                f"of {law['limit']}: {verdict}"
+            )
+    odd = [row for row in found["routing"] if row["p_holm"] < 0.01]
+    lines += [
+        f"ways out of {row['place']} differ, regime {row['regime'] or '-'}: p = {row['p_holm']:.1e}"
+        for row in odd
+    ]
+    for regime, doubts in found["doubts"].items():
+        lines += [
+            f"note: registered although doubtful, regime {regime or '-'}: {doubt}"
+            for doubt in doubts
+        ]
+    if not found["same_block"]:
+        lines.append(
+            "note: the training had another --block: the first throws of a cell are a "
+            "different share of all"
+        )
+    if not found["same_task_file"]:
+        lines.append("note: the task file has changed between training and these runs")
+    lines.append(
+        "agrees" if found["agrees"] else "DISAGREES: at least one figure at 1 % after Holm"
+    )
+    return "\n".join(lines)
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  "
+        + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def agreement_markdown(found: Mapping[str, Any]) -> str:
+    """A comparison as Markdown."""
+    before = "before" if found["registered_before"] else "**after**"
+    lines = [
+        f"Registered {found['forecast']['registered_at']}, {before} the runs (seed "
+        f"{found['campaign']['seed']}).",
+        "",
+    ]
+    lines += _markdown([HEAD, *rows_of(found)])
+    lines += [
+        "",
+        "The product of marginal reliabilities as a forecast of R_conj (negative control):",
+        "",
+    ]
+    lines += _markdown([("regime", "product", "measured", "p", "verdict"), *control_rows(found)])
+    lines += ["", "Law of the time (Kolmogorov's distance, limit at 1 %):", ""]
+    laws = [
+        (law["regime"] or "-", _number(law["distance"]), _number(law["limit"]))
+        for law in found["law"]
+    ]
+    return "\n".join([*lines, *_markdown([("regime", "distance", "limit"), *laws])]) + "\n"
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return [lines[0], "|" + "---|" * len(rows[0]), *lines[1:]]

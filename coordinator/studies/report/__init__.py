@@ -1,0 +1,6 @@
+"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures, and two
+campaigns compared."""
+
+from petrobot.coordinator.studies.report.run_page import report_html
+
+__all__ = ["report_html"]

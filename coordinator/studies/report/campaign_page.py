@@ -1,0 +1,418 @@
+"""A campaign as one HTML page: shares, choices and J over trials, R and C of actions, the task's
+own pictures, faults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from petrobot.coordinator.learning.objective import Figures, break_even, pareto
+from petrobot.coordinator.run.timeline import Bar, Timeline
+from petrobot.coordinator.studies.campaign.observed import regime_of
+from petrobot.coordinator.studies.campaign.plan import Plan
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.summary import Summary
+from petrobot.coordinator.studies.campaign.trials import Throw
+from petrobot.coordinator.studies.report import charts
+from petrobot.coordinator.studies.report.action_pictures import (
+    ACTIONS,
+    TRIALS,
+    action_pictures,
+    add_latencies,
+    latency_svg,
+    put,
+    trial_pictures,
+)
+from petrobot.coordinator.studies.report.comparing import Weighting, objectives
+from petrobot.coordinator.studies.report.page import gallery, html_page, section, table, text
+from petrobot.coordinator.studies.report.plots import declared
+from petrobot.coordinator.studies.report.run_page import gantt_svg
+from petrobot.coordinator.studies.report.trials import learned_curves, objective_curves
+from petrobot.coordinator.task import Status, Task
+
+# Fixed combinations of actions side by side: what each came to over the throws in which it was chosen, with one rho for all.
+
+Combination = tuple[tuple[str, str], ...]
+"""(primitive task, action) of each primitive task with alternatives, in the order of the task
+file."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One combination. J is the mean over the primitive tasks with alternatives; `task_objective`
+    that of the whole task."""
+
+    combination: Combination
+    throws: int
+    goal: float
+    objective: float
+    task_objective: float
+    time: float
+    """Mean of the completed throws (s)."""
+
+    def to_plain(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            **dict(self.combination),
+            "runs": self.throws,
+            "R_goal": round(self.goal, 6),
+            "J": round(self.objective, 6),
+            "J of the task": round(self.task_objective, 6),
+            "mean time (s)": round(self.time, 6),
+        }
+
+
+def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]:
+    """The actions of a throw's first runs."""
+    out: dict[str, str] = {}
+    for run in row.throw.runs if row.throw is not None else ():
+        name = task.primitive_task_of(run.place).name
+        if name in names:
+            out.setdefault(name, run.action)
+    return out
+
+
+def by_combination(
+    task: Task,
+    rows: Iterable[Row],
+    planned: Sequence[dict[str, str]] | None = None,
+    weighting: Weighting | None = None,
+) -> list[Judged]:
+    """Every combination in these rows, the lowest J first.
+
+    `planned`: the combination meant for each row; a throw that ended before all of its runs still
+    counts for it. Without it, only throws in which every primitive task ran can be told apart.
+    """
+    kept = [row for row in rows if row.throw is not None]
+    names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
+    weighting = weighting or Weighting.of(task, kept)
+    groups: dict[Combination, list[Row]] = {}
+    for i, row in enumerate(kept):
+        chosen = planned[i] if planned is not None else combination_of(task, row, names)
+        if all(name in chosen for name in names):
+            groups.setdefault(tuple((name, chosen[name]) for name in names), []).append(row)
+    return sorted(
+        (_judged(task, c, own, weighting) for c, own in groups.items()),
+        key=lambda j: (j.objective, j.combination),
+    )
+
+
+def _judged(
+    task: Task, combination: Combination, rows: Sequence[Row], weighting: Weighting
+) -> Judged:
+    found = objectives(task, rows, weighting)
+    times = [row.throw.time for row in rows if row.throw is not None and row.throw.time is not None]
+    goal = float(np.mean([row.throw is not None and row.throw.goals > 0 for row in rows]))
+    mean = float(np.mean(times)) if times else float("nan")
+    known = [value for name, value in found.items() if name != "task" and not np.isnan(value)]
+    return Judged(
+        combination,
+        len(rows),
+        goal,
+        float(np.mean(known)) if known else float("nan"),
+        found["task"],
+        mean,
+    )
+
+
+DIFFERENCES = "Differences, paired"
+AHEAD = (DIFFERENCES, TRIALS, ACTIONS)
+"""Headings of pictures that stand before the tables of actions."""
+MOST = 12
+"""Combinations that are listed."""
+WORST = 40
+"""Throws that went wrong which are listed."""
+
+
+class CampaignReport:
+    """Pictures and page of a campaign. `pictures` holds every picture by file name, with its
+    heading."""
+
+    def __init__(
+        self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]
+    ) -> None:
+        self.plan, self.task, self.rows = plan, task, rows
+        self.summary = Summary.of(task, rows, options=plan.options)
+        self.trials = objective_curves(task, rows)
+        learned_curves(plan, rows, self.trials)
+        word = "choice probability" if plan.batch else "share of choices"
+        self.pictures = trial_pictures(self.trials, word) | action_pictures(
+            task, self.summary.estimates
+        )
+        self._own(plots)
+        self._times()
+        self._gantt()
+
+    # --- pictures -----------------------------------------------------------------------------
+
+    def _add(self, name: str, heading: str, svg: str) -> None:
+        put(self.pictures, name, heading, svg)
+
+    def _own(self, plots: Mapping[str, Any]) -> None:
+        scores = [{**row.score, "n": row.n, "regime": row.regime} for row in self.rows]
+        for name, svg in declared(plots, scores).items():
+            self._add(f"own {name}", "Of the task itself", svg)
+
+    def _times(self) -> None:
+        times: dict[str, list[float]] = {}
+        latencies: dict[str, list[float]] = {}
+        for row in self.rows:
+            if row.throw is None:
+                continue
+            if row.throw.time is not None:
+                times.setdefault(row.regime or "time", []).append(row.throw.time)
+            for run in row.throw.runs:
+                add_latencies(latencies, run.action, run.values)
+        if times:
+            self._add("times", "Times", charts.histogram("Time of a run of the task", "s", times))
+        if latencies:
+            self._add("latencies", "Times", latency_svg(latencies))
+
+    def _gantt(self) -> None:
+        block = next((row.block for row in self.rows if row.throw is not None), None)
+        chosen = [row for row in self.rows if row.block == block and row.throw is not None]
+        if chosen:
+            self._add(
+                "gantt",
+                f"Runs over time: first cell, seed {chosen[0].seed}",
+                gantt_svg(timeline_of(chosen)),
+            )
+        bad = next(
+            (
+                r
+                for r in self.rows
+                if r.throw and r.throw.status == Status.ERROR.value and r.block != block
+            ),
+            None,
+        )
+        if bad is not None:
+            same = [row for row in self.rows if row.block == bad.block and row.throw is not None]
+            self._add(
+                "gantt error",
+                f"Runs over time: a cell with an error, seed {bad.seed}",
+                gantt_svg(timeline_of(same)),
+            )
+
+    # --- page ---------------------------------------------------------------------------------
+
+    def html(self, more: Sequence[str] = ()) -> str:
+        """The page; `more` are further sections, put behind the numbers."""
+        plan = self.plan
+        lead = f"{len(self.rows)} of {plan.runs} runs, selector {plan.selector}, seed {plan.seed}"
+        headings = list(dict.fromkeys(heading for heading, _ in self.pictures.values()))
+        parts = [
+            f"<h1>{escape(self.task.name)}: campaign</h1>",
+            f'<p class="lead">{escape(lead)}</p>',
+            section("Results", table(self._results())),
+            *more,
+            *(section(h, self._gallery(h)) for h in headings if h in AHEAD),
+            section("Actions", "".join(self._judged())),
+            *(
+                section(f"Combinations, regime {r or '-'}", table(rows))
+                for r, rows in self._combinations().items()
+            ),
+            *(section(h, self._gallery(h)) for h in headings if h not in AHEAD),
+            section("Ends of runs and their causes", table(self._causes())),
+            section("What went wrong, firing by firing", self._worst()),
+        ]
+        return html_page(f"{self.task.name}: campaign", parts)
+
+    def _gallery(self, heading: str) -> str:
+        return gallery(svg for own, svg in self.pictures.values() if own == heading)
+
+    def _results(self) -> list[dict[str, Any]]:
+        whole = self.summary.to_plain()
+        parts = [*whole["by_regime"].items(), ("all", whole)]
+        return [
+            {
+                "regime": name or "-",
+                "runs": part["runs"],
+                "R_goal": part["R_goal"],
+                "95 %": f"{part['wilson'][0]:.4f} to {part['wilson'][1]:.4f}",
+                "P_complete": part["P_complete"],
+                "R_conj": part["R_conj"],
+                "mean time (s)": part["mean"],
+                "90 % of times below (s)": part["q90"],
+            }
+            for name, part in parts
+        ]
+
+    def _judged(self) -> list[str]:
+        out = []
+        for primitive, judged in self.summary.comparisons().items():
+            front = {f.action for f in pareto(judged.figures)}
+            best = next((f for f in judged.figures if f.action == judged.best), None)
+            rows = [_action_row(f, front, best) for f in judged.figures]
+            out.append(
+                f"<h3>{escape(primitive)} <small>rho = {judged.rho:.4g}</small></h3>{table(rows)}"
+            )
+        return out
+
+    def _combinations(self) -> dict[str, list[dict[str, Any]]]:
+        """The best combinations of actions by regime, of throws in which each primitive task ran;
+        none of a single one."""
+        found = {}
+        for regime in self.summary.by_regime:
+            judged = by_combination(self.task, [row for row in self.rows if row.regime == regime])
+            if len(judged) > 1:
+                found[regime] = [one.to_plain() for one in judged[:MOST]]
+        return found
+
+    def _causes(self) -> list[dict[str, Any]]:
+        counts: dict[tuple[str, str, str, str, str], int] = {}
+        first: dict[tuple[str, str, str, str, str], Row] = {}
+        for row in self.rows:
+            for run in row.throw.runs if row.throw is not None else ():
+                key = (row.regime, run.place, run.action, run.status or "none", run.cause)
+                counts[key] = counts.get(key, 0) + 1
+                first.setdefault(key, row)
+        return [
+            {
+                **dict(zip(("regime", "place", "action", "status", "cause"), key, strict=True)),
+                "runs": n,
+                "first seen": f"seed {first[key].seed}, run {first[key].k}",
+            }
+            for key, n in sorted(counts.items())
+        ]
+
+    def _worst(self) -> str:
+        bad = [
+            row
+            for row in self.rows
+            if row.throw is not None and row.throw.status != Status.SUCCESS.value
+        ]
+        rows = [
+            {
+                "n": row.n,
+                "regime": row.regime,
+                "seed": row.seed,
+                "run": row.k,
+                "status": row.throw.status,
+                "firings": story(row.throw),
+            }
+            for row in bad[:WORST]
+            if row.throw is not None
+        ]
+        if not rows:
+            return "<p>Nothing: every run met its specification.</p>"
+        left = f"<p>{len(bad) - WORST} more in the table.</p>" if len(bad) > WORST else ""
+        return (
+            f"<details open><summary>{len(bad)} runs of the "
+            f"task</summary>{table(rows)}{left}</details>"
+        )
+
+
+def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, Any]:
+    even = break_even(best, f) if best is not None and best.action != f.action else None
+    return {
+        "action": f.action
+        + (" (lowest J)" if best is not None and f.action == best.action else ""),
+        "runs": f.runs,
+        "R in its hardest regime": f.reliability,
+        "95 %": f"{f.lower:.3f} to {f.upper:.3f}",
+        "availability": f.availability,
+        "C": f.cost,
+        "hardest regime": regime_of(f.worst or ""),
+        "hardest that meets the target": None if f.scenario is None else regime_of(f.scenario),
+        "J": f.j,
+        "not beaten in both R and C": f.action in front,
+        "same J as the best at rho": even,
+    }
+
+
+def timeline_of(rows: Sequence[Row]) -> Timeline:
+    """The runs of a mission run as bars."""
+    made = Timeline()
+    for row in rows:
+        for i, run in enumerate(row.throw.runs if row.throw is not None else ()):
+            assert row.throw is not None
+            begun = row.throw.begun + run.begun
+            key = f"{run.place} of run {row.k}" + (f" ({i})" if i else "")
+            status = Status(run.status) if run.status else None
+            made.bars[key] = Bar(
+                key, run.place, run.action, begun, begun + run.took, status, run.cause, run.text
+            )
+    return made
+
+
+def story(throw: Throw) -> str:
+    """A throw in one line: what ended when and how, and which transition took it."""
+    ends = sorted(throw.runs, key=lambda run: run.begun + run.took)
+    parts = []
+    for run in ends:
+        how = (
+            (run.status or "preempted").upper() if run.status != Status.SUCCESS.value else "success"
+        )
+        why = (
+            f" ({run.cause}: {run.text})"
+            if run.cause and run.text
+            else f" ({run.cause})"
+            if run.cause
+            else ""
+        )
+        parts.append(
+            f"{run.begun + run.took:.2f} s {run.action} {how}{why}, {run.taken or 'not taken'}"
+        )
+    return "; ".join(parts)
+
+
+def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
+    """Two campaigns side by side."""
+    shares = [
+        {
+            "share": name,
+            one: row["one"],
+            other: row["other"],
+            "difference": row["difference"],
+            "95 %": _interval(row["interval"]),
+            f"only {one}": row["only_one"],
+            f"only {other}": row["only_other"],
+            "p (McNemar)": row["p"],
+        }
+        for name, row in found["shares"].items()
+    ]
+    rest = [
+        {
+            "figure": name,
+            one: row["one"],
+            other: row["other"],
+            "difference": row["difference"],
+            "95 %": _interval(row["interval"]),
+        }
+        for name, row in [
+            *((_objective_name(n), r) for n, r in found["J"].items()),
+            ("mean time (s)", found["time"]),
+        ]
+        if "difference" in row
+    ]
+    lead = (
+        f"<p>{found['pairs']} pairs of throws with equal seeds; {found['left_out']} "
+        "throws without a partner.</p>"
+    )
+    return section(f"{one} against {other}", lead + table(shares) + table(rest))
+
+
+def _objective_name(name: str) -> str:
+    return {"mean": "mean J", "task": "J of the whole task"}.get(name, f"J of {name}")
+
+
+def _interval(ends: Sequence[float]) -> str:
+    return f"{text(ends[0])} to {text(ends[1])}"
+
+
+def comparison_pictures(
+    found: Mapping[str, Any], one: str, other: str
+) -> dict[str, tuple[str, str]]:
+    """Differences with their intervals."""
+    rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
+    rows += [(_objective_name(name), "", *_ends(row)) for name, row in found["J"].items()]
+    svg = charts.intervals(f"{one} minus {other}, 95 % intervals, paired", "difference", rows)
+    return {"comparison": (DIFFERENCES, svg)}
+
+
+def _ends(row: Mapping[str, Any]) -> tuple[float, float, float]:
+    return float(row["interval"][0]), float(row["difference"]), float(row["interval"][1])

@@ -1,0 +1,270 @@
+"""Two campaigns compared throw by throw: the same seeds met the same throws, so differences are
+paired.
+
+Shares: McNemar's exact test (Q. McNemar 1947, binomial on the discordant pairs), difference with
+the adjusted Wald interval of A. Agresti and Y. Min (2005, half a pair added to each cell). J and
+costs: percentile bootstrap over pairs, all J from sums with one rho.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.task import Status, Task
+
+REPLICATES = 2000
+Z = 1.959963984540054
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Throws of two campaigns with equal regime, seed and number that were begun in both."""
+
+    one: tuple[Row, ...]
+    other: tuple[Row, ...]
+    left_out: int
+    """Throws without a partner, or not begun."""
+
+
+def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
+    """Match two tables."""
+    first = {(row.regime, row.seed, row.k): row for row in one}
+    second = {(row.regime, row.seed, row.k): row for row in other}
+    common = [
+        k
+        for k in first
+        if k in second and first[k].throw is not None and second[k].throw is not None
+    ]
+    left = len(first) + len(second) - 2 * len(common)
+    return Pairs(tuple(first[k] for k in common), tuple(second[k] for k in common), left)
+
+
+def compare(
+    task: Task,
+    one: Iterable[Row],
+    other: Iterable[Row],
+    weighting: Weighting | None = None,
+    seed: int = 1,
+) -> dict[str, Any]:
+    """What the first campaign does better (positive differences in shares, negative in J and time)
+    than the second.
+
+    `weighting` gives the rho of J, so that several comparisons have one; without it, rho is that of
+    the actions in these two. Raises ValueError when they have no throw in common.
+    """
+    pairs = paired(one, other)
+    if not pairs.one:
+        raise ValueError(
+            "the two campaigns have no throw in common: run them with the same --seed, "
+            "--block and --regime"
+        )
+    random = np.random.default_rng(seed)
+    shares = {
+        "R_goal": lambda row: row.throw is not None and row.throw.goals > 0,
+        "P_complete": lambda row: row.throw is not None and row.throw.completed,
+        "R_conj": lambda row: row.throw is not None and row.throw.all_success,
+    }
+    found: dict[str, Any] = {name: share_difference(pairs, met) for name, met in shares.items()}
+    own = own_flags(pairs)
+    found |= {name: share_difference(pairs, _flag(name)) for name in own}
+    weighting = weighting or Weighting.of(task, (*pairs.one, *pairs.other))
+    return {
+        "pairs": len(pairs.one),
+        "left_out": pairs.left_out,
+        "rho": {**weighting.rho, "task": weighting.task},
+        "shares": found,
+        "time": _time(pairs),
+        "J": objective_difference(task, pairs, weighting, random),
+    }
+
+
+def own_flags(pairs: Pairs) -> list[str]:
+    """Truth values of the task's own score that every pair has."""
+    names = [n for n, v in pairs.one[0].score.items() if isinstance(v, bool)]
+    return [
+        n
+        for n in names
+        if all(isinstance(r.score.get(n), bool) for rows in (pairs.one, pairs.other) for r in rows)
+    ]
+
+
+def _flag(name: str) -> Callable[[Row], bool]:
+    return lambda row: bool(row.score[name])
+
+
+def share_difference(pairs: Pairs, met: Callable[[Row], bool]) -> dict[str, Any]:
+    """Both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
+    interval."""
+    a = np.array([met(row) for row in pairs.one])
+    b = np.array([met(row) for row in pairs.other])
+    n, gained, lost = len(a), int(np.sum(a & ~b)), int(np.sum(~a & b))
+    p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+    middle = (gained - lost) / (n + 2)
+    half = Z * np.sqrt(((gained + 0.5) + (lost + 0.5)) / (n + 2) - middle**2) / np.sqrt(n + 2)
+    return {
+        "one": round(float(a.mean()), 6),
+        "other": round(float(b.mean()), 6),
+        "only_one": gained,
+        "only_other": lost,
+        "difference": round((gained - lost) / n, 6),
+        "interval": [
+            round(float(max(-1.0, middle - half)), 6),
+            round(float(min(1.0, middle + half)), 6),
+        ],
+        "p": p,
+    }
+
+
+def _time(pairs: Pairs) -> dict[str, Any]:
+    times = [
+        (a.throw.time, b.throw.time)
+        for a, b in zip(pairs.one, pairs.other, strict=True)
+        if a.throw and b.throw and a.throw.time is not None and b.throw.time is not None
+    ]
+    if len(times) < 2:
+        return {"pairs": len(times)}
+    one, other = np.array(times).T
+    d = one - other
+    half = Z * float(d.std(ddof=1)) / len(d) ** 0.5
+    mean = float(d.mean())
+    return {
+        "pairs": len(d),
+        "one": round(float(one.mean()), 6),
+        "other": round(float(other.mean()), 6),
+        "difference": round(mean, 6),
+        "interval": [round(mean - half, 6), round(mean + half, 6)],
+    }
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """rho of each primitive task with alternatives, and of the task (whose cost is the time of a
+    throw)."""
+
+    rho: Mapping[str, float]
+    task: float
+
+    @classmethod
+    def of(cls, task: Task, rows: Sequence[Row]) -> Weighting:
+        """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of
+        their throws."""
+        names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
+        times = [
+            row.throw.time for row in rows if row.throw is not None and row.throw.time is not None
+        ]
+        mean = sum(times) / len(times) if times else 0.0
+        return cls(
+            {name: cost_weight(task, name, rows) for name in names}, 1.0 / mean if mean > 0 else 0.0
+        )
+
+
+def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[str, float]:
+    """J of each primitive task with alternatives and of the task ("task"), with the given rho; nan
+    where nothing was run."""
+    whole = np.ones((1, len(rows)))
+    found = {
+        name: float(_objective(_sums(task, name, rows), whole, rho)[0])
+        for name, rho in weighting.rho.items()
+    }
+    return found | {"task": float(_objective(_task_sums(rows), whole, weighting.task)[0])}
+
+
+def objective_difference(
+    task: Task, pairs: Pairs, weighting: Weighting, random: np.random.Generator
+) -> dict[str, Any]:
+    """J of each primitive task with alternatives, their mean, and J of the task (1 - R_goal + rho *
+    time), in both campaigns."""
+    n = len(pairs.one)
+    weights = random.multinomial(n, np.full(n, 1 / n), size=REPLICATES)
+    whole = np.ones((1, n))
+    out: dict[str, Any] = {}
+    means: list[tuple[float, float, Values, Values]] = []
+    for name, rho in weighting.rho.items():
+        one, other = _sums(task, name, pairs.one), _sums(task, name, pairs.other)
+        if not one[0].sum() or not other[0].sum():
+            continue
+        point = float(_objective(one, whole, rho)[0]), float(_objective(other, whole, rho)[0])
+        spread = _objective(one, weights, rho), _objective(other, weights, rho)
+        means.append((*point, *spread))
+        out[name] = _difference(*point, spread[0] - spread[1])
+    if means:
+        one_j, other_j = (float(np.mean([m[i] for m in means])) for i in (0, 1))
+        out["mean"] = _difference(one_j, other_j, np.mean([m[2] - m[3] for m in means], axis=0))
+    both = [_task_sums(rows) for rows in (pairs.one, pairs.other)]
+    values = [float(_objective(sums, whole, weighting.task)[0]) for sums in both]
+    spreads = [_objective(sums, weights, weighting.task) for sums in both]
+    out["task"] = _difference(values[0], values[1], spreads[0] - spreads[1])
+    return out
+
+
+def _difference(one: float, other: float, spread: Values) -> dict[str, Any]:
+    known = spread[~np.isnan(spread)]
+    low, high, upper = np.quantile(known, (0.025, 0.975, 0.95))
+    return {
+        "one": round(one, 6),
+        "other": round(other, 6),
+        "difference": round(one - other, 6),
+        "interval": [round(float(low), 6), round(float(high), 6)],
+        "upper_95": round(float(upper), 6),
+    }
+
+
+Sums = tuple[Values, Values, Values, Values]
+"""By throw: counted runs, successes, cost, runs with a cost."""
+
+
+def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
+    """Of a primitive task."""
+    out = np.zeros((4, len(rows)))
+    for i, row in enumerate(rows):
+        for run in row.throw.runs if row.throw is not None else ():
+            if run.status and task.primitive_task_of(run.place).name == name:
+                known = run.cost is not None
+                out[:, i] += (1.0, run.status == Status.SUCCESS.value, run.cost or 0.0, known)
+    return out[0], out[1], out[2], out[3]
+
+
+def _task_sums(rows: Sequence[Row]) -> Sums:
+    """Of the whole task: a throw is a run, a met goal its success, its time the cost."""
+    out = np.zeros((4, len(rows)))
+    for i, row in enumerate(rows):
+        if row.throw is not None:
+            time = row.throw.time
+            out[:, i] = (1.0, row.throw.goals > 0, time or 0.0, time is not None)
+    return out[0], out[1], out[2], out[3]
+
+
+def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
+    """rho = 1 / the largest mean cost of an action of the primitive task in these rows; 0 without
+    costs."""
+    costs: dict[str, list[float]] = {}
+    for row in rows:
+        for run in row.throw.runs if row.throw is not None else ():
+            if (
+                run.status
+                and run.cost is not None
+                and task.primitive_task_of(run.place).name == name
+            ):
+                costs.setdefault(run.action, []).append(run.cost)
+    largest = max((sum(c) / len(c) for c in costs.values()), default=0.0)
+    return 1.0 / largest if largest > 0 else 0.0
+
+
+def _objective(sums: Sums, weights: Any, rho: float) -> Values:
+    """J = 1 - R + rho C for each row of weights."""
+    runs, successes, cost, costed = (weights @ s for s in sums)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value: Values = (
+            1.0
+            - successes / runs
+            + rho * np.where(costed > 0, cost / np.maximum(costed, 1e-300), 0.0)
+        )
+    return value

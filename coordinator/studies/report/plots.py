@@ -1,0 +1,109 @@
+"""Pictures that a task declares itself, in the score of its laboratory: `plots` says which columns
+are drawn, and how.
+
+    plots = { catch_map = { kind = "lines", title = "...", x = "table.column", y = "...", x2 =
+    "...", y2 = "...",
+                            x_label = "... (m)", y_label = "... (m)", colour = "table.column" } }
+
+kind: `points` (x, y), `lines` (to x2, y2) or `histogram` (x; between `least` and `most`, if given).
+`pictures` in a score holds finished SVG texts by title.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from petrobot.coordinator.studies.report import charts
+
+PICTURES = "pictures"
+MOST = 4000
+"""Marks in one picture at most; of more, every k-th is drawn."""
+
+
+def declared(plots: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """SVG by name of every declared picture for which the rows have values; each row is the score
+    of one throw."""
+    out = {}
+    for name, plot in plots.items():
+        if not isinstance(plot, Mapping) or "x" not in plot:
+            continue
+        made = _histogram(plot, rows) if plot.get("kind") == "histogram" else _points(plot, rows)
+        if made is not None:
+            out[str(name)] = made
+    return out
+
+
+def _points(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str | None:
+    names = [
+        str(plot[key])
+        for key in (("x", "y", "x2", "y2") if plot.get("kind") == "lines" else ("x", "y"))
+    ]
+    groups: dict[str, list[tuple[tuple[float, ...], str]]] = {}
+    for i, row in enumerate(_thinned(rows)):
+        place = [_number(row.get(name)) for name in names]
+        if not any(math.isnan(v) for v in place):
+            tip = ", ".join(
+                f"{name.rpartition('.')[2]} {v:.4g}" for name, v in zip(names, place, strict=True)
+            )
+            groups.setdefault(_group(plot, row), []).append(
+                (tuple(place), f"{row.get('n', i + 1)}: {tip}")
+            )
+    if not groups:
+        return None
+    title = str(plot.get("title", ""))
+    return charts.points(
+        title,
+        str(plot.get("x_label", names[0])),
+        str(plot.get("y_label", names[1])),
+        _sorted(groups),
+    )
+
+
+def _histogram(plot: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str | None:
+    groups: dict[str, list[float]] = {}
+    for row in rows:
+        value = _number(row.get(str(plot["x"])))
+        if not math.isnan(value) and value <= float(plot.get("most", math.inf)):
+            groups.setdefault(_group(plot, row), []).append(value)
+    if not groups:
+        return None
+    least = float(plot["least"]) if "least" in plot else None
+    return charts.histogram(
+        str(plot.get("title", "")),
+        str(plot.get("x_label", plot["x"])),
+        _sorted(groups),
+        least=least,
+    )
+
+
+def _group(plot: Mapping[str, Any], row: Mapping[str, Any]) -> str:
+    value = row.get(str(plot["colour"])) if "colour" in plot else None
+    return (
+        {None: "", True: "yes", False: "no"}.get(value, str(value))
+        if isinstance(value, bool | None)
+        else str(value)
+    )
+
+
+def _sorted(groups: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(sorted(groups.items(), key=lambda item: -len(item[1])))
+
+
+def _thinned(rows: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    return rows[:: max(1, -(-len(rows) // MOST))]
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def finished(result: Mapping[str, Any]) -> dict[str, str]:
+    """Finished SVG texts by title that a score holds."""
+    given = result.get(PICTURES, {})
+    if not isinstance(given, Mapping):
+        return {}
+    return {
+        str(name): str(svg) for name, svg in given.items() if str(svg).lstrip().startswith("<svg")
+    }

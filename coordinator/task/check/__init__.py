@@ -1,0 +1,59 @@
+"""Static check of a task: fast, without its state space. What the state space holds is for the
+analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.check.completeness import (
+    event_faults,
+    external_waits,
+    translating_others,
+    uncovered_exits,
+    unoffered,
+)
+from petrobot.coordinator.task.check.conflicts import conflicts
+from petrobot.coordinator.task.check.findings import Finding, Report
+from petrobot.coordinator.task.check.flow import never_marked, odd_ends, timeless_cycles, unused
+from petrobot.coordinator.task.validation import faults
+from petrobot.coordinator.task.wording import Severity
+
+__all__ = ["Finding", "Report", "Severity", "check"]
+
+_CHECKS: tuple[Callable[[Task], Iterator[Finding]], ...] = (
+    uncovered_exits,
+    event_faults,
+    conflicts,
+    timeless_cycles,
+    external_waits,
+    never_marked,
+    odd_ends,
+    unused,
+)
+_ORDER = (Severity.ERROR, Severity.WARNING, Severity.NOTE)
+
+
+def check(
+    task: Task,
+    offers: Mapping[str, str] | None = None,
+    *,
+    translates: Mapping[str, str] | None = None,
+    source: str = "services.toml",
+) -> Report:
+    """Everything that can be said of the task without exploring it.
+
+    `offers`: the node of each action that is offered; `translates`: the primitive task that each of
+    them is said to translate; `source`: the location file that says so.
+    """
+    broken = faults(task)
+    if broken:
+        return Report(
+            tuple(Finding(Severity.ERROR, "inconsistent", f.key, f.text, f.remedy) for f in broken)
+        )
+    found = [finding for part in _CHECKS for finding in part(task.flat)]
+    if offers is not None:
+        found += unoffered(task, offers, source)
+    if translates is not None:
+        found += translating_others(task, translates, source)
+    return Report(tuple(sorted(found, key=lambda f: _ORDER.index(f.severity))))

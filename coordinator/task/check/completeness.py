@@ -1,0 +1,202 @@
+"""Every action place has a normal and an error way out, and the exits of each status cover all
+cases."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+from petrobot.coordinator.task import (
+    End,
+    Event,
+    Kind,
+    Place,
+    PrimitiveTask,
+    Scope,
+    Status,
+    Task,
+    Transition,
+)
+from petrobot.coordinator.task.check.findings import Finding
+from petrobot.coordinator.task.conditions import Expression
+from petrobot.coordinator.task.conditions.regions import Answer, Domain, covering
+from petrobot.coordinator.task.validation import condition_domains
+from petrobot.coordinator.task.wording import Severity, listed, nearest
+
+_EXIT_OF = {Status.SUCCESS: End.NORMAL, Status.FAILURE: End.NORMAL, Status.ERROR: End.ERROR}
+
+
+def uncovered_exits(task: Task) -> Iterator[Finding]:
+    """Missing branches, and statuses that may find every exit's condition false."""
+    domains = condition_domains(task)
+    for place in task.places.values():
+        if place.kind is not Kind.ACTION:
+            continue
+        for end in (End.NORMAL, End.ERROR):
+            if not exits(task, place, end):
+                yield _missing(place, end)
+        for status in Status:
+            ways = exits(task, place, _EXIT_OF[status])
+            if ways and not any(w.when is None or w.events for w in ways):
+                yield from _uncovered(place, status, ways, domains)
+
+
+def exits(task: Task, place: Place, end: End) -> list[Transition]:
+    """The transitions that take a token of the place at such an end."""
+    return [
+        t
+        for t in task.transitions.values()
+        if any(a.place == place.name and a.end is end for a in t.inputs)
+    ]
+
+
+def _missing(place: Place, end: End) -> Finding:
+    what = "success or failure" if end is End.NORMAL else "error"
+    text = f"no {end} way out: a run that ends with {what} could go nowhere"
+    remedy = f'add a transition with in = ["{place.name}:{end}"]'
+    return Finding(Severity.ERROR, f"no-{end}-exit", f"places.{place.name}", text, remedy)
+
+
+def _uncovered(
+    place: Place, status: Status, ways: list[Transition], domains: dict[str, Domain]
+) -> Iterator[Finding]:
+    name = f"{place.name}.status"
+    known = {**domains, name: replace(domains[name], values=(status.value,))}
+    conditions: list[Expression | None] = [w.when for w in ways]
+    verdict = covering(conditions, known)
+    names = ", ".join(w.name for w in ways)
+    key, remedy = (
+        f"places.{place.name}",
+        "let one exit take what is left (no `when`, lower priority)",
+    )
+    if verdict.answer is Answer.REFUTED:
+        text = (
+            f"after {status} the conditions of its exits {names} may all be false: "
+            "finished, nowhere to go"
+        )
+        yield Finding(Severity.ERROR, "uncovered-exit", key, text, remedy, verdict.witness)
+    elif verdict.answer is Answer.UNKNOWN:
+        text = (
+            f"after {status} it is not known whether the conditions of its exits {names} "
+            "cover all cases"
+        )
+        yield Finding(Severity.WARNING, "coverage-unknown", key, text, remedy)
+
+
+# Events that can never be heard, and waits that only the outside world can end.
+
+
+def event_faults(task: Task) -> Iterator[Finding]:
+    """Internal events whose transition does not hold a run that could raise them."""
+    for t in task.transitions.values():
+        for name in t.events:
+            event = task.events[name]
+            if event.scope is Scope.INTERNAL and not _holds_raiser(task, t, event):
+                yield _unheard(task, t, event)
+
+
+def external_waits(task: Task) -> Iterator[Finding]:
+    """Places whose tokens only an external event can free, with no `after` beside it."""
+    for place in task.places.values():
+        takers: dict[End | None, list[Transition]] = {}
+        for t in task.transitions.values():
+            for arc in t.inputs:
+                if arc.place == place.name and arc.end not in (End.PREEMPT, End.GOING):
+                    takers.setdefault(arc.end, []).append(t)
+        for end, ways in takers.items():
+            waits = {e for t in ways for e in t.events if task.events[e].scope is Scope.EXTERNAL}
+            if all(_is_external(task, t) for t in ways):
+                after = f" after its {end} end" if end else ""
+                text = (
+                    f"only {listed(waits)} can free its token{after}: if it never comes, "
+                    "the task hangs"
+                )
+                remedy = "put a transition with `after` beside it"
+                yield Finding(
+                    Severity.WARNING, "external-wait", f"places.{place.name}", text, remedy
+                )
+
+
+def _is_external(task: Task, t: Transition) -> bool:
+    return any(task.events[e].scope is Scope.EXTERNAL for e in t.events)
+
+
+def _holds_raiser(task: Task, t: Transition, event: Event) -> bool:
+    return any(a.end is not None and task.places[a.place].task == event.by for a in t.inputs)
+
+
+def _unheard(task: Task, t: Transition, event: Event) -> Finding:
+    key = f"transitions.{t.name}.event"
+    started = [o.place for o in t.outputs if task.places[o.place].kind is Kind.ACTION]
+    if any(task.places[p].task == event.by for p in started):
+        text = (
+            f"{event.name} is declared internal to {event.by}, but this transition starts "
+            f"{event.by}: it would have to run "
+            "before it is started, and the operator could no longer control by tokens how "
+            "often it does"
+        )
+        return Finding(
+            Severity.ERROR,
+            "internal-impossible",
+            key,
+            text,
+            f'declare {event.name} with scope = "external"',
+        )
+    text = (
+        f"{event.name} is raised by {event.by}, but none of its inputs is an action place "
+        "of that primitive task"
+    )
+    remedy = f"add an input from a place with task = {event.by!r}, or make the event external"
+    return Finding(Severity.ERROR, "event-unheard", key, text, remedy)
+
+
+# Whether some node offers every action that the task may choose, and offers it for that primitive task.
+
+
+def unoffered(task: Task, offers: Mapping[str, str], source: str) -> Iterator[Finding]:
+    """Alternatives of used primitive tasks that no node offers. `source`: the location file that
+    says what is offered."""
+    for primitive, action in _used(task):
+        if action not in offers:
+            key = f"primitive_tasks.{primitive.name}.alternatives"
+            text = f"no node offers the action {action!r}{nearest(action, offers)}"
+            remedy = f"add [actions.{action}] to {source}, or drop it here"
+            yield Finding(Severity.ERROR, "unoffered", key, text, remedy)
+
+
+def translating_others(task: Task, translates: Mapping[str, str], source: str) -> Iterator[Finding]:
+    """Actions whose location file names a primitive task that does not choose among them: it or the
+    task file is mistaken.
+
+    An action that several primitive tasks choose from is one's by name only, so that any of them
+    may stand there. `translates`: the primitive task of each action, as `source` says.
+    """
+    named: dict[str, list[str]] = {}
+    for primitive, action in _used(task):
+        named.setdefault(action, []).append(primitive.name)
+    for action, choosers in named.items():
+        said = translates.get(action, choosers[0])
+        if said not in choosers:
+            key = f"primitive_tasks.{choosers[0]}.alternatives"
+            text = (
+                f"{source} says that the action {action!r} translates {said!r}, which "
+                "does not name it"
+            )
+            remedy = (
+                f"write task = {' or '.join(map(repr, choosers))} in its "
+                f"[actions.{action}], or drop it here"
+            )
+            known = (
+                ""
+                if said in task.primitive_tasks
+                else f"; the task has {listed(task.primitive_tasks)}"
+            )
+            yield Finding(Severity.WARNING, "translates-other", key, text + known, remedy)
+
+
+def _used(task: Task) -> Iterator[tuple[PrimitiveTask, str]]:
+    """Primitive tasks that some place runs, with each of their alternatives."""
+    used = {p.task for p in task.flat.places.values() if p.kind is Kind.ACTION}
+    for primitive in task.primitive_tasks.values():
+        for action in primitive.alternatives if primitive.name in used else ():
+            yield primitive, action

@@ -1,0 +1,240 @@
+"""Conflicts found on the structure: which pairs of transitions can compete for a token, and what
+settles them.
+
+Two transitions compete when one stimulus, or what had come before it, can make both fireable for
+the same token. So what can come *last* before each can fire is compared: a pulse can only come
+last; a latched event that is dropped when nothing waits comes after the tokens; a timer runs only
+once the arcs are satisfied. If nothing can come last for both, they never become fireable together
+and arrival order decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+from math import gcd
+
+from petrobot.coordinator.task import Early, End, Input, Kind, Scope, Task, Transition
+from petrobot.coordinator.task.check.findings import Finding
+from petrobot.coordinator.task.conditions.regions import Answer, Domain, exclusive
+from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.validation import condition_domains, is_pulse
+from petrobot.coordinator.task.wording import Severity
+
+# Pairs of transitions that invariants keep from being enabled together.
+
+ROWS = 2000
+Flow = dict[int, int]
+"""Weights by place index."""
+
+
+def semiflows(task: Task) -> tuple[Flow, ...]:
+    """P-semiflows without control places; empty if there are none or too many to find here."""
+    net = task.net
+    places = [i for i, p in enumerate(task.places.values()) if p.kind is not Kind.CONTROL]
+    rows: list[tuple[Flow, dict[int, int]]] = [({p: 1}, _effects(net, p)) for p in places]
+    for t in range(len(net.transitions)):
+        rest = [r for r in rows if not r[1].get(t)]
+        gain = [r for r in rows if r[1].get(t, 0) > 0]
+        loss = [r for r in rows if r[1].get(t, 0) < 0]
+        if len(rest) + len(gain) * len(loss) > ROWS:
+            return ()
+        rows = _minimal(rest + [_combine(a, b, t) for a in gain for b in loss])
+    return tuple(flow for flow, _ in rows)
+
+
+def never_together(net: Net, flows: tuple[Flow, ...], t: int, u: int) -> bool:
+    """Whether some semiflow shows that no reachable marking enables both transitions."""
+    need = dict(net.consume[t])
+    for p, w in net.consume[u]:
+        need[p] = max(w, need.get(p, 0))
+    return any(
+        sum(y * need.get(p, 0) for p, y in flow.items())
+        > sum(y * net.initial[p] for p, y in flow.items())
+        for flow in flows
+    )
+
+
+def _effects(net: Net, place: int) -> dict[int, int]:
+    """Net gain of the place by transition, zeros left out."""
+    effects: dict[int, int] = {}
+    for t in range(len(net.transitions)):
+        gain = dict(net.produce[t]).get(place, 0) - dict(net.consume[t]).get(place, 0)
+        if gain:
+            effects[t] = gain
+    return effects
+
+
+def _combine(
+    a: tuple[Flow, dict[int, int]], b: tuple[Flow, dict[int, int]], t: int
+) -> tuple[Flow, dict[int, int]]:
+    """The positive combination of a row that gains and one that loses in which t changes
+    nothing."""
+    x, y = -b[1][t], a[1][t]
+    flow = _sum(a[0], x, b[0], y)
+    effect = _sum(a[1], x, b[1], y)
+    divisor = gcd(*flow.values(), *effect.values())
+    return {p: w // divisor for p, w in flow.items()}, {s: w // divisor for s, w in effect.items()}
+
+
+def _sum(a: dict[int, int], x: int, b: dict[int, int], y: int) -> dict[int, int]:
+    total = {k: x * a.get(k, 0) + y * b.get(k, 0) for k in {*a, *b}}
+    return {k: v for k, v in total.items() if v}
+
+
+def _minimal(rows: list[tuple[Flow, dict[int, int]]]) -> list[tuple[Flow, dict[int, int]]]:
+    """Rows whose support contains no other row's."""
+    kept: list[tuple[Flow, dict[int, int]]] = []
+    for row in sorted(rows, key=lambda r: len(r[0])):
+        if not any(other[0].keys() <= row[0].keys() for other in kept):
+            kept.append(row)
+    return kept
+
+
+MARKING = ("marking", "")
+_LIVE_ENDS = (End.PREEMPT, End.GOING)
+Trigger = tuple[str, str]
+
+
+def conflicts(task: Task) -> Iterator[Finding]:
+    """Conflicts that nothing settles (errors) and those that arrival order settles (notes)."""
+    domains, flows, net = condition_domains(task), semiflows(task), task.net
+    for t, u in combinations(task.transitions.values(), 2):
+        shared = sorted(_shared(task, t, u))
+        if not shared or excluded(task, t, u) or excluded(task, u, t):
+            continue
+        if not never_together(
+            net, flows, net.transition_index[t.name], net.transition_index[u.name]
+        ):
+            yield from _judge(task, t, u, shared, domains)
+
+
+def _judge(
+    task: Task, t: Transition, u: Transition, shared: list[str], domains: dict[str, Domain]
+) -> Iterator[Finding]:
+    verdict = exclusive([t.when, u.when], domains)
+    if verdict.answer is Answer.PROVED:
+        return
+    key, over = f"transitions.{t.name}", " and ".join(shared)
+    if not last_triggers(task, t) & last_triggers(task, u):
+        text = (
+            f"{t.name} and {u.name} compete for {over}: whichever becomes fireable first takes it"
+        )
+        yield Finding(Severity.NOTE, "arrival-order", key, text)
+        return
+    if (
+        t.priority != u.priority
+        or (t.weight is not None and u.weight is not None)
+        or _preempts(t) != _preempts(u)
+    ):
+        return
+    unsure = (
+        " (it is not known whether their conditions exclude each other)"
+        if verdict.answer is Answer.UNKNOWN
+        else ""
+    )
+    text = (
+        f"{t.name} and {u.name} can become fireable together, compete for {over}, and "
+        f"nothing settles it{unsure}"
+    )
+    remedy = "give exclusive conditions, or different `priority`, or a `weight` to each"
+    yield Finding(Severity.ERROR, "unsettled-conflict", key, text, remedy, verdict.witness)
+
+
+def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
+    """What both take: places of shared tokens, latched events, raised events."""
+    shared = {
+        a.place
+        for a in t.inputs
+        for b in u.inputs
+        if a.place == b.place and _same_token(task, t, a, u, b)
+    }
+    common = [task.events[e] for e in t.events if e in u.events]
+    events = {f"the event {e.name}" for e in common if not is_pulse(e)}
+    return shared | events | _mutual_bars(t, u) | (_room(task, t) & _room(task, u))
+
+
+def _room(task: Task, t: Transition) -> set[str]:
+    """The room that the transition takes up in places of limited capacity."""
+    net = task.net
+    index = net.transition_index[t.name]
+    taken = dict(net.consume[index])
+    return {
+        f"room in {net.places[p]}"
+        for p, w in net.produce[index]
+        if net.capacity[p] is not None and w > taken.get(p, 0)
+    }
+
+
+def _same_token(task: Task, t: Transition, a: Input, u: Transition, b: Input) -> bool:
+    """Whether the two arcs from one place can ask for the same token."""
+    if End.GOING in (a.end, b.end):
+        return False
+    if a.end == b.end:
+        return True
+    return (a.end is End.PREEMPT and t.priority > u.priority) or (
+        b.end is End.PREEMPT and u.priority > t.priority
+    )
+
+
+def _mutual_bars(t: Transition, u: Transition) -> set[str]:
+    """Inhibitor arcs by which each bars the other."""
+    one = {i.place for i in u.inhibitors} & {o.place for o in t.outputs}
+    other = {i.place for i in t.inhibitors} & {o.place for o in u.outputs}
+    return {f"the way past {p}" for p in one | other} if one and other else set()
+
+
+def excluded(task: Task, t: Transition, u: Transition) -> bool:
+    """Whether tokens alone keep the two from being fireable together: one run in two states, or an
+    inhibitor arc."""
+    limits = {i.place: i.threshold for i in t.inhibitors}
+    if any(b.weight >= limits[b.place] for b in u.inputs if b.place in limits):
+        return True
+    for a in t.inputs:
+        for b in u.inputs:
+            single = (
+                a.place == b.place and a.end is not None and task.places[a.place].servers is None
+            )
+            if single and _state(a) != _state(b) and not _same_token(task, t, a, u, b):
+                return True
+    return False
+
+
+def _state(arc: Input) -> str:
+    """The state of the run that the arc asks for."""
+    return "live" if arc.end in _LIVE_ENDS else str(arc.end)
+
+
+def _preempts(t: Transition) -> bool:
+    """As the engine ranks it: a run's end goes before its preemption, unless a weight is
+    declared."""
+    return t.weight is None and any(a.end is End.PREEMPT for a in t.inputs)
+
+
+def last_triggers(task: Task, t: Transition) -> set[Trigger]:
+    """What can be the last thing to come before the transition can fire."""
+    pulses = {("event", e) for e in t.events if is_pulse(task.events[e])}
+    if pulses:
+        return pulses
+    variables = {("variable", n) for n in t.when.names} if t.when is not None else set()
+    if t.after is not None:
+        return {("timer", t.name)} | variables
+    ends = {("end", a.place) for a in t.inputs if a.end in (End.NORMAL, End.ERROR)}
+    events = {("event", e) for e in t.events}
+    if any(_holds_until_fired(task, e) for e in t.events):
+        return events | ends | variables
+    if (
+        events
+        and all(task.events[e].scope is Scope.INTERNAL for e in t.events)
+        and len(t.inputs) == 1
+    ):
+        return events | ends | variables
+    others = {MARKING} if len(t.inputs) > len(ends) or t.inhibitors or not t.inputs else set()
+    return events | ends | variables | others
+
+
+def _holds_until_fired(task: Task, event: str) -> bool:
+    """Whether the event's flag can only be set once all tokens of a transition that waits for it
+    are there."""
+    e = task.events[event]
+    return e.scope is Scope.EXTERNAL and not is_pulse(e) and e.early is Early.DROP

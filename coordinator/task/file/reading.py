@@ -1,0 +1,405 @@
+"""TOML to task. All faults are found in one pass and raised together."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from enum import StrEnum
+from math import isfinite
+from pathlib import Path
+from typing import Any, TypeVar
+
+from petrobot.coordinator.task import (
+    Early,
+    Estimate,
+    Event,
+    Inhibitor,
+    Input,
+    Kind,
+    Memory,
+    Output,
+    Place,
+    PrimitiveTask,
+    Reference,
+    Scope,
+    Start,
+    Status,
+    Subnet,
+    Task,
+    Transition,
+    Value,
+    Variable,
+    VariableType,
+)
+from petrobot.coordinator.task.conditions import ConditionError, Expression, parse
+from petrobot.coordinator.task.file.arcs import ArcError, read_input, read_output
+from petrobot.coordinator.task.file.errors import TaskFileError, key_lines, line_of
+from petrobot.coordinator.task.validation import faults as task_faults
+from petrobot.coordinator.task.wording import Fault, nearest
+
+# Reading one TOML table: every key is asked for by name and type, every fault is collected, leftovers are refused.
+
+E = TypeVar("E", bound=StrEnum)
+_KINDS: Mapping[type, str] = {
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    list: "a list",
+    dict: "a table",
+}
+
+
+class Table:
+    """A table, its key in the file and the list that collects faults. Wrong or missing values read
+    as their default."""
+
+    def __init__(self, data: Mapping[str, Any], key: str, faults: list[Fault]) -> None:
+        self.data = data
+        self.key = key
+        self.faults = faults
+        self.asked: set[str] = set()
+
+    def fault(self, name: str, text: str, remedy: str = "") -> None:
+        """Note a fault of one of the table's keys."""
+        self.faults.append(Fault(f"{self.key}.{name}" if self.key else name, text, remedy))
+
+    def text(self, name: str, default: str | None = None) -> str:
+        """A text; required without a default."""
+        value: str = self._value(name, str, default, "")
+        return value
+
+    def number(self, name: str, default: float | None = None) -> float:
+        """A finite number; required without a default."""
+        value = float(self._value(name, float, default, 1.0))
+        if not isfinite(value):
+            self.fault(name, f"{value} is no finite number", "give a finite number")
+            return 1.0
+        return value
+
+    def maybe_number(self, name: str) -> float | None:
+        """A finite number, or None if the key is absent."""
+        self.asked.add(name)
+        return self.number(name) if name in self.data else None
+
+    def integer(self, name: str, default: int) -> int:
+        """A whole number."""
+        value: int = self._value(name, int, default, default)
+        return value
+
+    def maybe_integer(self, name: str) -> int | None:
+        """A whole number, or None if the key is absent."""
+        self.asked.add(name)
+        return self.integer(name, 1) if name in self.data else None
+
+    def flag(self, name: str) -> bool:
+        """True or false; false if absent."""
+        value: bool = self._value(name, bool, False, False)
+        return value
+
+    def word(self, name: str, words: type[E], default: E | None = None) -> E:
+        """One of the words of an enumeration; required without a default."""
+        first = next(iter(words))
+        text = self._value(name, str, default, first)
+        try:
+            return words(text)
+        except ValueError:
+            self.fault(
+                name,
+                f"{text!r} is none of {', '.join(words)}",
+                nearest(text, list(words)).strip(" ()"),
+            )
+            return first
+
+    def texts(self, name: str, single: bool = False) -> tuple[str, ...]:
+        """A list of texts (or, if allowed, a single text); empty if absent."""
+        if single and isinstance(self.data.get(name), str):
+            return (self.text(name),)
+        values: list[Any] = self._value(name, list, [], [])
+        for value in values:
+            if not isinstance(value, str):
+                self.fault(name, f"{value!r} is no text", "write each in quotes")
+        return tuple(v for v in values if isinstance(v, str))
+
+    def plain(self, name: str) -> dict[str, Any]:
+        """A table taken as it is; empty if absent."""
+        value: dict[str, Any] = self._value(name, dict, {}, {})
+        return dict(value)
+
+    def any(self, name: str) -> Any:
+        """Any value, or None if the key is absent."""
+        self.asked.add(name)
+        return self.data.get(name)
+
+    def table(self, name: str) -> Table:
+        """A table in this one; an absent one is empty."""
+        return Table(self.plain(name), f"{self.key}.{name}" if self.key else name, self.faults)
+
+    def tables(self, name: str) -> dict[str, Table]:
+        """A table of tables."""
+        outer = self.table(name)
+        found: dict[str, Table] = {}
+        for key, value in outer.data.items():
+            if isinstance(value, dict):
+                found[key] = Table(value, f"{outer.key}.{key}", self.faults)
+            else:
+                outer.fault(key, f"{value!r} is no table", f"write [{outer.key}.{key}]")
+        return found
+
+    def done(self) -> None:
+        """Refuse every key that was not asked for."""
+        for name in self.data:
+            if name not in self.asked:
+                near = nearest(name, self.asked).strip(" ()")
+                self.fault(
+                    name, "unknown key", near or f"known here: {', '.join(sorted(self.asked))}"
+                )
+
+    def _value(self, name: str, kind: type, default: Any, fallback: Any) -> Any:
+        self.asked.add(name)
+        if name not in self.data:
+            if default is None:
+                self.fault(name, "missing", f"give {_KINDS[kind]}")
+                return fallback
+            return default
+        value = self.data[name]
+        fits = isinstance(value, (int, float) if kind is float else kind)
+        if fits and (kind is bool or not isinstance(value, bool)):
+            return value
+        self.fault(name, f"{value!r} is not {_KINDS[kind]}", f"give {_KINDS[kind]}")
+        return fallback
+
+
+SCHEMA = 1
+LARGEST = 4 << 20
+
+
+def load(path: str | Path) -> Task:
+    """The task in a file. Raises TaskFileError with every fault."""
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        fault = Fault(
+            "file", f"cannot be read: {error.strerror}", "check the path and its permissions"
+        )
+        raise TaskFileError(str(path), [fault], [0]) from error
+    if len(data) > LARGEST:
+        raise TaskFileError(
+            str(path), [Fault("file", f"{len(data)} bytes", f"a task has at most {LARGEST}")], [0]
+        )
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise TaskFileError(
+            str(path), [Fault("file", "is not UTF-8", "save it as UTF-8")], [line]
+        ) from error
+    return loads(text, str(path))
+
+
+def loads(text: str, source: str = "task") -> Task:
+    """The task in a TOML text; `source` names it in errors. Raises TaskFileError with every
+    fault."""
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        found = re.search(r"at line (\d+)", str(error))
+        line = int(found[1]) if found else text.count("\n") + 1  # "at end of document"
+        raise TaskFileError(
+            source, [Fault("TOML", str(error), "see toml.io for the syntax")], [line]
+        ) from error
+    except RecursionError as error:
+        raise TaskFileError(
+            source, [Fault("TOML", "nested too deeply", "flatten it")], [0]
+        ) from error
+    faults: list[Fault] = []
+    task = _task(Table(data, "", faults))
+    faults = faults or list(task_faults(task))
+    if faults:
+        lines = key_lines(text)
+        raise TaskFileError(source, faults, [line_of(f.key, lines) for f in faults])
+    return task
+
+
+def _task(root: Table) -> Task:
+    schema = root.any("schema")
+    if schema != SCHEMA or isinstance(schema, bool):
+        root.fault("schema", f"{schema!r} is not known here", f"write schema = {SCHEMA}")
+    head = root.table("task")
+    task = Task(
+        name=head.text("name"),
+        text=head.text("text", ""),
+        goal=head.text("goal", ""),
+        goal_transitions=head.texts("goal_transitions"),
+        final=_condition(head, "final") or parse("false"),
+        final_error=_condition(head, "final_error") if "final_error" in head.data else None,
+        runs_place=head.text("runs_place", ""),
+        prepare=head.text("prepare", ""),
+        score=head.text("score", ""),
+        pictures=head.text("pictures", ""),
+        services=head.text("services", ""),
+        parameters=head.plain("parameters"),
+        primitive_tasks={
+            n: _primitive_task(n, t) for n, t in root.tables("primitive_tasks").items()
+        },
+        variables={n: _variable(n, t) for n, t in root.tables("variables").items()},
+        events={n: _event(n, t) for n, t in root.tables("events").items()},
+        places={n: _place(n, t) for n, t in root.tables("places").items()},
+        transitions={n: _transition(n, t) for n, t in root.tables("transitions").items()},
+        subnets={n: _subnet(n, t) for n, t in root.tables("subnets").items()},
+    )
+    head.any("final_error")
+    head.done()
+    root.done()
+    return task
+
+
+def _primitive_task(name: str, t: Table) -> PrimitiveTask:
+    primitive = PrimitiveTask(
+        name=name,
+        goal=t.text("goal"),
+        specification=t.text("specification", ""),
+        alternatives=t.texts("alternatives"),
+        deadline=t.number("deadline"),
+        target_reliability=t.number("target_reliability", 0.9),
+        cost=t.text("cost", "wall"),
+        error_causes=_texts(t.table("error_causes")),
+        start=t.word("start", Start, Start.WHEN_FREE),
+        stop_within=t.number("stop_within", 2.0),
+        estimates=_estimates(t),
+    )
+    t.done()
+    return primitive
+
+
+def _texts(t: Table) -> dict[str, str]:
+    return {name: t.text(name) for name in t.data}
+
+
+def _estimates(t: Table) -> dict[Status, Estimate]:
+    table = t.table("estimates")
+    estimates: dict[Status, Estimate] = {}
+    for status in Status:
+        if status.value in table.data:
+            e = table.table(status.value)
+            estimates[status] = Estimate(e.number("share"), e.number("mean"), e.number("cv", 1.0))
+            e.done()
+    table.done()
+    return estimates
+
+
+def _variable(name: str, t: Table) -> Variable:
+    variable = Variable(name, t.word("type", VariableType), t.any("initial"), t.texts("values"))
+    t.done()
+    return variable
+
+
+def _event(name: str, t: Table) -> Event:
+    event = Event(
+        name=name,
+        scope=t.word("scope", Scope),
+        memory=t.word("memory", Memory, Memory.PULSE),
+        early=t.word("early", Early, Early.DROP),
+        by=t.text("by", ""),
+        mean_wait=t.maybe_number("mean_wait"),
+        text=t.text("text", ""),
+    )
+    t.done()
+    return event
+
+
+def _place(name: str, t: Table) -> Place:
+    place = Place(
+        name=name,
+        kind=t.word("kind", Kind),
+        tokens=t.integer("tokens", 0),
+        capacity=t.maybe_integer("capacity"),
+        task=t.text("task", ""),
+        args={n: _argument(v) for n, v in t.plain("args").items()},
+        out=_texts(t.table("out")),
+        servers=t.maybe_integer("servers"),
+        subnet=t.text("subnet", ""),
+        macro=t.text("macro", ""),
+        label=t.text("label", ""),
+        x=t.maybe_number("x"),
+        y=t.maybe_number("y"),
+    )
+    t.done()
+    return place
+
+
+def _argument(value: Any) -> Value:
+    if isinstance(value, dict) and set(value) == {"var"} and isinstance(value["var"], str):
+        return Reference(value["var"])
+    return value
+
+
+def _transition(name: str, t: Table) -> Transition:
+    arcs = _inputs(t)
+    transition = Transition(
+        name=name,
+        inputs=tuple(a for a in arcs if isinstance(a, Input)),
+        inhibitors=tuple(a for a in arcs if isinstance(a, Inhibitor)),
+        outputs=_outputs(t),
+        events=t.texts("event", single=True),
+        when=_condition(t, "when") if "when" in t.data else None,
+        priority=t.integer("priority", 0),
+        weight=t.maybe_number("weight"),
+        after=t.maybe_number("after"),
+        error_branch=t.flag("error_branch"),
+        macro=t.text("macro", ""),
+        label=t.text("label", ""),
+        x=t.maybe_number("x"),
+        y=t.maybe_number("y"),
+    )
+    t.any("when")
+    t.done()
+    return transition
+
+
+def _inputs(t: Table) -> list[Input | Inhibitor]:
+    arcs: list[Input | Inhibitor] = []
+    for text in t.texts("in"):
+        try:
+            arcs.append(read_input(text))
+        except ArcError as error:
+            t.fault("in", str(error))
+    return arcs
+
+
+def _outputs(t: Table) -> tuple[Output, ...]:
+    arcs: list[Output] = []
+    for text in t.texts("out"):
+        try:
+            arcs.append(read_output(text))
+        except ArcError as error:
+            t.fault("out", str(error))
+    return tuple(arcs)
+
+
+def _condition(t: Table, name: str) -> Expression | None:
+    text = t.text(name)
+    if not text:
+        if name in t.data and isinstance(t.data[name], str):
+            t.fault(name, "an empty condition", "write one, or drop the key")
+        return None
+    try:
+        return parse(text)
+    except ConditionError as error:
+        t.fault(name, str(error))
+        return None
+
+
+def _subnet(name: str, t: Table) -> Subnet:
+    subnet = Subnet(
+        name=name,
+        places={n: _place(n, p) for n, p in t.tables("places").items()},
+        transitions={n: _transition(n, p) for n, p in t.tables("transitions").items()},
+        entry=t.text("entry"),
+        normal=t.text("normal"),
+        error=t.text("error", ""),
+    )
+    t.done()
+    return subnet

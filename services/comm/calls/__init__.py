@@ -1,0 +1,1 @@
+"""Calls and results between a caller and a node: machines, and their asyncio shells."""

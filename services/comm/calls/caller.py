@@ -1,0 +1,477 @@
+"""The calling end of the node protocol for one peer, as a machine: calls out, how each one ended
+in.
+
+Used alike in real time (`client.py` drives it) and in lock step (its messages travel in envelopes).
+What it promises:
+
+- Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
+- No call is ever made again under another id. After a lost link the same call is sent again under
+  the same id to the same
+  boot of the peer, marked `again`: the peer knows the id, or says that it may have forgotten it,
+  and runs it at most once. Another boot is never sent it.
+- What the caller decides by itself is ERROR with a cause (the table in docs/protocol.md): executed
+  = no where the call never
+  left, unknown otherwise, also when its owner names the boot it was meant for: he may have sent it
+  before he was restarted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from petrobot.services.comm.calls.acknowledgements import Settled
+from petrobot.services.comm.calls.active import NEVER, Patience, Pending, UnderWay, Waiter
+from petrobot.services.comm.calls.events import EventIntake
+from petrobot.services.comm.calls.notices import (
+    Accepted,
+    Answered,
+    Ended,
+    EventArrived,
+    Late,
+    Notice,
+    PeerBack,
+    PeerLost,
+    Progress,
+)
+from petrobot.services.comm.calls.reconnect import LOST, REFUSED, UNREACHABLE, Absence
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.plain import plain
+
+__all__ = [
+    "Accepted",
+    "Answered",
+    "Caller",
+    "Ended",
+    "EventArrived",
+    "Late",
+    "Notice",
+    "Patience",
+    "PeerBack",
+]
+__all__ += ["PeerLost", "Progress"]
+
+ERROR: Final = "error"
+
+
+class Caller:
+    """Calls to one peer. `hello` says who calls; its epoch goes into each call that names none.
+
+    With `auto_ack` results and events are acknowledged at once; otherwise the owner says when they
+    are safe.
+    """
+
+    def __init__(
+        self, peer: str, hello: m.Hello, *, auto_ack: bool = False, patience: Patience | None = None
+    ) -> None:
+        self.peer = peer
+        self.hello = hello
+        self.up = False
+        self.boot = ""
+        """Boot of the peer, empty before the first link."""
+        self.offers: tuple[str, ...] = ()
+        self.soonest = NEVER
+        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for
+        that."""
+        self._auto_ack = auto_ack
+        self._patience = patience or Patience()
+        self._absence = Absence(peer, self._patience)
+        self._pending = UnderWay()
+        self._commands: dict[str, float] = {}
+        self._names: tuple[str, ...] | None = None
+        self._events = EventIntake()
+        self._settled = Settled(self._patience.acknowledge)
+        self._messages: list[m.Message] = []
+        self._notices: list[Notice] = []
+        self._takers: Mapping[type, Callable[[float, Any], None]] = {
+            m.Outcome: lambda now, outcome: self.take_outcomes(now, (outcome,)),
+            m.Accept: self._take_accept,
+            m.Feedback: self._take_feedback,
+            m.Event: self._take_event,
+            m.Answer: self._take_answer,
+            m.Welcome: self.link_up,
+            m.Refuse: self.link_refused,
+            m.Bye: lambda now, bye: self.link_down(now, bye.text or "it left"),
+            m.Ping: lambda now, ping: self._messages.append(m.Pong(ping.number)),
+        }
+
+    def open(self, now: float) -> None:
+        """Say HELLO (lock step; in real time the connection does it)."""
+        self._messages.append(self.hello)
+        self.connecting(now)
+
+    def connecting(self, now: float) -> None:
+        """A first connection is being tried: calls made now wait for it as long as for a
+        reconnection."""
+        self._absence.wait(now)
+        self.soonest = min(self.soonest, self._absence.until)
+
+    def call(self, now: float, call: m.Call) -> None:
+        """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments
+        that no message carries."""
+        self.begin(
+            now,
+            call.id,
+            call.service,
+            call.arguments,
+            call.deadline,
+            call.parent,
+            call.seed,
+            call.epoch,
+            call.boot,
+            again=call.again,
+        )
+
+    def begin(
+        self,
+        now: float,
+        id: str,  # noqa: A002
+        service: str,
+        arguments: Mapping[str, Any],
+        deadline: float | None = None,
+        parent: str = "",
+        seed: int = 0,
+        epoch: int = 0,
+        boot: str = "",
+        waiter: Waiter | None = None,
+        again: bool = False,
+    ) -> int:
+        """`call` by the fields of a Call. `waiter` is told its end in place of a notice, and its
+        result acknowledged then.
+
+        Gives how many messages wait to be taken out.
+        """
+        if id in self._pending:
+            raise ValueError(f"call {id}: this id is under way already")
+        if arguments:
+            arguments = plain(arguments, "arguments")
+        call = m.Call(
+            id,
+            service,
+            arguments,
+            deadline,
+            epoch or self.hello.epoch,
+            boot or self.boot,
+            parent,
+            seed,
+            again,
+        )
+        if self.up:
+            due = now + self._patience.accept
+            self._pending[id] = Pending(call, not boot, now, waiter, True, False, None, due)
+            self._pending.watch_new(due, id)
+            self._messages.append(call)
+            if due < self.soonest:
+                self.soonest = due
+        else:
+            self._begin_unsent(now, Pending(call, not boot, now, waiter))
+        return len(self._messages)
+
+    def _begin_unsent(self, now: float, pending: Pending) -> None:
+        self._pending[pending.call.id] = pending
+        away = self._absence.new_call(now)
+        self.soonest = min(self.soonest, self._absence.until)
+        if away is not None:
+            self._end(pending.call.id, *away, pending.if_unsent)
+
+    def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
+        """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the
+        peer does not say so `within` seconds (None: `Patience.stop`). An id that is not under way
+        is left alone.
+        """
+        pending = self._pending.get(id)
+        if pending is None or pending.cancel is not None:
+            return
+        if not pending.sent and pending.if_unsent is m.Executed.NO:
+            self._end(id, "cancelled", reason, m.Executed.NO)
+            return
+        pending.cancel = reason
+        self._pending.release(now, id)
+        self._watch(pending, now + (self._patience.stop if within is None else within))
+        if self.up:
+            self._messages.append(m.Cancel(id, reason))
+
+    def hold(self, now: float, id: str) -> None:  # noqa: A002
+        """The peer holds this call's run: it is not waited for until `release`."""
+        self._pending.hold(now, id)
+
+    def release(self, now: float, id: str) -> None:  # noqa: A002
+        """The run goes on."""
+        self._pending.release(now, id)
+        self.soonest = min(self.soonest, self._pending.due())
+
+    def cancel_children(self, now: float, parent: str, reason: str = "") -> None:
+        """Cancel all calls made on behalf of this one."""
+        for id_ in [id_ for id_, pending in self._pending.items() if pending.call.parent == parent]:
+            self.cancel(now, id_, reason)
+
+    def command(self, now: float, command: m.Command) -> None:
+        """Give a node-level order. Raises NotPlainError for data that no message carries."""
+        if not self.up:
+            self._no_answer(command.id, UNREACHABLE)
+            return
+        self._commands[command.id] = now + self._patience.answer
+        self.soonest = min(self.soonest, now + self._patience.answer)
+        self._messages.append(replace(command, data=plain(command.data, "data")))
+
+    def subscribe(self, now: float, names: Iterable[str]) -> None:
+        """Have these events sent from now on, also after each reconnection; replaces an earlier
+        subscription."""
+        self._names = tuple(names)
+        if self.up:
+            self._messages.append(m.Subscribe(self._names))
+
+    def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
+        """The result of this call is safe; the peer may forget it. After a restart also of a call
+        of the time before. One that was given up here has no result yet."""
+        settled = self._settled
+        if id not in self._pending and not settled.is_safe(id) and not settled.was_given_up(id):
+            self._ack(now, id)
+
+    def disown(self, now: float, id: str) -> None:  # noqa: A002
+        """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes
+        as `Late`."""
+        if id not in self._pending and self.up:
+            self._settled.give_up(id)
+            self._messages.append(m.Cancel(id, "disowned"))
+
+    def acknowledge_event(self, now: float, event: m.Event) -> None:
+        """This event of its source and all before it are safe."""
+        ack = self._events.acknowledge(event)
+        if ack is not None and self.up:
+            self._messages.append(ack)
+
+    def under_way(self) -> tuple[str, ...]:
+        """Ids of the calls that have not ended."""
+        return tuple(self._pending)
+
+    def link_up(self, now: float, welcome: m.Welcome) -> None:
+        """The peer welcomed us: what was under way is sent again under its id, or ends if this is
+        another boot."""
+        same = welcome.boot == self.boot
+        self.up = True
+        self._absence.over()
+        self.boot, self.offers = welcome.boot, welcome.offers
+        self._notices.append(
+            PeerBack(welcome.name, welcome.boot, same, welcome.offers, welcome.runs)
+        )
+        if not same:
+            self._forget_boot()
+        if self._names is not None:
+            self._messages.append(m.Subscribe(self._names))
+        for pending in list(self._pending.values()):
+            self._send(now, pending)
+            if pending.cancel is not None:
+                self._messages.append(m.Cancel(pending.call.id, pending.cancel))
+        self._settle_again(now, welcome.runs)
+
+    def _forget_boot(self) -> None:
+        """The peer is another process now: what the old one was sent is lost, its event numbers
+        begin anew."""
+        self._events.clear()
+        for id_, pending in list(self._pending.items()):
+            if pending.sent:
+                self._end(id_, "rebooted", f"{self.peer} was started anew", m.Executed.UNKNOWN)
+        self._settled.peer_is_new()
+
+    def _settle_again(self, now: float, runs: Iterable[str]) -> None:
+        """Runs that the peer still keeps although they ended here: stop what was given up,
+        acknowledge what was lost."""
+        for id_ in runs:
+            if self._settled.was_given_up(id_):
+                self._messages.append(m.Cancel(id_, "given up"))
+            elif self._settled.is_safe(id_):
+                self._ack(now, id_)
+
+    def link_down(self, now: float, reason: str, *, final: bool = False) -> None:
+        """The link broke. Calls wait for it to come back, unless `final` (the peer was silent for
+        long already)."""
+        self._absence.fail(reason)
+        if not self.up:
+            return
+        self.up = False
+        self._messages.clear()
+        self._settled.link_lost()
+        self._notices.append(PeerLost(reason))
+        for id_ in list(self._commands):
+            self._no_answer(id_, LOST)
+        if final:
+            self._end_all(LOST, reason)
+        else:
+            self.connecting(now)
+
+    def unreached(self, now: float, trouble: str, *, gone: bool = False) -> None:
+        """An attempt to connect has failed; `gone`: nothing listens at the peer's address. A
+        process that we were connected to has ended then, so its calls end at once; what was never
+        connected may still be starting."""
+        self._absence.fail(trouble)
+        if gone and self.boot and not self.up and self._absence.until < NEVER:
+            self._end_all(*self._absence.give_up())
+
+    def link_refused(self, now: float, refuse: m.Refuse) -> None:
+        """The peer refuses us: every call ends, also those to come, until it welcomes us."""
+        was_up, self.up = self.up, False
+        away = self._absence.refuse(refuse.code, refuse.text)
+        self._messages.clear()
+        if was_up or self._pending or self._commands:
+            self._notices.append(PeerLost(away.text))
+        for id_ in list(self._commands):
+            self._no_answer(id_, REFUSED)
+        self._end_all(*away)
+
+    def receive(self, now: float, message: m.Message) -> None:
+        """Take a message of the peer; kinds that only a server is sent are left alone."""
+        taker = self._takers.get(type(message))
+        if taker is not None:
+            taker(now, message)
+
+    def take_outcomes(self, now: float, outcomes: Iterable[m.Outcome]) -> None:
+        """`receive` of results."""
+        safe: list[str] = []
+        take = self._pending.pop
+        for outcome in outcomes:
+            id_ = outcome.id
+            pending = take(id_, None)
+            if pending is None:
+                if id_ not in safe:
+                    self._take_late(now, outcome)
+                continue
+            waiter = pending.waiter
+            if waiter is not None:
+                safe.append(id_)
+                if not waiter.done():
+                    waiter.set_result(outcome)
+                continue
+            if self._auto_ack:
+                safe.append(id_)
+            else:
+                self._settled.end(id_, False)
+            self._notices.append(Ended(outcome))
+        if safe:
+            self._ack(now, *safe)
+
+    def _take_late(self, now: float, outcome: m.Outcome) -> None:
+        id_ = outcome.id
+        safe = self._settled.is_safe(id_)
+        if safe is None:
+            self._settled.turn_up(id_)
+            if outcome.executed is not m.Executed.UNKNOWN:
+                self._notices.append(Late(outcome))
+        if safe is not False:
+            self._ack(now, id_)
+
+    def _take_accept(self, now: float, accept: m.Accept) -> None:
+        pending = self._pending.get(accept.id)
+        if pending is None or pending.accepted:
+            return
+        pending.accepted = True
+        self._notices.append(Accepted(accept.id))
+        if pending.call.deadline is not None:
+            self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
+
+    def _take_feedback(self, now: float, feedback: m.Feedback) -> None:
+        if feedback.id in self._pending:
+            self._notices.append(Progress(feedback.id, feedback.fraction, feedback.data))
+
+    def _take_event(self, now: float, event: m.Event) -> None:
+        new, ack = self._events.take(event, self._auto_ack)
+        if ack is not None:
+            self._messages.append(ack)
+        if new:
+            self._notices.append(EventArrived(event))
+
+    def _take_answer(self, now: float, answer: m.Answer) -> None:
+        if self._commands.pop(answer.id, None) is not None:
+            self._notices.append(Answered(answer))
+
+    def advance(self, now: float) -> None:
+        """End what has waited too long."""
+        away = self._absence.advance(now)
+        if away is not None:
+            self._end_all(*away)
+        for id_ in self._pending.not_accepted(now):
+            if self.up:
+                self._give_up(
+                    id_,
+                    "not_accepted",
+                    f"{self.peer} did not accept it in {self._patience.accept:g} s",
+                )
+        for id_ in self._pending.not_answered(now):
+            self._give_up(id_, "no_answer", f"{self.peer} gave no result in time")
+        for id_ in [id_ for id_, due in self._commands.items() if due <= now]:
+            self._no_answer(id_, "no_answer")
+
+    def due(self) -> float | None:
+        """When `advance` has something to do next (s), None if never."""
+        waits = (self._pending.due(), self._settled.due, self._absence.until)
+        self.soonest = soonest = min(*waits, *self._commands.values())
+        return soonest if soonest < NEVER else None
+
+    @property
+    def calls(self) -> int:
+        """How many calls are under way."""
+        return len(self._pending)
+
+    @property
+    def has_news(self) -> bool:
+        """Whether there are notices to take out."""
+        return bool(self._notices)
+
+    def messages(self, now: float | None = None) -> list[m.Message]:
+        """What to send, in order; each message is given once. Acknowledgements wait for others
+        until `now` reaches theirs."""
+        if now is None or now >= self._settled.due:
+            self._messages += self._settled.take_acks()
+        messages, self._messages = self._messages, []
+        return messages
+
+    def notices(self) -> list[Notice]:
+        """What the owner should know, in order; each notice is given once."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def _send(self, now: float, pending: Pending) -> None:
+        call = pending.call
+        if pending.any_boot and call.boot != self.boot:
+            call = pending.call = replace(call, boot=self.boot)
+        if pending.sent and not call.again:
+            call = pending.call = replace(call, again=True)
+        pending.sent, pending.accepted = True, False
+        due = now + self._patience.accept
+        self._pending.watch_accept(pending, due)
+        self._messages.append(call)
+        self.soonest = min(self.soonest, due)
+
+    def _watch(self, pending: Pending, due: float) -> None:
+        self._pending.watch_result(pending, due)
+        self.soonest = min(self.soonest, due)
+
+    def _ack(self, now: float, *ids: str) -> None:
+        if self.up:
+            self._settled.acknowledge(now, *ids)
+            self.soonest = min(self.soonest, self._settled.due)
+
+    def _give_up(self, id_: str, cause: str, text: str) -> None:
+        if self.up:
+            self._messages.append(m.Cancel(id_, cause))
+        self._end(id_, cause, text, m.Executed.UNKNOWN)
+
+    def _end_all(self, cause: str, text: str) -> None:
+        for id_, pending in list(self._pending.items()):
+            its = UNREACHABLE if cause == LOST and not pending.sent else cause
+            self._end(id_, its, text, m.Executed.UNKNOWN if pending.sent else pending.if_unsent)
+
+    def _end(self, id_: str, cause: str, text: str, executed: m.Executed) -> None:
+        pending = self._pending.pop(id_)
+        if pending.sent:
+            self._settled.give_up(id_)
+        outcome, waiter = m.Outcome(id_, ERROR, {}, cause, text, executed), pending.waiter
+        if waiter is None:
+            self._notices.append(Ended(outcome))
+        elif not waiter.done():
+            waiter.set_result(outcome)
+
+    def _no_answer(self, id_: str, cause: str) -> None:
+        self._commands.pop(id_, None)
+        self._notices.append(Answered(m.Answer(id_, False, {"cause": cause})))

@@ -1,0 +1,362 @@
+"""The connecting end: a `Caller` on asyncio, connected again and again until it is closed.
+
+client = Client("127.0.0.1", 7001, caller, on_notices=executor.take)
+client.start()
+caller.call(client.now(), Call(...)); client.flush()      # its end comes as a notice
+outcome = await client.call("memory.get", {"name": "x"})  # or as an awaited outcome
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import random
+import socket
+import ssl
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+from petrobot.services.comm.calls.active import NEVER
+from petrobot.services.comm.calls.caller import Caller, Notice
+from petrobot.services.comm.calls.link import (
+    READ_BUFFER,
+    Limits,
+    Link,
+    Timing,
+    clock_of,
+    futures_of,
+)
+from petrobot.services.comm.protocol.messages import (
+    Bye,
+    Call,
+    Executed,
+    Message,
+    Outcome,
+    Refuse,
+    Welcome,
+)
+from petrobot.services.comm.protocol.security import UNPROVEN, Keys
+from petrobot.services.comm.protocol.wire import ProtocolError, Side, State
+
+OnNotices = Callable[[float, list[Notice]], None]
+NOT_TRUSTED = (
+    "perhaps our certificate is not trusted there, or has ended: it takes TLS 1.3 "
+    "and certificates of its own cell alone"
+)
+_FOR_GOOD = frozenset(("version", "key_needed", "wrong_node"))
+"""Faults of the opening that trying again does not mend. With a key they are found in a proven
+WELCOME alone."""
+_EXPIRED = 10
+"""X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
+_NUMBERS = itertools.count(1)
+"""Of calls: of all clients of this process, which may have one name and boot among them."""
+_OUTCOMES = frozenset((Outcome,))
+_NO_ARGUMENTS: Mapping[str, Any] = {}
+AT_ONCE = 32
+"""Calls that share one write: the peer takes them in while the next ones are made."""
+
+
+class _ClientLink(Link):
+    """One connection to the peer."""
+
+    def __init__(self, client: Client) -> None:
+        super().__init__(
+            Side.CLIENT, client.caller.peer, client.key, client.timing, client.limits, client.buffer
+        )
+        self._client = client
+        self.finished = asyncio.Event()
+        self.refusal: Refuse | None = None
+        self.welcome = False
+
+    def made(self) -> None:
+        self.send((self._client.caller.hello,))
+
+    def took(self, now: float, messages: list[Message]) -> None:
+        client = self._client
+        if _OUTCOMES.issuperset(map(type, messages)):
+            client.took_outcomes(now, cast("list[Outcome]", messages))
+            return
+        for message in messages:
+            if isinstance(message, Welcome):
+                self.welcome = True
+                self.opened()
+                client.welcomed(now, self, message)
+            elif isinstance(message, Refuse):
+                if self.connection.proven:
+                    self.refusal = message
+                else:
+                    self.reason = f"{UNPROVEN}: {message.code}: {message.text}"
+            elif not isinstance(message, Bye):
+                client.caller.receive(now, message)
+        client.flush(now)
+
+    def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
+        if isinstance(message, Call):
+            outcome = Outcome(message.id, "error", {}, fault.code, fault.text, Executed.NO)
+            self._client.caller.receive(self.loop.time(), outcome)
+        return None
+
+    def faulted(self, opening: bool, fault: ProtocolError) -> None:
+        if opening and fault.code in _FOR_GOOD:
+            self.refusal = Refuse(fault.code, fault.text)
+
+    def over(self, now: float) -> None:
+        self.finished.set()
+        self._client.gone(now, self)
+
+
+class Client:
+    """Keeps a caller connected to its peer. `on_notices(now, notices)` gets what the caller has to
+    tell, in the loop, but for the ends of calls made by `call`.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        caller: Caller,
+        *,
+        on_notices: OnNotices | None = None,
+        key: Keys | None = None,
+        tls: ssl.SSLContext | None = None,
+        timing: Timing | None = None,
+        limits: Limits | None = None,
+    ) -> None:
+        """`key`: the shared key, or all that are accepted. `tls`: mutual TLS; the other end must
+        show the certificate of the caller's peer. With any of them, and without, the other end must
+        go by the name of the caller's peer."""
+        self.host = host
+        self.port = port
+        self.caller = caller
+        self.loop = self._loop = asyncio.get_running_loop()
+        self.now = clock_of(self.loop)
+        """The clock that the caller lives by: monotonic, of the loop (s)."""
+        self.key = key
+        self.tls = tls
+        self.trouble = ""
+        """Why the last attempt to connect came to nothing; empty if it did not."""
+        self.answered = False
+        """Whether somebody answered the last attempt, be it by a refusal: then nobody needs to be
+        launched there."""
+        self.timing = timing or Timing()
+        self.limits = limits or Limits()
+        self.buffer = bytearray(READ_BUFFER)
+        self._on_notices = on_notices
+        self._link: _ClientLink | None = None
+        self._future = futures_of(self._loop)
+        self._task: asyncio.Task[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._armed = NEVER
+        self._flushing = False
+        self._up = asyncio.Event()
+        self._prefix = f"{caller.hello.name}/{caller.hello.boot}/"
+
+    def start(self) -> None:
+        """Begin to connect."""
+        self.caller.connecting(self.now())
+        self._task = self._loop.create_task(self._connect_for_ever())
+
+    async def connected(self, timeout: float) -> bool:
+        """Whether the peer has welcomed us, waiting for it at most `timeout` seconds."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self._up.wait()
+        return self._up.is_set()
+
+    @property
+    def certificate_ends(self) -> float | None:
+        """When the certificate ends that the peer showed (s since 1970); None while not connected,
+        and without TLS."""
+        certificate = None if self._link is None else self._link.certificate()
+        return (
+            None
+            if certificate is None
+            else float(ssl.cert_time_to_seconds(certificate["notAfter"]))
+        )
+
+    async def close(self, text: str = "the caller stops") -> None:
+        """Say good-bye; calls under way end as lost."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+        link = self._link
+        if link is not None:
+            link.end(text, Bye(text) if link.connection.state is State.OPEN else None)
+            await link.finished.wait()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer, self._armed = None, NEVER
+        self.caller.link_down(self.now(), text, final=True)
+        self._tell(self.now())
+
+    # Calls.
+
+    async def call(
+        self,
+        service: str,
+        arguments: Mapping[str, Any] = _NO_ARGUMENTS,
+        *,
+        deadline: float | None = None,
+        parent: str = "",
+        seed: int = 0,
+    ) -> Outcome:
+        """Call a service: its outcome, which is acknowledged when it comes. Cancelling the task
+        cancels the call."""
+        id_ = f"{self._prefix}{next(_NUMBERS)}"
+        now = self.now()
+        future: asyncio.Future[Outcome] = self._future()
+        caller = self.caller
+        waiting = caller.begin(now, id_, service, arguments, deadline, parent, seed, 0, "", future)
+        if waiting >= AT_ONCE:
+            self.flush(now)
+        elif not self._flushing:
+            if caller.calls == 1:
+                self.flush(now)
+            else:
+                self._flush_in_a_moment()
+        try:
+            return await future
+        except asyncio.CancelledError:
+            self.give_up(id_)
+            raise
+
+    def give_up(self, id_: str) -> None:
+        """Nobody waits for this call any more."""
+        self.caller.cancel(self.now(), id_, "its caller gave up")
+        self.flush()
+
+    def _flush_in_a_moment(self) -> None:
+        """What is called in this turn of the loop shares a write."""
+        if not self._flushing:
+            self._flushing = True
+            self._loop.call_soon(self._flush_soon)
+
+    def _flush_soon(self) -> None:
+        self._flushing = False
+        self.flush()
+
+    def flush(self, now: float | None = None) -> None:
+        """Send the caller's messages and tell its notices; call it after each use of the caller."""
+        now = self.now() if now is None else now
+        caller = self.caller
+        messages = caller.messages(now)
+        if messages and self._link is not None:
+            if len(messages) == 1:
+                self._link.send_one(messages[0])
+            else:
+                self._link.send(messages)
+        if caller.has_news:
+            self._tell(now)
+        if caller.soonest < self._armed:
+            self._arm()
+
+    def _tell(self, now: float) -> None:
+        notices = self.caller.notices()
+        if notices and self._on_notices is not None:
+            self._on_notices(now, notices)
+
+    def _arm(self) -> None:
+        due = self.caller.due()
+        if due is None or due >= self._armed:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._armed = due
+        self._timer = self._loop.call_at(due, self._advance)
+
+    def _advance(self) -> None:
+        self._timer, self._armed = None, NEVER
+        now = self.now()
+        self.caller.advance(now)
+        self.flush(now)
+
+    # The connection.
+
+    async def _connect_for_ever(self) -> None:
+        first, longest = self.timing.backoff
+        pause = first
+        while True:
+            link = await self._connect()
+            if link is not None:
+                await link.finished.wait()
+                if link.welcome:
+                    pause = first
+            # A little chance, so that many clients do not come back in one moment.
+            await asyncio.sleep(pause * random.uniform(0.5, 1.0))
+            pause = min(2.0 * pause, longest)
+
+    async def _connect(self) -> _ClientLink | None:
+        name = self.caller.peer if self.tls is not None else None
+        try:
+            async with asyncio.timeout(self.timing.silence):
+                _, link = await self._loop.create_connection(
+                    lambda: _ClientLink(self),
+                    self.host,
+                    self.port,
+                    ssl=self.tls,
+                    server_hostname=name,
+                )
+        except (OSError, TimeoutError) as fault:
+            self.trouble, self.answered = self._said(fault), isinstance(fault, ssl.SSLError)
+            self.caller.unreached(
+                self.now(), self.trouble, gone=isinstance(fault, ConnectionRefusedError)
+            )
+            self.flush()
+            return None
+        self.trouble, self.answered = "", True
+        self._link = link
+        return link
+
+    def took_outcomes(self, now: float, outcomes: list[Outcome]) -> None:
+        """Calls have ended. Their owners go on in this turn of the loop: what they call now shares
+        a write."""
+        caller = self.caller
+        caller.take_outcomes(now, outcomes)
+        if caller.has_news:
+            self.flush(now)
+        elif len(outcomes) > 1 or caller.soonest < self._armed:
+            self._flush_in_a_moment()
+
+    def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
+        """A link was welcomed."""
+        self._link = link
+        self._up.set()
+        self.caller.link_up(now, welcome)
+
+    def gone(self, now: float, link: _ClientLink) -> None:
+        """A link is over."""
+        if self.tls is not None and not link.welcome and link.refusal is None:
+            # in TLS 1.3 a client is let in before its certificate is looked at
+            link.reason += f"; {NOT_TRUSTED}"
+        self.trouble = link.reason
+        if self._link is link:
+            self._link = None
+        self._up.clear()
+        if link.refusal is not None:
+            self.caller.link_refused(now, link.refusal)
+        else:
+            self.caller.link_down(now, link.reason, final=link.silent)
+        self.flush(now)
+
+    def _said(self, fault: Exception) -> str:
+        """Why there is no connection, in words."""
+        if isinstance(fault, ssl.SSLCertVerificationError):
+            if fault.verify_code == _EXPIRED:
+                peer = self.caller.peer
+                text = f"the certificate of {peer}, or its authority's, has ended"
+                return f"{text}; make it anew with `petrobot keys --tls` and copy it to {peer}"
+            return f"its certificate is not that of {self.caller.peer}: {fault.verify_message}"
+        said = str(getattr(fault, "strerror", "") or fault) or "no answer"
+        if (
+            isinstance(fault, OSError)
+            and fault.errno
+            and not isinstance(fault, ssl.SSLError | socket.gaierror)
+        ):
+            said = os.strerror(fault.errno).lower()  # asyncio's own words are the address once more
+        return (
+            f"{said}; {NOT_TRUSTED}"
+            if self.tls is not None and isinstance(fault, ConnectionError)
+            else said
+        )

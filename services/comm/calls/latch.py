@@ -1,0 +1,111 @@
+"""The emergency stop's latch on disk: a node that is started again must not let devices move that
+somebody has stopped.
+
+One small file a node, on the node's own host, with the names of the devices that obey nobody (`*`:
+all of them). The node keeps it, and looks for it before each run on a device, and a few times a
+second; `petrobot estop` writes it for a node of its own host that does not answer. A file that
+cannot be read or understood counts as `*`: whoever is unsure leaves the devices stopped.
+
+The file stands in `$PETROBOT_STATE`, else in `.petrobot` beside services.toml, else, where that
+cannot be written, in a folder of the user's own (`$XDG_STATE_HOME` or `~/.local/state`). What lies
+in any of them counts; clearing clears them all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from petrobot.services.host.whole_file import make_folder, write_whole
+
+ALL: Final = "*"
+STATE: Final = "PETROBOT_STATE"
+FOLDER: Final = ".petrobot"
+
+
+class LatchError(OSError):
+    """The latch cannot be written or removed: file and why."""
+
+
+class Latch:
+    """The latch of one node. `folders` are where it may lie, the one to be written first."""
+
+    def __init__(self, node: str, folders: Iterable[Path]) -> None:
+        self.paths = tuple(folder / f"{node}.stopped" for folder in folders)
+
+    def stopped(self) -> frozenset[str]:
+        """Names of devices that obey nobody; `ALL` among them: all. Costs a look at each file's
+        name while there is none."""
+        return frozenset().union(*(_read(path) for path in self.paths))
+
+    def stop(self, devices: Iterable[str]) -> Path:
+        """Keep that these devices are stopped, too; gives where, once it is safe on disk. Raises
+        LatchError."""
+        names = sorted(self.stopped() | set(devices))
+        faults = []
+        for path in self.paths:
+            try:
+                _write(path, names)
+            except OSError as fault:
+                faults.append(f"{path}: {fault.strerror}")
+            else:
+                return path
+        raise LatchError("; ".join(faults))
+
+    def clear(self, devices: Iterable[str], all_devices: Iterable[str]) -> None:
+        """These devices obey again; `all_devices` is what `ALL` stands for. Raises LatchError, and
+        then nothing is cleared."""
+        stopped = self.stopped()
+        left = (set(all_devices) if ALL in stopped else set(stopped)) - set(devices)
+        if left:
+            self.stop(left)
+        for path in self.paths:
+            try:
+                if left and path.exists():
+                    _write(path, sorted(left))
+                else:
+                    path.unlink(missing_ok=True)
+            except OSError as fault:
+                raise LatchError(
+                    f"{path}: {fault.strerror}; remove it by hand once the cell is safe"
+                ) from fault
+
+    @property
+    def kept(self) -> bool:
+        """Whether it could be written now, as far as permissions say."""
+        return any(_writable(path.parent) for path in self.paths)
+
+
+def latch_of(source: Path, node: str) -> Latch:
+    """The latch of a node whose services.toml is `source`."""
+    given = os.environ.get(STATE)
+    if given:
+        return Latch(node, [Path(given)])
+    source = source.resolve()
+    home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    own = home / "petrobot" / hashlib.sha256(str(source).encode()).hexdigest()[:16]
+    return Latch(node, [source.parent / FOLDER, own])
+
+
+def _read(path: Path) -> frozenset[str]:
+    try:
+        names = path.read_text(encoding="utf-8").split()
+    except FileNotFoundError:
+        return frozenset()
+    except (OSError, ValueError):
+        return frozenset({ALL})
+    return frozenset(names) or frozenset({ALL})
+
+
+def _write(path: Path, names: list[str]) -> None:
+    make_folder(path.parent)
+    write_whole(path, "\n".join(names) + "\n")
+
+
+def _writable(folder: Path) -> bool:
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return os.access(folder, os.W_OK | os.X_OK)

@@ -1,0 +1,408 @@
+"""One asyncio connection: bytes to a `Connection` and back, heartbeat, limits. Server and client
+build on it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import secrets
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
+
+from petrobot.services.comm.protocol.messages import (
+    Bye,
+    Event,
+    Feedback,
+    Message,
+    Ping,
+    Pong,
+    Refuse,
+)
+from petrobot.services.comm.protocol.security import NONCE_BYTES, Keys
+from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side, State
+
+READ_BUFFER = 1 << 16
+"""Bytes read at once. What is in them is taken apart before another link is read: so many empty
+maps take some 25 ms."""
+HEARD = 4096
+"""Bytes of a frame that is not complete that count as a sign of life. Fewer do not: a frame that
+drips in, or whose length was changed on its way, must not hold up all that follows it for longer
+than silence would."""
+_HEARTBEATS = frozenset((Ping, Pong))
+_OWN = frozenset((Ping, Pong, Bye, Refuse))
+"""Kinds that a link deals with itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Of a link (s)."""
+
+    heartbeat: float = 0.25
+    """Silence after which PING is sent,"""
+    silence: float = 1.0
+    """and after which the other side counts as frozen or cut."""
+    handshake: float = 2.0
+    """From connection to WELCOME."""
+    user_timeout: float = 1.5
+    """TCP_USER_TIMEOUT: unacknowledged data for so long breaks the connection."""
+    backoff: tuple[float, float] = (0.05, 1.0)
+    """First and longest pause between attempts to connect."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Of a server and its links."""
+
+    connections: int = 256
+    opening: int = 64
+    """Connections that have not shown who they are; above it the oldest of them gives way."""
+    handshakes: float = 20.0
+    """Handshakes of one address that may fail a second, on average,"""
+    handshakes_at_once: int = 100
+    """and at once; above it the address is cut off before it says a word."""
+    spare_loopback: bool = True
+    """Whether addresses of this host may fail as often as they like: one process must not lock out
+    all others here."""
+    messages: float = 200_000.0
+    """Messages that a caller may send a second, on average: above it no more is read from it for a
+    while,"""
+    messages_at_once: int = 20_000
+    """and at once."""
+    buffer_high: int = 1 << 20
+    """Bytes waiting to be sent above which a link is slow: progress and pulses are dropped, no more
+    is read from it,"""
+    buffer_hard: int = 64 << 20
+    """and above which it is cut."""
+
+
+class Beat(Enum):
+    """What a heart wants."""
+
+    NOTHING = auto()
+    PING = auto()
+    LOST = auto()
+
+
+class Heart:
+    """Silence of the other side, as a machine without clock."""
+
+    __slots__ = ("_due", "_timing", "heard")
+
+    def __init__(self, now: float, timing: Timing) -> None:
+        self._timing = timing
+        self.heard = now
+        """When something last came (s); set by whoever takes it in."""
+        self._due = now + timing.heartbeat
+
+    def advance(self, now: float) -> Beat:
+        """What to do at `now`; call it when `due`."""
+        late = now - self._due
+        if late > self._timing.silence / 2:
+            # This process itself stood still: what the other side said meanwhile may still lie in
+            # the socket.
+            self.heard = max(self.heard, now - self._timing.silence + self._timing.heartbeat)
+        silent = now - self.heard
+        if silent >= self._timing.silence:
+            return Beat.LOST
+        self._due = min(now + self._timing.heartbeat, self.heard + self._timing.silence)
+        return Beat.PING if silent >= self._timing.heartbeat else Beat.NOTHING
+
+    def due(self) -> float:
+        """When to call `advance` next (s)."""
+        return self._due
+
+
+class Link(asyncio.BufferedProtocol):
+    """Base of both ends. Subclasses take messages in `took`, the end of the link in `over`.
+
+    `buffer` is what bytes are read into, shared by all links of an owner: they are taken out before
+    anything else is read. Reading into one buffer spares a fresh one of 256 KiB for each read,
+    which costs more than all else here.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        server: str,
+        key: Keys | None,
+        timing: Timing,
+        limits: Limits,
+        buffer: bytearray,
+    ) -> None:
+        nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
+        self.connection = Connection(side, server, key=key, nonce=nonce)
+        self.loop = asyncio.get_running_loop()
+        self.now = clock_of(self.loop)
+        self.timing = timing
+        self.limits = limits
+        self.slow = False
+        self.reason = ""
+        """Why the link is over."""
+        self.silent = False
+        """Whether it is over because the other side was silent."""
+        self.frames: list[bytes] = []
+        """Made by the connection and not yet written: they have their places in the order, so they
+        go before all else."""
+        self._view = memoryview(buffer)
+        self._transport: asyncio.Transport | None = None
+        self._heart = Heart(0.0, timing)
+        self._unheard = 0
+        """Bytes of a frame that is not complete, since something was last heard."""
+        self._timer: asyncio.TimerHandle | None = None
+        self._pings = 0
+        self._opening = True
+
+    # For subclasses.
+
+    def made(self) -> None:
+        """The connection stands."""
+
+    def took(self, now: float, messages: list[Message]) -> None:
+        """Messages came."""
+
+    def beaten(self, now: float, count: int) -> bool:
+        """So many heartbeats came; False: the link has been ended for it."""
+        return True
+
+    def over(self, now: float) -> None:
+        """The link is over, `reason` says why. Called once."""
+
+    def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
+        """No frame can carry this message; gives what is sent in its place."""
+        return None
+
+    # What asyncio calls.
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=self.limits.buffer_high)
+        sock = transport.get_extra_info("socket")
+        if sock is not None and sock.family in (socket.AF_INET, socket.AF_INET6):
+            _tune(sock, self.timing)
+        now = self.now()
+        self._timer = self.loop.call_at(now + self.timing.handshake, self._handshake_over)
+        self.made()
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        return (
+            self._view
+        )  # not the bytearray: under TLS asyncio slices it, and would read into a copy
+
+    def buffer_updated(self, nbytes: int) -> None:
+        data = bytes(self._view[:nbytes])
+        now = self.now()
+        try:
+            messages = self.connection.receive_data(data)
+        except ProtocolError as fault:
+            self._refuse(now, fault)
+            return
+        self._unheard += nbytes
+        if messages or self._unheard >= HEARD:
+            self._heart.heard = now
+            self._unheard = 0
+        if len(messages) == 1 and type(messages[0]) not in _OWN and not self._opening:
+            self.took(now, messages)
+            return
+        if (
+            self._opening
+            and self._transport is not None
+            and (out := self.connection.data_to_send())
+        ):
+            self._transport.write(out)
+        self._sort(now, messages)
+
+    def _sort(self, now: float, messages: list[Message]) -> None:
+        """Heartbeats stay here; an end ends the link after what came before it was taken."""
+        if not messages:
+            return
+        last = messages[-1]
+        pings = [message for message in messages if type(message) in _HEARTBEATS]
+        if pings:
+            if not self.beaten(now, len(pings)):
+                return
+            messages = [message for message in messages if type(message) not in _HEARTBEATS]
+            self.send([Pong(ping.number) for ping in pings if type(ping) is Ping])
+        if messages:
+            self.took(now, messages)
+        if isinstance(last, Refuse):
+            self.end(f"{last.code}: {last.text}")
+        elif isinstance(last, Bye):
+            self.end(last.text or "it left")
+
+    def pause_writing(self) -> None:
+        self.slow = True
+        if self.connection.side is Side.SERVER and self._transport is not None:
+            self._transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        self.slow = False
+        if self.connection.side is Side.SERVER and self._transport is not None:
+            self._transport.resume_reading()
+
+    def connection_lost(self, fault: Exception | None) -> None:
+        if not self.reason:
+            self.reason = (
+                f"the connection broke: {fault}" if fault is not None else "the other side hung up"
+            )
+        if self._timer is not None:
+            self._timer.cancel()
+        self._transport = None
+        self.over(self.now())
+
+    # What the owner asks for.
+
+    def opened(self) -> None:
+        """The handshake is over: the heart beats from now on."""
+        self._opening = False
+        now = self.now()
+        self._heart = Heart(now, self.timing)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self.loop.call_at(self._heart.due(), self._beat)
+
+    def send(self, messages: Sequence[Message]) -> None:
+        """Send messages in one write. One that no frame can carry is answered for by
+        `unsendable`."""
+        if self.frames:
+            self.write()
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        transport.write(self._all_bytes(messages))
+        if self.slow:
+            self._bear(transport)
+
+    def send_one(self, message: Message) -> None:
+        """Send one message."""
+        if self.slow or self.frames or self._transport is None or self._transport.is_closing():
+            self.send((message,))
+            return
+        self._transport.write(self._bytes(message))
+
+    def write(self) -> None:
+        """Send the frames that wait, in one write."""
+        frames, self.frames = self.frames, []
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return
+        transport.write(frames[0] if len(frames) == 1 else b"".join(frames))
+        if self.slow:
+            self._bear(transport)
+
+    def _bear(self, transport: asyncio.Transport) -> None:
+        if transport.get_write_buffer_size() > self.limits.buffer_hard:
+            self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
+
+    def _all_bytes(self, messages: Sequence[Message]) -> bytes:
+        if not self.slow and not self._opening:
+            with contextlib.suppress(ProtocolError):
+                return self.connection.send_all(messages)
+        return b"".join([self._bytes(message) for message in messages])
+
+    def _bytes(self, message: Message) -> bytes:
+        if self.slow and (
+            type(message) is Feedback or (type(message) is Event and not message.number)
+        ):
+            return b""
+        try:
+            return self.connection.send(message)
+        except ProtocolError as fault:
+            if self.connection.state is not State.OPEN:
+                return (
+                    b""  # its last word came with what is being answered: nobody listens any more
+                )
+            instead = self.unsendable(message, fault)
+            return b"" if instead is None else self.connection.send(instead)
+
+    def end(self, reason: str, last: Message | None = None) -> None:
+        """Say a last word (Bye, Refuse) and close once it is out."""
+        transport = self._transport
+        if transport is None:
+            return
+        self.reason = self.reason or reason
+        if self.frames:
+            self.write()
+        if last is not None and not transport.is_closing():
+            with contextlib.suppress(ProtocolError):
+                transport.write(self.connection.send(last))
+        transport.close()
+
+    def cut(self, reason: str) -> None:
+        """Close at once."""
+        self.reason = self.reason or reason
+        if self._transport is not None:
+            self._transport.abort()
+
+    def certificate(self) -> dict[str, Any] | None:
+        """The other end's certificate, as `ssl.SSLSocket.getpeercert` gives it; None without
+        TLS."""
+        return None if self._transport is None else self._transport.get_extra_info("peercert")
+
+    def ends(self) -> tuple[str, str]:
+        """Addresses of the other and of this end; empty where there are none."""
+        if self._transport is None:
+            return "", ""
+        return _host(self._transport.get_extra_info("peername")), _host(
+            self._transport.get_extra_info("sockname")
+        )
+
+    def _refuse(self, now: float, fault: ProtocolError) -> None:
+        opening = self.connection.version == 0
+        self._sort(now, list(fault.before))
+        # The connection is closed for its part already; a sealed one could only be answered with a
+        # seal.
+        self.reason = self.reason or str(fault)
+        if self._transport is not None and not self._transport.is_closing():
+            refusal = self.connection.refusal(Refuse(fault.code, fault.text[:500]))
+            self._transport.write(refusal)
+            self._transport.close()
+        self.faulted(opening, fault)
+
+    def faulted(self, opening: bool, fault: ProtocolError) -> None:
+        """The other side broke the protocol (for subclasses that count)."""
+
+    def _handshake_over(self) -> None:
+        self.cut(f"no handshake in {self.timing.handshake:g} s")
+
+    def _beat(self) -> None:
+        now = self.now()
+        beat = self._heart.advance(now)
+        if beat is Beat.LOST:
+            self.silent = True
+            self.cut(f"silent for {self.timing.silence:g} s: frozen or cut off")
+            return
+        self._timer = self.loop.call_at(self._heart.due(), self._beat)
+        if beat is Beat.PING:
+            self._pings += 1
+            self.send((Ping(self._pings),))
+
+
+def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
+    """The clock of a loop: for asyncio's own the function that its `time` calls."""
+    return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
+
+
+def futures_of(loop: asyncio.AbstractEventLoop) -> Callable[[], asyncio.Future[Any]]:
+    """What makes the futures of a loop: for asyncio's own the class that its `create_future`
+    calls."""
+    usual = getattr(type(loop), "create_future", None) is asyncio.BaseEventLoop.create_future
+    return functools.partial(asyncio.Future, loop=loop) if usual else loop.create_future
+
+
+def _host(address: object) -> str:
+    return str(address[0]) if isinstance(address, tuple) and address else ""
+
+
+def _tune(sock: socket.socket, timing: Timing) -> None:
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(timing.user_timeout * 1000))

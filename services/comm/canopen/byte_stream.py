@@ -1,0 +1,303 @@
+"""CAN over a byte stream: its framing, and the python-can interface `petrobot_stream` that speaks
+it.
+
+    bus = can.Bus(interface="petrobot_stream", channel="tcp://127.0.0.1:7303")      # or "unix:///run/cell/can"
+
+Framing, both directions. First each end sends the six bytes `PBCAN\\x02`. Then every frame is
+    u32  identifier, big-endian; bit 31 extended (29 bits), bit 30 remote, bit 29 error frame
+    u8   DLC, 0 to 8
+    DLC bytes of data (none in a remote frame)
+    u32  CRC-32 of all that (IEEE 802.3, as zlib's), big-endian: a real bus has a CRC of its own
+A hub (`can_hub`) passes each frame on to all ports but the one it came from, in order of arrival. A
+port that sends other things, or does not read while more than 256 KiB wait for it, is dropped.
+Classic CAN only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import ipaddress
+import select
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+import can
+from can import typechecking
+
+from petrobot.services.comm.protocol.security import CHECK_BYTES, check
+
+GREETING: Final = b"PBCAN\x02"
+EXTENDED: Final = 1 << 31
+REMOTE: Final = 1 << 30
+ERROR: Final = 1 << 29
+ID_MASK: Final = (1 << 29) - 1
+BACKLOG: Final = 256 * 1024
+_HEAD: Final = struct.Struct(">IB")
+_GONE: Final = (errno.ECONNRESET, errno.EPIPE, errno.ENOTCONN, errno.EBADF)
+
+
+class StreamFormatError(ConnectionError):
+    """The other end does not speak this framing."""
+
+
+def encode(word: int, data: bytes, dlc: int | None = None) -> bytes:
+    """One frame on the stream; `word` is the identifier with its flag bits, `dlc` differs from the
+    data in remote frames."""
+    frame = _HEAD.pack(word, len(data) if dlc is None else dlc) + data
+    return frame + check(frame)
+
+
+class Splitter:
+    """Cuts a byte stream into frames: (word, DLC, data). Raises StreamFormatError on a wrong
+    greeting, DLC, identifier or check."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._greeted = False
+
+    def feed(self, data: bytes) -> list[tuple[int, int, bytes]]:
+        """Take bytes, give the frames that they complete."""
+        buffer = self._buffer
+        buffer += data
+        if not self._greeted and not self._greet():
+            return []
+        frames, at = [], 0
+        while len(buffer) - at >= _HEAD.size:
+            word, dlc = _HEAD.unpack_from(buffer, at)
+            self._check(word, dlc)
+            end = at + _HEAD.size + (0 if word & REMOTE else dlc)
+            if len(buffer) < end + CHECK_BYTES:
+                break
+            if buffer[end : end + CHECK_BYTES] != check(bytes(buffer[at:end])):
+                raise StreamFormatError("a frame was changed on its way")
+            frames.append((word, dlc, bytes(buffer[at + _HEAD.size : end])))
+            at = end + CHECK_BYTES
+        del buffer[:at]
+        return frames
+
+    def _greet(self) -> bool:
+        start = bytes(self._buffer[: len(GREETING)])
+        if start != GREETING[: len(start)]:
+            raise StreamFormatError(
+                f"expected the greeting {GREETING!r}, got {start!r}: is this a CAN hub?"
+            )
+        if len(start) < len(GREETING):
+            return False
+        del self._buffer[: len(GREETING)]
+        self._greeted = True
+        return True
+
+    @staticmethod
+    def _check(word: int, dlc: int) -> None:
+        if dlc > 8:
+            raise StreamFormatError(f"DLC {dlc}: classic CAN has at most 8")
+        if not word & EXTENDED and word & ID_MASK > 0x7FF:
+            raise StreamFormatError(f"identifier {word & ID_MASK:#x} does not fit 11 bits")
+
+
+def parse_channel(channel: str, allow_remote: bool = False) -> tuple[socket.AddressFamily, Any]:
+    """Socket family and address of `tcp://host:port` or `unix:///path`.
+
+    Raises ValueError for anything else, and for a host that is not this one unless `allow_remote`
+    says so: the stream has neither secrecy nor authentication.
+    """
+    parts = urlsplit(channel)
+    if parts.scheme == "unix" and parts.path and not parts.netloc:
+        return socket.AF_UNIX, parts.path
+    if parts.scheme != "tcp" or not parts.hostname or parts.port is None:
+        raise ValueError(f"channel {channel!r}: write tcp://127.0.0.1:7303 or unix:///path")
+    if not allow_remote and not _is_loopback(parts.hostname):
+        raise ValueError(
+            f"channel {channel!r} leaves this host, and the stream is not protected: say "
+            "allow_remote=True to allow it"
+        )
+    return (socket.AF_INET6 if ":" in parts.hostname else socket.AF_INET), (
+        parts.hostname,
+        parts.port,
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+class Line:
+    """A connected non-blocking socket that carries frames."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        if sock.family != socket.AF_UNIX:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setblocking(False)
+        self.sock = sock
+        self._splitter = Splitter()
+        self._lock = threading.Lock()  # python-can users receive in one thread and send in another
+        self._waiting = bytearray(GREETING)
+        self.flush()
+
+    @property
+    def pending(self) -> bool:
+        """Whether bytes wait to be sent."""
+        return bool(self._waiting)
+
+    def write(self, data: bytes) -> None:
+        """Send, or keep what the kernel does not take. Raises ConnectionError if the other end is
+        gone or does not read."""
+        with self._lock:
+            self._waiting += data
+            self._flush()
+        if len(self._waiting) > BACKLOG:
+            raise ConnectionError("the other end of the CAN stream does not read")
+
+    def flush(self) -> None:
+        """Send what waits, as far as the kernel takes it."""
+        with self._lock:
+            self._flush()
+
+    def _flush(self) -> None:
+        while self._waiting:
+            try:
+                sent = self.sock.send(self._waiting)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as reason:
+                raise ConnectionError(f"the CAN stream is gone: {reason}") from reason
+            del self._waiting[:sent]
+
+    def read(self) -> list[tuple[int, int, bytes]]:
+        """Frames that have come. Raises ConnectionError when the other end is gone."""
+        frames: list[tuple[int, int, bytes]] = []
+        while True:
+            try:
+                data = self.sock.recv(65536)
+            except (BlockingIOError, InterruptedError):
+                return frames
+            except OSError as reason:
+                raise ConnectionError(f"the CAN stream is gone: {reason}") from reason
+            if not data:
+                if frames:
+                    return frames  # what came before the end counts; the end shows at the next read
+                raise ConnectionError("the CAN stream was closed by its other end")
+            frames += self._splitter.feed(data)
+            if len(data) < 65536:
+                return frames
+
+    def close(self) -> None:
+        """Let it go."""
+        self.sock.close()
+
+
+def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> Line:
+    """A line to the hub of a channel; raises ConnectionError if there is none, ValueError for a bad
+    channel."""
+    family, address = parse_channel(channel, allow_remote)
+    sock = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        sock.settimeout(timeout)
+        sock.connect(address)
+        return Line(sock)
+    except OSError as reason:
+        sock.close()
+        raise ConnectionError(
+            f"no CAN hub at {channel}: {reason}. Is the bus (the simulated laboratory) up?"
+        ) from reason
+
+
+class StreamBus(can.BusABC):
+    """python-can bus on a hub's channel; see the head of this module."""
+
+    def __init__(
+        self,
+        channel: str,
+        can_filters: typechecking.CanFilters | None = None,
+        connect_timeout: float = 5.0,
+        allow_remote: bool = False,
+        receive_own_messages: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        """Connect. `bitrate` and other settings of a real bus are taken and have no effect. Raises
+        CanInitializationError."""
+        if kwargs.pop("fd", False):
+            raise can.CanInitializationError("petrobot_stream carries classic CAN only, not CAN FD")
+        try:
+            self._line = connect(channel, connect_timeout, allow_remote)
+        except (ConnectionError, ValueError) as reason:
+            raise can.CanInitializationError(str(reason)) from reason
+        self.channel_info = f"petrobot_stream {channel}"
+        self._can_protocol = can.CanProtocol.CAN_20
+        self._channel = channel
+        self._own = receive_own_messages
+        self._waiting: deque[can.Message] = deque()
+        super().__init__(channel, can_filters=can_filters, **kwargs)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a classic frame; waits up to `timeout` seconds for room (None: does not wait).
+        Raises CanOperationError."""
+        if msg.is_fd:
+            raise can.CanOperationError("petrobot_stream carries classic CAN only, not CAN FD")
+        word = msg.arbitration_id | (EXTENDED if msg.is_extended_id else 0)
+        word |= (REMOTE if msg.is_remote_frame else 0) | (ERROR if msg.is_error_frame else 0)
+        try:
+            self._line.write(encode(word, b"" if msg.is_remote_frame else bytes(msg.data), msg.dlc))
+            if timeout and self._line.pending:
+                self._drain(time.monotonic() + timeout)
+        except ConnectionError as reason:
+            raise can.CanOperationError(str(reason)) from reason
+        if self._own:
+            self._waiting.append(
+                _message(word, msg.dlc, bytes(msg.data), self._channel, is_rx=False)
+            )
+
+    def fileno(self) -> int:
+        """For select, and python-can's asyncio notifier."""
+        return self._line.sock.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        super().shutdown()
+        self._line.close()
+
+    def _drain(self, until: float) -> None:
+        while self._line.pending and (left := until - time.monotonic()) > 0.0:
+            select.select([], [self._line.sock], [], left)
+            self._line.flush()
+        if self._line.pending:
+            raise ConnectionError("the CAN stream had no room in time")
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._waiting:
+            try:
+                self._fetch(timeout)
+            except ConnectionError as reason:
+                raise can.CanOperationError(str(reason)) from reason
+        return (self._waiting.popleft() if self._waiting else None), False
+
+    def _fetch(self, timeout: float | None) -> None:
+        if self._line.pending:
+            self._line.flush()
+        frames = self._line.read()
+        if not frames and timeout != 0.0:
+            select.select([self._line.sock], [], [], timeout)
+            frames = self._line.read()
+        self._waiting += [_message(word, dlc, data, self._channel) for word, dlc, data in frames]
+
+
+def _message(word: int, dlc: int, data: bytes, channel: str, is_rx: bool = True) -> can.Message:
+    return can.Message(
+        timestamp=time.time(),
+        arbitration_id=word & ID_MASK,
+        is_extended_id=bool(word & EXTENDED),
+        is_remote_frame=bool(word & REMOTE),
+        is_error_frame=bool(word & ERROR),
+        dlc=dlc,
+        data=data,
+        channel=channel,
+        is_rx=is_rx,
+    )

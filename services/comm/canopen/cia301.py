@@ -1,0 +1,366 @@
+"""CANopen on classic CAN (CiA 301): identifiers, frames in and out of bytes, and the client of
+expedited SDO transfers.
+
+Pure: times are passed in, frames come back. The subset is NMT, heartbeat, expedited SDO, SYNC, PDO
+mapping and EMCY, which is what drives and a digital-input node need. Byte order is little-endian
+everywhere (CiA 301, section 7.1.4).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from petrobot.services.comm.canopen.bus import Frame
+
+NMT_ID: Final = 0x000
+SYNC_ID: Final = 0x080
+EMCY_BASE: Final = 0x080
+TPDO1_BASE: Final = 0x180
+RPDO1_BASE: Final = 0x200
+SDO_REPLY_BASE: Final = 0x580
+SDO_REQUEST_BASE: Final = 0x600
+HEARTBEAT_BASE: Final = 0x700
+NODES: Final = range(1, 128)
+"""Node ids that CiA 301 allows."""
+
+
+class NmtCommand(IntEnum):
+    """What the NMT master may order (CiA 301, table 31)."""
+
+    START = 0x01
+    STOP = 0x02
+    ENTER_PREOPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+class NmtState(IntEnum):
+    """States as a heartbeat shows them; BOOT_UP is sent once."""
+
+    BOOT_UP = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PREOPERATIONAL = 0x7F
+
+
+class Type(IntEnum):
+    """Static data types and their codes in EDS files (CiA 301, table 44)."""
+
+    BOOLEAN = 0x01
+    INTEGER8 = 0x02
+    INTEGER16 = 0x03
+    INTEGER32 = 0x04
+    UNSIGNED8 = 0x05
+    UNSIGNED16 = 0x06
+    UNSIGNED32 = 0x07
+
+    def pack(self, value: int) -> bytes:
+        """Little-endian bytes; raises ValueError if the value does not fit."""
+        try:
+            return _STRUCT[self].pack(value)
+        except struct.error as reason:
+            raise ValueError(f"{value} does not fit {self.name}") from reason
+
+    def unpack(self, data: bytes) -> int:
+        """The number in exactly as many bytes as the type has; raises ValueError otherwise."""
+        try:
+            (value,) = _STRUCT[self].unpack(data)
+        except struct.error as reason:
+            raise ValueError(f"{len(data)} bytes are no {self.name}") from reason
+        return int(value)
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return _STRUCT[self].size
+
+
+_STRUCT: Final = {
+    Type.BOOLEAN: struct.Struct("<?"),
+    Type.INTEGER8: struct.Struct("<b"),
+    Type.INTEGER16: struct.Struct("<h"),
+    Type.INTEGER32: struct.Struct("<i"),
+    Type.UNSIGNED8: struct.Struct("<B"),
+    Type.UNSIGNED16: struct.Struct("<H"),
+    Type.UNSIGNED32: struct.Struct("<I"),
+}
+
+
+class Abort(IntEnum):
+    """SDO abort codes (CiA 301, table 22)."""
+
+    TOGGLE = 0x05030000
+    TIMEOUT = 0x05040000
+    COMMAND = 0x05040001
+    ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    PDO_LENGTH = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    HARDWARE = 0x06060000
+    LENGTH = 0x06070010
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    TOO_HIGH = 0x06090031
+    TOO_LOW = 0x06090032
+    GENERAL = 0x08000000
+    STATE = 0x08000022
+
+
+class SdoAbortError(Exception):
+    """An SDO transfer was refused; `code` is a CiA 301 abort code."""
+
+    def __init__(self, code: int, index: int = 0, sub: int = 0) -> None:
+        name = (
+            Abort(code).name.lower().replace("_", " ")
+            if code in Abort._value2member_map_
+            else "unknown"
+        )
+        super().__init__(f"SDO abort {code:#010x} ({name}) at {index:#06x}:{sub}")
+        self.code = code
+        self.index = index
+        self.sub = sub
+
+
+class Emergency(NamedTuple):
+    """An EMCY message: error code, error register (1001h) and five bytes of the maker's."""
+
+    node: int
+    code: int
+    register: int
+    detail: bytes
+
+
+def nmt(command: NmtCommand, node: int = 0) -> Frame:
+    """Order one node, or all (0), to change its NMT state."""
+    return Frame(NMT_ID, bytes((command, node)))
+
+
+SYNC: Final = Frame(SYNC_ID, b"")
+
+
+def heartbeat(node: int, state: NmtState) -> Frame:
+    """The heartbeat, or with BOOT_UP the boot-up message, of a node."""
+    return Frame(HEARTBEAT_BASE + node, bytes((state,)))
+
+
+def emergency(node: int, code: int, register: int, detail: bytes = b"") -> Frame:
+    """An EMCY message; code 0 says that the error is gone."""
+    return Frame(EMCY_BASE + node, struct.pack("<HB", code, register) + detail[:5].ljust(5, b"\0"))
+
+
+def parse_emergency(frame: Frame) -> Emergency:
+    """What an EMCY frame says; raises ValueError if it is none."""
+    node = frame.id - EMCY_BASE
+    if node not in NODES or len(frame.data) != 8:
+        raise ValueError(
+            f"frame {frame.id:#05x} with {len(frame.data)} bytes is no emergency message"
+        )
+    code, register = struct.unpack_from("<HB", frame.data)
+    return Emergency(node, code, register, frame.data[3:])
+
+
+def sdo_write_request(node: int, index: int, sub: int, data: bytes) -> Frame:
+    """Initiate an expedited download of 1 to 4 bytes."""
+    if not 1 <= len(data) <= 4:
+        raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
+    command = 0x23 | (4 - len(data)) << 2
+    return Frame(
+        SDO_REQUEST_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
+    )
+
+
+def sdo_read_request(node: int, index: int, sub: int) -> Frame:
+    """Initiate an upload."""
+    return Frame(SDO_REQUEST_BASE + node, struct.pack("<BHBI", 0x40, index, sub, 0))
+
+
+def sdo_write_reply(node: int, index: int, sub: int) -> Frame:
+    """The server's confirmation of a download."""
+    return Frame(SDO_REPLY_BASE + node, struct.pack("<BHBI", 0x60, index, sub, 0))
+
+
+def sdo_read_reply(node: int, index: int, sub: int, data: bytes) -> Frame:
+    """The server's answer to an upload, 1 to 4 bytes."""
+    if not 1 <= len(data) <= 4:
+        raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
+    command = 0x43 | (4 - len(data)) << 2
+    return Frame(
+        SDO_REPLY_BASE + node, struct.pack("<BHB", command, index, sub) + data.ljust(4, b"\0")
+    )
+
+
+def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:
+    """End a transfer; `cob_id` is that of the end that aborts."""
+    return Frame(cob_id, struct.pack("<BHBI", 0x80, index, sub, code))
+
+
+@dataclass(frozen=True, slots=True)
+class SdoMessage:
+    """An SDO frame taken apart; `data` holds the bytes of an expedited transfer or the abort
+    code."""
+
+    command: int
+    index: int
+    sub: int
+    data: bytes
+
+
+def parse_sdo(frame: Frame) -> SdoMessage:
+    """Take an SDO frame apart; raises ValueError if it has not 8 bytes, SdoAbortError(COMMAND) if
+    it is no expedited transfer."""
+    if len(frame.data) != 8:
+        raise ValueError(f"SDO frame {frame.id:#05x} with {len(frame.data)} bytes: must be 8")
+    command, index, sub = struct.unpack_from("<BHB", frame.data)
+    kind = command & 0xE0
+    if command in (0x40, 0x60) or command == 0x80:
+        return SdoMessage(command, index, sub, frame.data[4:])
+    if kind in (0x20, 0x40) and command & 0x02:
+        size = 4 - (command >> 2 & 0x03) if command & 0x01 else 4
+        return SdoMessage(kind, index, sub, frame.data[4 : 4 + size])
+    raise SdoAbortError(Abort.COMMAND, index, sub)
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """One object in a PDO."""
+
+    index: int
+    sub: int
+    type: Type
+
+    @property
+    def entry(self) -> int:
+        """As objects 1600h and 1A00h hold it: index, sub-index, bits."""
+        return self.index << 16 | self.sub << 8 | self.type.size * 8
+
+
+def pdo_struct(mapping: Iterable[Mapped]) -> struct.Struct:
+    """How to pack a PDO of these objects; raises ValueError beyond 8 bytes."""
+    layout = struct.Struct("<" + "".join(_STRUCT[mapped.type].format[1:] for mapped in mapping))
+    if layout.size > 8:
+        raise ValueError(f"a PDO holds 8 bytes, these objects need {layout.size}")
+    return layout
+
+
+@dataclass(frozen=True, slots=True)
+class Transfer:
+    """One SDO transfer to do: a write of `value` if it is given, else a read."""
+
+    index: int
+    sub: int
+    type: Type
+    value: int | None = None
+
+
+PDO_OFF: Final = 1 << 31
+"""Bit of a PDO's COB-ID (sub-index 1 of 1400h and 1800h) that switches it off."""
+
+
+def map_pdo(
+    parameters: int, mapping: int, cob_id: int, transmission: int, objects: Sequence[Mapped]
+) -> list[Transfer]:
+    """The writes that map and switch on a PDO, in the order that CiA 301 section 7.5.2.36 asks for.
+
+    `parameters` and `mapping` are the indices of its two records (1400h and 1600h, or 1800h and
+    1A00h).
+    """
+    u8, u32 = Type.UNSIGNED8, Type.UNSIGNED32
+    return [
+        Transfer(parameters, 1, u32, cob_id | PDO_OFF),
+        Transfer(parameters, 2, u8, transmission),
+        Transfer(mapping, 0, u8, 0),
+        *(Transfer(mapping, number, u32, mapped.entry) for number, mapped in enumerate(objects, 1)),
+        Transfer(mapping, 0, u8, len(objects)),
+        Transfer(parameters, 1, u32, cob_id),
+    ]
+
+
+class SdoClient:
+    """A client of one node's SDO server: does transfers one after another, gives up after `timeout`
+    seconds each.
+
+    `results` holds what was read, by (index, sub-index); `failure` says why a transfer failed,
+    which ends the row.
+    """
+
+    def __init__(self, node: int, timeout: float = 0.5) -> None:
+        self.node = node
+        self.timeout = timeout
+        self.results: dict[tuple[int, int], int] = {}
+        self.failure = ""
+        self._queue: deque[Transfer] = deque()
+        self._due = 0.0
+        self._asked = False
+
+    @property
+    def busy(self) -> bool:
+        """Whether transfers remain."""
+        return bool(self._queue)
+
+    def begin(self, transfers: Iterable[Transfer]) -> None:
+        """Forget what was, and do these."""
+        self.results, self.failure, self._asked = {}, "", False
+        self._queue = deque(transfers)
+
+    def advance(self, now: float) -> list[Frame]:
+        """The request that is due, if any."""
+        if not self._queue:
+            return []
+        transfer = self._queue[0]
+        if self._asked:
+            if now >= self._due:
+                self._fail(
+                    f"node {self.node}: no answer from {transfer.index:#06x}:{transfer.sub} "
+                    f"within {self.timeout} s"
+                )
+                return [
+                    sdo_abort(
+                        SDO_REQUEST_BASE + self.node, transfer.index, transfer.sub, Abort.TIMEOUT
+                    )
+                ]
+            return []
+        self._asked, self._due = True, now + self.timeout
+        if transfer.value is None:
+            return [sdo_read_request(self.node, transfer.index, transfer.sub)]
+        return [
+            sdo_write_request(
+                self.node, transfer.index, transfer.sub, transfer.type.pack(transfer.value)
+            )
+        ]
+
+    def receive(self, frame: Frame) -> None:
+        """Take a frame of the server; what was not asked for is ignored."""
+        if not (self._queue and self._asked) or frame.id != SDO_REPLY_BASE + self.node:
+            return
+        transfer = self._queue[0]
+        try:
+            reply = parse_sdo(frame)
+            if (reply.index, reply.sub) != (transfer.index, transfer.sub):
+                return
+            self._settle(transfer, reply)
+        except (ValueError, SdoAbortError) as reason:
+            self._fail(f"node {self.node}: {reason}")
+
+    def _settle(self, transfer: Transfer, reply: SdoMessage) -> None:
+        if reply.command == 0x80:
+            raise SdoAbortError(int.from_bytes(reply.data, "little"), reply.index, reply.sub)
+        if reply.command != (0x40 if transfer.value is None else 0x60):
+            raise SdoAbortError(Abort.COMMAND, reply.index, reply.sub)
+        if transfer.value is None:
+            self.results[transfer.index, transfer.sub] = transfer.type.unpack(reply.data)
+        self._queue.popleft()
+        self._asked = False
+
+    def _fail(self, why: str) -> None:
+        self.failure, self._asked = why, False
+        self._queue.clear()

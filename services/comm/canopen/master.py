@@ -1,0 +1,432 @@
+"""A CANopen master of CiA 402 drives, whatever machine they move: configures, starts, enables and
+supervises, cycle by cycle.
+
+A machine: frames in, frames out, times passed in. What a drive is set to and what is sent to it in
+a cycle, its `DriveLink` knows; nodes that are no drives (inputs, sensors) are `Companion`s. CiA 301
+(NMT, heartbeat, SDO, SYNC, EMCY) and CiA 402-2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Generic, Protocol, TypeVar
+
+from petrobot.services.comm.canopen import cia301 as canopen
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import (
+    Mapped,
+    NmtCommand,
+    NmtState,
+    SdoClient,
+    Transfer,
+    Type,
+)
+from petrobot.services.comm.canopen.cia402 import (
+    DEVICE_TYPE,
+    ENABLING,
+    SENT,
+    Command,
+    Fault,
+    Mode,
+    Object,
+    State,
+    fault_text,
+)
+
+MASTER_NODE: Final = 0x7F
+"""Node id under which the master sends its own heartbeat."""
+HEARTBEAT_MS: Final = 50
+"""Period of everybody's heartbeat."""
+RETRY: Final = 1.0
+"""s before a failed configuration is tried again."""
+SETTLE: Final = 0.05
+"""s that nodes are given after a reset of their communication."""
+
+_U8, _U16, _U32, _I8 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8
+_MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+
+
+class Phase(Enum):
+    """What the master is doing."""
+
+    CONFIGURING = "configuring"
+    """SDO transfers are under way, or are waiting to be tried again."""
+    STARTING = "starting"
+    """Nodes are ordered into OPERATIONAL; not all have sent process data yet."""
+    RUNNING = "running"
+    """All drives answer each SYNC."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """Something that needs a reset.
+
+    `cause` is a short code (`drive_fault`, `power`, `bus`), `axis` the drive's number from 0 on or
+    None, `code` an EMCY error code or 0.
+    """
+
+    cause: str
+    axis: int | None
+    code: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """How strict a master is: chosen by its cycle and by what a drive may do alone meanwhile."""
+
+    silent_cycles: int
+    """Cycles without a drive's TPDO after which it counts as lost."""
+    patience: float
+    """s without a heartbeat after which a node counts as lost."""
+    old_emergencies: bool = False
+    """Whether an EMCY that comes during a reset is passed over: a fault that stays will show."""
+
+
+class DriveLink(Protocol):
+    """What the master needs of one drive's link; see `Power`, `usual_transfers`, `pdo_transfers`
+    and `unfit` to make one."""
+
+    node: int
+    sdo: SdoClient
+    state: State
+    limited: bool
+    """Whether the drive cuts its set points because they are faster than it goes."""
+    silent: int
+    """Cycles since its last TPDO."""
+    spoken: bool
+    """Whether it has sent one since it was started."""
+    error_code: int
+
+    def transfers(self, cycle: float) -> list[Transfer]:
+        """Its configuration for a bus cycle of so many seconds, and what is read from it."""
+
+    def wrong(self) -> str:
+        """What makes the device at this node unfit, in words; empty if nothing. Asked when the
+        transfers are done."""
+
+    def take(self, data: bytes) -> bool:
+        """Its TPDO; says whether its status is another one. Raises ValueError for bytes that are
+        none."""
+
+    def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
+        """Its RPDO of this cycle."""
+
+
+Link = TypeVar("Link", bound=DriveLink)
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A node on the bus that is no drive: its id, configuration, and what becomes of the data of
+    its TPDO."""
+
+    node: int
+    transfers: Sequence[Transfer]
+    take: Callable[[bytes], None]
+    needed: bool = True
+    """Whether the drives may move only while it answers."""
+
+
+class Power:
+    """Which controlword leads a drive to where its master wants it (CiA 402-2, figure 9)."""
+
+    __slots__ = ("_reset_cycles", "_stop_cycles", "_wait", "stopping")
+
+    def __init__(self, reset_cycles: int, stop_cycles: int) -> None:
+        """`reset_cycles`: cycles between two fault resets; `stop_cycles`: cycles that a drive is
+        given to stop quickly and stand before its power is taken away and its brake holds."""
+        self._reset_cycles, self._stop_cycles = reset_cycles, stop_cycles
+        self._wait = 0
+        self.stopping = 0
+        """Cycles since the drive was last wanted."""
+
+    def word(self, state: State, wanted: bool, resetting: bool) -> int:
+        """The controlword of this cycle; `resetting`: whether faults may be reset."""
+        self.stopping = 0 if wanted else self.stopping + 1
+        return self._command(state, wanted, resetting).word
+
+    def _command(self, state: State, wanted: bool, resetting: bool) -> Command:
+        if not wanted:
+            brakes = state in _MOVING and self.stopping <= self._stop_cycles
+            return Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
+        if state is State.FAULT:
+            self._wait = (self._wait + 1) % self._reset_cycles
+            return Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
+        return ENABLING.get(state, Command.DISABLE_VOLTAGE)
+
+
+def usual_transfers(cycle: float, mode: Mode, patience: float) -> list[Transfer]:
+    """Identity, heartbeats both ways (`patience` s), the bus cycle (s) and the mode of
+    operation."""
+    beat = MASTER_NODE << 16 | round(patience * 1e3)
+    return [
+        Transfer(Object.DEVICE_TYPE, 0, _U32),
+        Transfer(Object.SUPPORTED_MODES, 0, _U32),
+        Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+        Transfer(Object.CONSUMER_HEARTBEAT, 1, _U32, beat),
+        Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
+        Transfer(Object.MODE, 0, _I8, mode),
+    ]
+
+
+def pdo_transfers(node: int, received: Sequence[Mapped]) -> list[Transfer]:
+    """One RPDO of these objects and the TPDO that every drive sends, both by SYNC."""
+    return [
+        *canopen.map_pdo(
+            Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received
+        ),
+        *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 1, SENT),
+    ]
+
+
+def companion_transfers(node: int, timer_ms: int, objects: Sequence[Mapped]) -> list[Transfer]:
+    """Heartbeat, and a TPDO of these objects when they change and every `timer_ms`."""
+    return [
+        Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+        Transfer(Object.TPDO1, 5, _U16, timer_ms),
+        *canopen.map_pdo(
+            Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects
+        ),
+    ]
+
+
+def unfit(node: int, read: Mapping[tuple[int, int], int], mode: Mode) -> str:
+    """What makes a device with these objects no drive for a mode, in words; empty if nothing."""
+    device, modes = read[Object.DEVICE_TYPE, 0], read[Object.SUPPORTED_MODES, 0]
+    if device != DEVICE_TYPE:
+        return f"node {node} is no servo drive (object 1000h is {device:#010x}): check the node ids"
+    if not modes & mode.bit:
+        return f"node {node} does not know {mode.name.lower().replace('_', ' ')}"
+    return ""
+
+
+class CanopenMaster(Generic[Link]):
+    """Master of drives, known by their links and names, and of companions."""
+
+    def __init__(
+        self,
+        drives: Mapping[str, Link],
+        companions: Sequence[Companion],
+        cycle: float,
+        manner: Manner,
+        *,
+        enable: bool = False,
+    ) -> None:
+        """`cycle` in s; with `enable` the drives are enabled as soon as they are there for the
+        first time."""
+        self.cycle = cycle
+        self.drives: Sequence[Link] = tuple(drives.values())
+        self.names = tuple(drives)
+        self.wanted = False
+        """Whether the drives are to be enabled."""
+        self.phase = Phase.CONFIGURING
+        self.troubles: list[Trouble] = []
+        self.limited = False
+        """Whether a drive cuts its set points because they are faster than it goes."""
+        self._manner = manner
+        self._companions = {each.node: each for each in companions}
+        self._sdos = {each.node: SdoClient(each.node) for each in companions}
+        self._by_tpdo = {canopen.TPDO1_BASE + drive.node: drive for drive in self.drives}
+        self._others_by_tpdo = {canopen.TPDO1_BASE + each.node: each for each in companions}
+        self._axis = {drive.node: axis for axis, drive in enumerate(self.drives)}
+        self._heard = dict.fromkeys([*self._axis, *self._companions], 0.0)
+        self._now = 0.0
+        self._begin_at: float | None = 0.0
+        self._settled_at = 0.0
+        self._beat_due = 0.0
+        self._resetting = False
+        self._enable_first = enable
+        self._all_enabled = False
+
+    @property
+    def enabled(self) -> bool:
+        """Whether all drives follow set points."""
+        return self._all_enabled and self.phase is Phase.RUNNING
+
+    def alive(self, node: int) -> bool:
+        """Whether a node's heartbeat has been heard of late."""
+        return self._now - self._heard[node] <= self._manner.patience
+
+    def reset(self, now: float) -> None:
+        """Forget troubles, reset faults and enable again; configure again if the bus was the
+        trouble."""
+        again = self.phase is not Phase.RUNNING or any(
+            trouble.cause == "bus" for trouble in self.troubles
+        )
+        self.troubles.clear()
+        self._resetting, self.wanted = True, True
+        for drive in self.drives:
+            drive.error_code = 0
+        if again:
+            self.phase, self._begin_at = Phase.CONFIGURING, now
+
+    def give_up(self, why: str, cause: str, code: int) -> None:
+        """The machine itself has its drives stopped quickly, with the next cycle."""
+        self._report(Trouble(cause, None, code, why))
+        self._enable_first = False
+
+    def bus_lost(self, now: float, why: str) -> None:
+        """The bus itself is gone: nothing is enabled any more; configure again when it is back."""
+        self._report(Trouble("bus", None, 0, why))
+        self.phase, self._begin_at = Phase.CONFIGURING, now + RETRY
+
+    # Frames in
+
+    def receive(self, now: float, frame: Frame) -> None:
+        """A frame off the bus; what cannot be understood is ignored."""
+        drive = self._by_tpdo.get(frame.id)
+        if drive is not None:
+            try:
+                if drive.take(frame.data):
+                    self._look_at_drives()
+            except ValueError:
+                return  # not ours: silence will show
+        elif frame.id in self._others_by_tpdo:
+            self._others_by_tpdo[frame.id].take(frame.data)
+        elif frame.id > canopen.HEARTBEAT_BASE:
+            self._beat(now, frame)
+        elif frame.id > canopen.SDO_REPLY_BASE:
+            for client in self._clients():
+                client.receive(frame)
+        elif canopen.EMCY_BASE < frame.id < canopen.TPDO1_BASE:
+            self._emergency(frame)
+
+    def _look_at_drives(self) -> None:
+        """A drive's status has changed."""
+        self._all_enabled = all(drive.state is State.OPERATION_ENABLED for drive in self.drives)
+        self.limited = any(drive.limited for drive in self.drives)
+
+    def _beat(self, now: float, frame: Frame) -> None:
+        node = frame.id - canopen.HEARTBEAT_BASE
+        if node not in self._heard or len(frame.data) != 1:
+            return
+        self._heard[node] = now
+        restarted = frame.data[0] == NmtState.BOOT_UP and self.phase is not Phase.CONFIGURING
+        if restarted and self._needed(node):
+            self._report(Trouble("bus", self._axis.get(node), 0, f"node {node} has restarted"))
+
+    def _emergency(self, frame: Frame) -> None:
+        try:
+            message = canopen.parse_emergency(frame)
+        except ValueError:
+            return
+        axis = self._axis.get(message.node)
+        if axis is None:
+            return
+        self.drives[axis].error_code = message.code
+        passed_over = self.phase is Phase.CONFIGURING or (
+            self._manner.old_emergencies and self._resetting
+        )
+        if message.code and not passed_over:  # before, it may be old; a fault that stays will show
+            self._fault(axis, message.code)
+
+    # Frames out
+
+    def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
+        """Frames of one cycle: configuration, or set points (one a drive) and SYNC; heartbeat when
+        due."""
+        self._now = now
+        frames: list[Frame] = []
+        if now >= self._beat_due:
+            self._beat_due = now + HEARTBEAT_MS / 1e3
+            frames.append(canopen.heartbeat(MASTER_NODE, NmtState.OPERATIONAL))
+        if self.phase is Phase.CONFIGURING:
+            return frames + self._configure(now)
+        self._supervise(now)
+        wanted, resetting = self.wanted, self._resetting
+        frames += [
+            drive.frame(target, wanted, resetting)
+            for drive, target in zip(self.drives, targets, strict=True)
+        ]
+        frames.append(canopen.SYNC)
+        return frames
+
+    def _clients(self) -> list[SdoClient]:
+        return [*(drive.sdo for drive in self.drives), *self._sdos.values()]
+
+    def _configure(self, now: float) -> list[Frame]:
+        if self._begin_at is not None:
+            if now < self._begin_at:
+                return []
+            self._begin_at, self._settled_at = None, now + SETTLE
+            for drive in self.drives:
+                drive.sdo.begin(drive.transfers(self.cycle))
+            for node, client in self._sdos.items():
+                client.begin(self._companions[node].transfers)
+            return [canopen.nmt(NmtCommand.RESET_COMMUNICATION)]
+        if now < self._settled_at:
+            return []
+        clients = self._clients()
+        if any(client.busy for client in clients):
+            return [frame for client in clients for frame in client.advance(now)]
+        return self._start(now)
+
+    def _start(self, now: float) -> list[Frame]:
+        """All transfers are over: start the nodes, or say what failed and try again later."""
+        wrong = [
+            client.failure
+            for client in self._clients()
+            if client.failure and self._needed(client.node)
+        ]
+        wrong = wrong or [text for text in (drive.wrong() for drive in self.drives) if text]
+        if wrong:
+            self._report(Trouble("bus", None, 0, "; ".join(wrong)))
+            self._begin_at = now + RETRY
+            return []
+        if self._enable_first:
+            self._enable_first, self.wanted = False, True
+            self._resetting = (
+                True  # the drives may have gone into a fault when their last master went away
+            )
+            self.troubles.clear()
+        self.phase = Phase.STARTING
+        for drive in self.drives:
+            drive.silent, drive.spoken = 0, False
+        self._heard = dict.fromkeys(self._heard, now)
+        return [canopen.nmt(NmtCommand.START)]
+
+    # Supervision
+
+    def _needed(self, node: int) -> bool:
+        companion = self._companions.get(node)
+        return companion is None or companion.needed
+
+    def _supervise(self, now: float) -> None:
+        """Silence, lost heartbeats, and the end of starting and of a reset."""
+        lost = self._manner.silent_cycles + 1
+        for axis, drive in enumerate(self.drives):
+            drive.silent += 1
+            if drive.silent == lost:
+                self._report(Trouble("bus", axis, 0, f"{self.names[axis]}: the drive is silent"))
+            if (
+                drive.state is State.FAULT
+                and not self._resetting
+                and drive.spoken
+                and drive.silent <= 1
+            ):
+                self._fault(axis, drive.error_code)
+        patience = self._manner.patience
+        for node, heard in self._heard.items():
+            if now - heard > patience and self._needed(node):
+                self._report(
+                    Trouble("bus", self._axis.get(node), 0, f"node {node} sends no heartbeat")
+                )
+        if self.phase is Phase.STARTING and all(drive.spoken for drive in self.drives):
+            self.phase = Phase.RUNNING
+        if self._resetting and self.enabled:
+            self._resetting = False
+
+    def _fault(self, axis: int, code: int) -> None:
+        cause = "power" if code == Fault.UNDERVOLTAGE else "drive_fault"
+        what = fault_text(code) if code else "drive in fault"
+        self._report(Trouble(cause, axis, code, f"{self.names[axis]}: {what}"))
+
+    def _report(self, trouble: Trouble) -> None:
+        """Keep it until a reset (the same one once), and let no drive move on."""
+        self.wanted = False
+        known = {(each.axis, each.cause, each.code) for each in self.troubles}
+        if (trouble.axis, trouble.cause, trouble.code) not in known:
+            self.troubles.append(trouble)

@@ -1,0 +1,377 @@
+"""Where everything is: the location file services.toml as immutable data, read by every host and by
+the coordinator."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from petrobot.services.comm.location_file import reading as directory_file
+from petrobot.services.comm.lockstep.party import TICK
+
+_log = logging.getLogger(__name__)
+COORDINATOR = directory_file.COORDINATOR
+COORDINATOR_PORT = directory_file.COORDINATOR_PORT
+SHIPPED = Path(__file__).parents[3]
+"""Where petrobot's own files are, so that a copied services.toml still finds the shipped
+numbers."""
+MEMORY = "memory"
+MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
+"""What the node that has the global memory offers."""
+
+
+class DirectoryError(Exception):
+    """services.toml is refused, or it does not know a name; `faults` holds one line for each fault,
+    with its remedy."""
+
+    def __init__(self, faults: tuple[str, ...]) -> None:
+        super().__init__("\n".join(faults))
+        self.faults = faults
+
+
+@dataclass(frozen=True, slots=True)
+class NodeEntry:
+    """A node: one process (with its workers) at one address."""
+
+    name: str
+    host: str
+    port: int
+    sim: str = ""
+    """Import path of what makes the simulated laboratory's party, `function(directory, name)`;
+    empty for a real node."""
+    worker_memory_mb: int = 4096
+    """Limit of the address space of each worker process (MiB). Address space, not memory in use:
+    numpy, opencv and scipy together reserve about 0.6 GiB on a small host; some libraries reserve
+    more for each core."""
+    workers: int = 32
+    """Most worker processes for actions without a device: as many runs of such actions at a
+    time."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceEntry:
+    """A device: its node, its driver ("module:Class"; empty on a simulated node) and the driver's
+    own keys."""
+
+    name: str
+    node: str
+    driver: str
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ActionEntry:
+    """A primitive action: the primitive task that it translates, its place and its limits (s)."""
+
+    name: str
+    run: str
+    """Import path, "module:function"."""
+    task: str
+    node: str
+    device: str = ""
+    """Empty for an action that needs none."""
+    args: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments that every call gets unless it says otherwise."""
+    deadline: float | None = None
+    orphan_time: float | None = None
+    """How long a run outlives its coordinator's connection; None: without limit."""
+    on_resume: str = "rejoin"
+    """What a resumed coordinator does with it: rejoin, error or ask."""
+    compute_time: float = 0.0
+    """Simulated time of computing in lock step: the result is so much later."""
+    at_once: bool = False
+    """Starts also while an earlier run of its device is still stopping (such as hold)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceEntry:
+    """A general-purpose service. `run` is empty for the global memory and for what a simulated node
+    answers itself."""
+
+    name: str
+    node: str
+    run: str = ""
+    local: bool = False
+    """Only callers on the node's own host may call it."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamEntry:
+    """A set-point stream: the device that receives it and the period at which it is sent (s)."""
+
+    name: str
+    to: str
+    period: float
+
+
+@dataclass(frozen=True, slots=True)
+class TimerEntry:
+    """A timer that raises the external pulse event of its name with this period (s)."""
+
+    name: str
+    node: str
+    period: float
+
+
+@dataclass(frozen=True, slots=True)
+class Directory:
+    """All of services.toml. The mappings keep the order of the file."""
+
+    source: Path
+    hash: str
+    """SHA-256 of the file's data (comments and spacing left out), in the handshake of every
+    connection."""
+    nodes: Mapping[str, NodeEntry]
+    devices: Mapping[str, DeviceEntry]
+    actions: Mapping[str, ActionEntry]
+    services: Mapping[str, ServiceEntry]
+    streams: Mapping[str, StreamEntry]
+    timers: Mapping[str, TimerEntry]
+    links: Mapping[str, float]
+    """Lock-step delays (s) by channel or "source/target" (endpoint names)."""
+    keys: Mapping[str, str]
+    coordinator: NodeEntry
+    """Where the coordinator listens (in lock step)."""
+    parameters: Mapping[str, str]
+    """Files of numbers that the cell's programs share, by name; relative to this file."""
+
+    def where(self, name: str) -> str:
+        """The node of an action, service, device, stream's receiver or timer. Raises
+        DirectoryError."""
+        if name in self.streams:
+            return self.devices[self.streams[name].to].node
+        key = MEMORY if name in MEMORY_CALLS else name
+        for table in (self.actions, self.services, self.devices, self.timers):
+            if key in table:
+                return str(table[key].node)
+        known = [*self.actions, *self.services, *self.devices, *self.timers, *self.streams]
+        raise DirectoryError(
+            (f"{self.source}: nothing is named {name!r}{directory_file.nearest(key, known)}",)
+        )
+
+    def party(self, endpoint: str) -> str:
+        """Lock step: the party that an endpoint lives in; a name that stands in no table is a party
+        itself."""
+        try:
+            return endpoint if endpoint in self.nodes else self.where(endpoint)
+        except DirectoryError:
+            return endpoint
+
+    def offers(self, node: str) -> tuple[str, ...]:
+        """Names of all actions and services that a node answers to."""
+        actions = [a.name for a in self.actions.values() if a.node == node]
+        for service in self.services.values():
+            if service.node == node:
+                actions += MEMORY_CALLS if service.name == MEMORY else [service.name]
+        return tuple(actions)
+
+    def alternatives(self, task: str) -> tuple[str, ...]:
+        """The primitive actions that translate a primitive task, in the order of the file."""
+        return tuple(a.name for a in self.actions.values() if a.task == task)
+
+    def address(self, node: str) -> tuple[str, int]:
+        """Host and port of a node or of the coordinator."""
+        entry = self.coordinator if node == COORDINATOR else self.nodes[node]
+        return entry.host, entry.port
+
+    def members(self) -> dict[str, tuple[str, int]]:
+        """Addresses of all members of a lock-step cell: its nodes and the coordinator."""
+        return {name: self.address(name) for name in (*self.nodes, COORDINATOR)}
+
+    def same_host(self, node: str, party: str) -> bool:
+        """Whether a party lives on a node's host; one that is no node (a coordinator in lock step)
+        does."""
+        return party not in self.nodes or self.nodes[party].host == self.nodes[node].host
+
+    def laboratory(self) -> str:
+        """The simulated node, empty when there is none."""
+        return next((n.name for n in self.nodes.values() if n.sim), "")
+
+    def local(self, service: str) -> bool:
+        """Whether only callers of the same host may call it."""
+        key = MEMORY if service in MEMORY_CALLS else service
+        return key in self.services and self.services[key].local
+
+    def file(self, path: str) -> Path:
+        """A path written in services.toml, taken relative to it; what is not there but comes with
+        petrobot is taken from there."""
+        beside = self.source.parent / path
+        shipped = SHIPPED / path
+        return shipped if not beside.exists() and shipped.exists() else beside
+
+    def delays(self) -> dict[str, int]:
+        """Lock-step delays of the links in whole ticks, rounded up, as `services.comm.cell.Delays`
+        takes them."""
+        return {
+            name: max(1, math.ceil(seconds / TICK - 1e-6)) for name, seconds in self.links.items()
+        }
+
+
+def load(path: str | Path) -> Directory:
+    """Read services.toml. Raises DirectoryError with every fault in it, OSError when it cannot be
+    read."""
+    source = Path(path)
+    return parse(read_text(source), source)
+
+
+def read_text(source: Path) -> str:
+    """The text of a location file. Raises DirectoryError with the line that is no UTF-8, OSError
+    when it cannot be read."""
+    try:
+        return source.read_text(encoding="utf-8")
+    except UnicodeDecodeError as fault:
+        line = source.read_bytes()[: fault.start].count(b"\n") + 1
+        raise DirectoryError(
+            (f"{source}:{line}: not UTF-8 text ({fault.reason}); save the file as UTF-8",)
+        ) from fault
+
+
+def parse(text: str, source: Path) -> Directory:
+    """Read the text of a services.toml; `source` is its path, for messages and for relative
+    paths."""
+    text = text.removeprefix("\ufeff")  # some editors begin a file with a byte-order mark
+    tables, digest, faults = directory_file.read(text, str(source), MEMORY)
+    if faults:
+        raise DirectoryError(tuple(faults))
+    devices = {n: _device(n, t) for n, t in tables["devices"].items()}
+    return Directory(
+        source=source,
+        hash=digest,
+        nodes={n: NodeEntry(n, **t) for n, t in tables["nodes"].items()},
+        devices=devices,
+        actions={n: _action(n, t, devices) for n, t in tables["actions"].items()},
+        services={n: _service(n, t) for n, t in tables["services"].items()},
+        streams={
+            n: StreamEntry(n, t["to"], float(t["period"])) for n, t in tables["streams"].items()
+        },
+        timers={
+            n: TimerEntry(n, t["node"], float(t["period"])) for n, t in tables["timers"].items()
+        },
+        links={n: float(d) for n, d in tables["links"].items()},
+        keys=dict(tables["keys"]),
+        coordinator=NodeEntry(
+            COORDINATOR, **{"host": "127.0.0.1", "port": COORDINATOR_PORT, **tables[COORDINATOR]}
+        ),
+        parameters=dict(tables["parameters"]),
+    )
+
+
+def _device(name: str, table: Mapping[str, Any]) -> DeviceEntry:
+    config = {key: value for key, value in table.items() if key not in ("node", "driver")}
+    return DeviceEntry(name, table["node"], table.get("driver", ""), config)
+
+
+def _action(name: str, table: Mapping[str, Any], devices: Mapping[str, DeviceEntry]) -> ActionEntry:
+    device = table.get("device", "")
+    orphan_time = table.get("orphan_time", 1.0 if device else None)
+    return ActionEntry(
+        name=name,
+        run=table["run"],
+        task=table["task"],
+        node=devices[device].node if device else table["node"],
+        device=device,
+        args=table.get("args", {}),
+        deadline=_seconds(table.get("deadline")),
+        orphan_time=_seconds(orphan_time),
+        on_resume=table.get("on_resume", "rejoin"),
+        compute_time=float(table.get("compute_time", 0.0)),
+        at_once=table.get("start", "when_stopped") == "at_once",
+    )
+
+
+def _service(name: str, table: Mapping[str, Any]) -> ServiceEntry:
+    return ServiceEntry(
+        name, table["node"], table.get("run", ""), table.get("scope", "network") == "local"
+    )
+
+
+def _seconds(value: float | None) -> float | None:
+    return None if value is None else float(value)
+
+
+def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
+    """Faults of the import paths that a node of this host must load: one line each, empty when all
+    are there."""
+    places = [
+        (f"devices.{d.name}.driver", d.driver)
+        for d in directory.devices.values()
+        if d.node == node and d.driver
+    ]
+    places += [
+        (f"actions.{a.name}.run", a.run) for a in directory.actions.values() if a.node == node
+    ]
+    places += [
+        (f"services.{s.name}.run", s.run)
+        for s in directory.services.values()
+        if s.node == node and s.run
+    ]
+    found = [(key, _import_fault(path)) for key, path in places]
+    return tuple(f"{directory.source}: {key}: {fault}" for key, fault in found if fault)
+
+
+def _import_fault(path: str) -> str:
+    try:
+        resolve(path)
+    except ImportError as fault:
+        return str(fault)
+    return ""
+
+
+MOVED = {
+    "sim.laboratory": "sim.catching.laboratory",
+    "sim.track_laboratory": "sim.track.laboratory",
+    "sim.track_plan": "sim.track.plan",
+}
+"""What location files written before petrobot was one package name, and where it is now."""
+
+
+@cache
+def module_name(name: str) -> str:
+    """Return the name by which a module of a location file or task file is imported.
+
+    It is the name itself. Only what was shipped as `services`, `sim` or `coordinator` before
+    petrobot was one package is found under its present name, unless the user has such a package.
+    """
+    top = name.partition(".")[0]
+    if top not in ("coordinator", "services", "sim"):
+        return name
+    try:
+        spec = importlib.util.find_spec(top)
+    except ValueError:  # a stand-in in sys.modules without a spec: the user's
+        return name
+    own = spec.origin if spec is not None else None
+    if spec is not None and (own is None or not Path(own).samefile(SHIPPED / top / "__init__.py")):
+        return name
+    _log.warning("%s is an old name; write petrobot.%s", name, name)
+    return f"petrobot.{MOVED.get(name, name)}"
+
+
+def resolve(path: str) -> Any:
+    """The object at an import path "module:name". Raises ImportError that says what is missing and
+    what to do."""
+    written, _, attribute = path.partition(":")
+    try:
+        module = importlib.import_module(module_name(written))
+    except ImportError as fault:
+        raise ImportError(
+            f"cannot import {written!r} ({fault}); install its package on this host or put "
+            "its folder on PYTHONPATH"
+        ) from fault
+    except Exception as fault:
+        raise ImportError(
+            f"importing {written!r} raises {type(fault).__name__}: {fault}; mend the module"
+        ) from fault
+    found = getattr(module, attribute, None)
+    if not callable(found):
+        names = [n for n in vars(module) if not n.startswith("_")]
+        raise ImportError(
+            f"{written!r} has no callable {attribute!r}{directory_file.nearest(attribute, names)}"
+        )
+    return found

@@ -1,0 +1,98 @@
+"""What lies in a lock-step cell's envelopes besides protocol messages: frames, images, set points
+and controls.
+
+A node and the laboratory exchange them instead of a bus, a camera's socket and a stream's socket:
+
+- "can": all frames that one port sent in a tick, from a device to the laboratory and back, as a
+  tuple of `Frame`;
+- "control": from a device to the laboratory, the rate at which it wants images (`images_wanted`);
+- "image": from the laboratory to a device (`image_body`), with its age when it was sent, as on the
+  wire;
+- "stream": a set point from a stream to the device that receives it (`set_point_body`).
+
+Source and target are endpoint names: the device on one side, the laboratory's node on the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.streams.image import Image
+
+_FRAMES = frozenset((Frame,))
+
+
+class ImagesWanted(NamedTuple):
+    """A device wants images at `rate` (1/s; 0: none); `generation` counts its wishes: images of an
+    earlier one are dropped."""
+
+    rate: float
+    generation: int
+
+
+class SetPointBody(NamedTuple):
+    """A set point on its way: the stream, its values, how long its sender has stood by them (s) and
+    the stream's period (s)."""
+
+    stream: str
+    values: tuple[float, ...]
+    held: float
+    period: float
+
+
+def can_body(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    """Body of a "can" envelope."""
+    return tuple(frames)
+
+
+def read_can(body: Any) -> tuple[Frame, ...]:
+    """Frames of a "can" envelope, also of one that holds a single frame."""
+    if isinstance(body, Frame):
+        return (body,)
+    if _FRAMES.issuperset(map(type, body)):
+        return tuple(body)
+    return tuple(Frame(*frame) for frame in body)
+
+
+def images_wanted(rate: float, generation: int) -> Mapping[str, Any]:
+    """Body of a "control" envelope to the laboratory."""
+    return {"images": float(rate), "generation": generation}
+
+
+def read_images_wanted(body: Mapping[str, Any]) -> ImagesWanted | None:
+    """The wish in a "control" envelope, None when it is about something else."""
+    if "images" not in body:
+        return None
+    return ImagesWanted(float(body["images"]), int(body["generation"]))
+
+
+def image_body(
+    pixels: NDArray[np.uint8], age: float, sequence: int, generation: int
+) -> Mapping[str, Any]:
+    """Body of an "image" envelope: grey levels (height, width), age in seconds since mid-exposure
+    when it is sent."""
+    return {"pixels": pixels, "age": float(age), "sequence": sequence, "generation": generation}
+
+
+def read_image(body: Mapping[str, Any], now: float) -> tuple[Image, int]:
+    """The image of an "image" envelope on the receiver's clock, and the generation of the wish that
+    it answers."""
+    return Image(body["pixels"], now - body["age"], body["sequence"]), body["generation"]
+
+
+def set_point_body(
+    stream: str, values: Sequence[float], held: float, period: float
+) -> tuple[Any, ...]:
+    """Body of a "stream" envelope."""
+    return (stream, tuple(float(v) for v in values), float(held), float(period))
+
+
+def read_set_point(body: Sequence[Any]) -> SetPointBody:
+    """The set point in a "stream" envelope."""
+    stream, values, held, period = body
+    return SetPointBody(stream, tuple(values), held, period)

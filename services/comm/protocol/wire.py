@@ -1,0 +1,512 @@
+"""One connection of the node protocol as a machine: bytes in, messages out, and the other way
+round.
+
+A frame is a u32 length (big endian), a body (`codec.py`) and, on an open connection, a seal of 16
+bytes (with a key) or a check of 4 bytes (without), which the length counts. No socket, clock or
+randomness of its own: the shell passes bytes and the nonce. Nothing but ProtocolError leaves it.
+
+    opening  client: HELLO ->                       server: <- WELCOME or REFUSE
+    with a key:      HELLO ->  <- CHALLENGE  PROOF ->        <- WELCOME or REFUSE
+    open     everything else, sealed or checked
+    closing  BYE or REFUSE was sent: nothing more goes out, what comes in is dropped
+    closed   BYE or REFUSE came, or the other side broke the protocol
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+from petrobot.services.comm.protocol.codec import (
+    LIMITS,
+    NAME_LENGTH,
+    READERS,
+    UNCOUNTED,
+    ProtocolError,
+    decode,
+    decode_by_table,
+    encode,
+    encode_all,
+    kind_of,
+    no_extension,
+    unpack,
+)
+from petrobot.services.comm.protocol.messages import (
+    Challenge,
+    Hello,
+    Message,
+    Proof,
+    Refuse,
+    Welcome,
+)
+from petrobot.services.comm.protocol.security import (
+    CHECK_BYTES,
+    NONCE_BYTES,
+    PROOF_BYTES,
+    SEAL_BYTES,
+    Check,
+    Keys,
+    Seal,
+    all_keys,
+    check,
+    proof,
+    same,
+)
+from petrobot.services.comm.protocol.states import (
+    LAST,
+    MAY_COME,
+    MAY_GO,
+    NOTHING,
+    OVER,
+    STATES,
+    Phase,
+    Side,
+    State,
+)
+
+__all__ = [
+    "NEWEST_VERSION",
+    "OLDEST_VERSION",
+    "Connection",
+    "ProtocolError",
+    "Side",
+    "State",
+    "negotiate",
+]
+
+OLDEST_VERSION: Final = 2
+NEWEST_VERSION: Final = 2
+"""Versions of the protocol that this code speaks."""
+
+_HEADER: Final = 4
+_HEAD: Final = struct.Struct(">IBB")
+"""Length, then the first two bytes of the body: its array and the kind."""
+_head_at: Final = _HEAD.unpack_from
+_LARGE: Final = 4096
+_NO_QUICK: Mapping[int, int] = {}
+
+
+def negotiate(oldest: int, newest: int) -> int | None:
+    """The newest version that this code and a peer with the range [oldest, newest] both speak; None
+    if there is none."""
+    version = min(newest, NEWEST_VERSION)
+    return version if version >= max(oldest, OLDEST_VERSION) and oldest <= newest else None
+
+
+class Connection:
+    """One end of a connection. `nonce` (32 fresh random bytes) is needed with a `key`.
+
+    `server` is the name of the server: on its own side its name, on the client's the name that the
+    client asks for. HELLO carries it and WELCOME confirms it, both under the proof of the key; a
+    server of another name refuses, and is refused. A server sees HELLO only after its sender has
+    proved the key, and then sends WELCOME or REFUSE.
+    """
+
+    def __init__(
+        self, side: Side, server: str, *, key: Keys | None = None, nonce: bytes = b""
+    ) -> None:
+        if key is not None and len(nonce) != NONCE_BYTES:
+            raise ValueError(f"a connection with a key needs a nonce of {NONCE_BYTES} bytes")
+        self.side = side
+        self.version = 0
+        """Version agreed on; 0 before WELCOME."""
+        self.proven = True
+        """Whether a REFUSE that came is known to be the server's: with a key only if it was
+        sealed."""
+        self._server = server
+        self._keys = all_keys(key)
+        self._nonce = nonce
+        self._phase = Phase.HELLO
+        self._parts: list[bytes] = []
+        self._have = 0
+        self._need = 0
+        self._out = bytearray()
+        self._hello: Hello | None = None
+        self._transcript = b""
+        self._seal_in: Seal | Check | None = None
+        self._seal_out: Seal | Check | None = None
+        self._seal_bytes = 0
+        self._may_come = MAY_COME.get((side, self._phase), NOTHING)
+        self._may_go = MAY_GO.get((side, self._phase), NOTHING)
+        self._quick_in: Mapping[int, int] = _NO_QUICK
+        """While the connection is open: the kinds that may come and end nothing, with the longest
+        frame of each (bytes),"""
+        self._quick_out = NOTHING
+        """and those that may go so."""
+
+    @property
+    def state(self) -> State:
+        """opening, open, closing or closed."""
+        return STATES.get(self._phase, State.OPENING)
+
+    def _enter(self, phase: Phase) -> None:
+        self._phase = phase
+        self._may_come = MAY_COME.get((self.side, phase), NOTHING)
+        self._may_go = MAY_GO.get((self.side, phase), NOTHING)
+        if phase is Phase.OPEN:
+            self._quick_in = {
+                kind: LIMITS[kind] + self._seal_bytes for kind in self._may_come - LAST
+            }
+            self._quick_out = self._may_go - LAST
+        else:
+            self._quick_in, self._quick_out = _NO_QUICK, NOTHING
+
+    def data_to_send(self) -> bytes:
+        """Bytes that the handshake itself has to send; ask after each `receive_data`."""
+        data = bytes(self._out)
+        self._out.clear()
+        return data
+
+    def send(self, message: Message) -> bytes:
+        """Bytes of a message. Raises ProtocolError if it is too large or may not be sent now; then
+        nothing has changed."""
+        if message.KIND not in self._quick_out:
+            return self._send_unusual(message)
+        return self._frame(encode(message))
+
+    def send_all(self, messages: Sequence[Message]) -> bytes:
+        """Bytes of messages that may all go and end nothing. Raises as `send`; then nothing has
+        changed."""
+        if not self._quick_out.issuperset([message.KIND for message in messages]):
+            raise ProtocolError("out_of_turn", "these messages have to be sent one by one")
+        assert self._seal_out is not None
+        parts: list[bytes] = []
+        seal, seal_bytes = self._seal_out.next, self._seal_bytes
+        for body in encode_all(messages):
+            parts += (len(body) + seal_bytes).to_bytes(_HEADER, "big"), body, seal(body)
+        return b"".join(parts)
+
+    def _send_unusual(self, message: Message) -> bytes:
+        if message.KIND not in self._may_go:
+            raise ProtocolError(
+                "out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}"
+            )
+        if self._phase is not Phase.OPEN:
+            return self._send_opening(message)
+        last_word = self._frame(encode(message))
+        self._enter(Phase.CLOSING)
+        return last_word
+
+    def refusal(self, refuse: Refuse) -> bytes:
+        """Bytes of the last word to a side that has broken the protocol, sealed as soon as both are
+        known to share a key."""
+        body = encode(refuse)
+        return self._frame(body) if self.version else self._opening_refusal(body)
+
+    def _frame(self, body: bytes) -> bytes:
+        assert self._seal_out is not None
+        length = len(body) + self._seal_bytes
+        return length.to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
+
+    def _opening_refusal(self, body: bytes) -> bytes:
+        # Proven by the seal that the first frame of the open connection would have had; nothing
+        # follows it.
+        return _opening_frame(body if self._seal_out is None else body + self._seal_out.next(body))
+
+    def _send_opening(self, message: Message) -> bytes:
+        if isinstance(message, Hello):
+            self._transcript = self._hello_body(message)
+            self._enter(Phase.HELLO_SENT)
+            return _opening_frame(self._transcript)
+        if isinstance(message, Welcome):
+            data = _opening_frame(self._welcome_body(message))
+            self._open(message.version)
+            return data
+        data = self._opening_refusal(encode(message))
+        self._enter(Phase.CLOSING)
+        return data
+
+    def _hello_body(self, hello: Hello) -> bytes:
+        """HELLO whose `auth` is: bytes of the check (u8), the server that is asked for, the check,
+        which is the nonce, or without a key the CRC-32 of all before it."""
+        end = self._nonce if self._keys else bytes(CHECK_BYTES)
+        body = encode(replace(hello, auth=bytes((len(end),)) + self._server.encode() + end))
+        return body if self._keys else _checked(body)
+
+    def _welcome_body(self, welcome: Welcome) -> bytes:
+        # `auth` is the last field, so everything but its last bytes is covered without encoding
+        # twice on the other side.
+        if not self._keys:
+            return _checked(encode(replace(welcome, auth=bytes(CHECK_BYTES))), self._transcript)
+        body = encode(replace(welcome, auth=bytes(PROOF_BYTES)))[:-PROOF_BYTES]
+        return body + proof(self._keys[0], "server", self._transcript + body)
+
+    def _share(self, key: bytes) -> None:
+        """Both sides are known to have this key: all that follows is sealed by it."""
+        self._keys = (key,)
+        labels = ("client to server", "server to client")
+        mine, theirs = labels if self.side is Side.CLIENT else labels[::-1]
+        self._seal_out = Seal(key, mine, self._transcript)
+        self._seal_in = Seal(key, theirs, self._transcript)
+
+    def _open(self, version: int) -> None:
+        self.version = version
+        self._seal_bytes = SEAL_BYTES if self._keys else CHECK_BYTES
+        if not self._keys:
+            self._seal_out = self._seal_in = Check()
+        self._enter(Phase.OPEN)
+
+    def receive_data(self, data: bytes) -> list[Message]:
+        """Messages completed by these bytes, in order.
+
+        Raises ProtocolError when the other side broke the protocol: the connection is closed then,
+        and what came well before the fault is in the error's `before`.
+        """
+        if self._parts:
+            self._parts.append(data)
+            self._have += len(data)
+            if self._have < self._need:
+                return []
+            data = b"".join(self._parts)
+            self._parts.clear()
+        elif self._phase in OVER:
+            return []
+        messages: list[Message] = []
+        try:
+            start = self._quick_frames(data, messages) if len(data) > _HEAD.size else 0
+            if start < len(data):
+                self._frames(data, start, messages)
+        except ProtocolError as fault:
+            self._enter(Phase.CLOSED)
+            raise ProtocolError(fault.code, fault.text, messages) from None
+        return messages
+
+    def _quick_frames(self, data: bytes, messages: list[Message]) -> int:
+        """Take whole frames of an open connection for as long as nothing is unusual about them;
+        says how far it came."""
+        size, start, longest, seal_bytes = len(data), 0, self._quick_in.get, self._seal_bytes
+        last, least = size - _HEAD.size, seal_bytes + 2
+        while start < last:
+            length, array, kind = _head_at(data, start)
+            body = start + _HEADER
+            end = body + length
+            if end > size or not least <= length <= longest(kind, 0) or array & 0xF0 != 0x90:
+                break
+            part = self._unsealed(data, body, end)
+            message = None
+            if kind in READERS and length <= UNCOUNTED:
+                # As `decode_kind`, which would be one more call for each of a hundred thousand
+                # frames a second.
+                try:
+                    message = READERS[kind](
+                        unpack(part, ext_hook=no_extension), length <= NAME_LENGTH
+                    )
+                except Exception:
+                    message = None  # whatever it is, the table finds and names it
+            messages.append(message or decode_by_table(part, kind, len(part)))
+            start = end
+        return start
+
+    def _frames(self, data: bytes, start: int, messages: list[Message]) -> None:
+        """Take whole frames, whatever they are; what is left waits for more, in parts, so that
+        nothing is moved twice."""
+        while self.state is not State.CLOSED and (end := self._frame_end(data, start)):
+            message = self._take(data, start + _HEADER, end)
+            start = end
+            if message is not None:
+                messages.append(message)
+        if start < len(data):
+            self._parts.append(data[start:] if start else data)
+            self._have = len(data) - start
+
+    def _unsealed(self, data: bytes, start: int, end: int) -> bytes | memoryview:
+        """The body of a frame of an open connection, which lies with its seal or check at `start`
+        to `end`."""
+        assert self._seal_in is not None
+        middle = end - self._seal_bytes
+        # A large body is not copied again to be taken apart.
+        body = memoryview(data)[start:middle] if end - start > _LARGE else data[start:middle]
+        if not same(data[middle:end], self._seal_in.next(body)):
+            if self._keys:
+                raise ProtocolError(
+                    "bad_seal", "a frame was changed, repeated, lost or made without the key"
+                )
+            raise ProtocolError(
+                "bad_check", "a frame was changed on its way, or made without its check"
+            )
+        return body
+
+    def _frame_end(self, data: bytes, start: int) -> int:
+        """Where the frame that begins at `start` ends; 0 if it is not all there. Refuses a bad one
+        as early as it can."""
+        body = start + _HEADER
+        self._need = _HEADER + 2
+        if len(data) < body:
+            return 0
+        length = int.from_bytes(data[start:body], "big")
+        sealed = self._seal_bytes
+        if length < 2 + sealed:
+            raise ProtocolError("malformed", f"a frame of {length} bytes")
+        if len(data) < body + 2:
+            return 0
+        kind = kind_of(data[body : body + 2])
+        if kind not in self._may_come:
+            raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
+        # A refusal of the opening may have a seal as well.
+        longest = LIMITS[kind] + (SEAL_BYTES if self._phase is Phase.PROVED else sealed)
+        if length > longest:
+            raise ProtocolError(
+                "too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}"
+            )
+        self._need = _HEADER + length
+        return body + length if len(data) >= body + length else 0
+
+    def _take(self, data: bytes, start: int, end: int) -> Message | None:
+        if self._phase is not Phase.OPEN:
+            return self._take_opening(data[start:end])
+        message = decode(self._unsealed(data, start, end))
+        if message.KIND in LAST:
+            self._enter(Phase.CLOSED)
+        return message
+
+    def _take_opening(self, body: bytes) -> Message | None:
+        if self._phase is Phase.PROVED and kind_of(body) == Refuse.KIND:
+            body = self._refusal_body(body)
+        message = decode(body)
+        if isinstance(message, Hello):
+            return self._take_hello(message, body)
+        if isinstance(message, Challenge):
+            self._take_challenge(message, body)
+            return None
+        if isinstance(message, Proof):
+            return self._take_proof(message)
+        if isinstance(message, Welcome):
+            self._take_welcome(message, body)
+            return message
+        self.proven = not self._keys or (self.proven and self._phase is Phase.PROVED)
+        self._enter(Phase.CLOSED)
+        return message
+
+    def _refusal_body(self, body: bytes) -> bytes:
+        """The body of a refusal in answer to our proof, which is proven if the server has sealed
+        it."""
+        for key in self._keys:
+            seal = Seal(key, "server to client", self._transcript)
+            if same(body[-SEAL_BYTES:], seal.next(body[:-SEAL_BYTES])):
+                return body[:-SEAL_BYTES]
+        self.proven = False
+        return body
+
+    def _take_hello(self, hello: Hello, body: bytes) -> Hello | None:
+        if negotiate(hello.oldest_version, hello.newest_version) is None:
+            spoken = f"{OLDEST_VERSION} to {NEWEST_VERSION}"
+            asked = f"{hello.oldest_version} to {hello.newest_version}"
+            raise ProtocolError(
+                "version",
+                f"versions {asked} are asked for, {spoken} are spoken here: update the older side",
+            )
+        self._transcript = body
+        wanted, keyed = _wanted(hello, body)
+        if not self._keys:
+            if keyed:
+                raise ProtocolError(
+                    "no_key_here",
+                    "this side has no key: give it the same key file, or take yours away",
+                )
+            self._enter(Phase.DECIDING)
+            self._refuse_another(wanted)
+            return hello
+        if not keyed:
+            raise ProtocolError(
+                "key_needed", "this side asks for a key: give the other side the same key file"
+            )
+        self._hello = hello
+        challenge = encode(Challenge(self._nonce))
+        self._transcript += challenge
+        self._out += _opening_frame(challenge)
+        self._enter(Phase.CHALLENGED)
+        return None
+
+    def _refuse_another(self, wanted: str) -> None:
+        if wanted != self._server:
+            raise _wrong_node(self._server, wanted)
+
+    def _take_challenge(self, challenge: Challenge, body: bytes) -> None:
+        if not self._keys:
+            raise ProtocolError(
+                "key_needed", "the server asks for a key: give this side the same key file"
+            )
+        if len(challenge.auth) != NONCE_BYTES:
+            raise ProtocolError("malformed", f"a nonce of {len(challenge.auth)} bytes")
+        self._transcript += body
+        proofs = b"".join([proof(key, "client", self._transcript) for key in self._keys])
+        self._out += _opening_frame(encode(Proof(proofs)))
+        self._enter(Phase.PROVED)
+
+    def _take_proof(self, given: Proof) -> Hello | None:
+        auth = given.auth
+        proofs = [auth[n : n + PROOF_BYTES] for n in range(0, len(auth), PROOF_BYTES)]
+        for key in self._keys:
+            expected = proof(key, "client", self._transcript)
+            if any(same(one, expected) for one in proofs):
+                break
+        else:
+            raise ProtocolError(
+                "wrong_key", "the client's key is not this side's key: use the same key file"
+            )
+        self._share(key)
+        self._enter(Phase.DECIDING)
+        assert self._hello is not None
+        self._refuse_another(_wanted(self._hello, b"")[0])
+        return self._hello
+
+    def _take_welcome(self, welcome: Welcome, body: bytes) -> None:
+        if self._keys:
+            if self._phase is not Phase.PROVED:
+                raise ProtocolError(
+                    "no_key_there", "the server did not ask for the key: give it the same key file"
+                )
+            covered = self._transcript + body[:-PROOF_BYTES]
+            for key in self._keys:
+                if same(welcome.auth, proof(key, "server", covered)):
+                    break
+            else:
+                raise ProtocolError(
+                    "wrong_key", "the server's key is not this side's key: use the same key file"
+                )
+            self._share(key)
+        elif welcome.auth != check(body[:-CHECK_BYTES], self._transcript):
+            raise ProtocolError("bad_check", "HELLO or WELCOME was changed on its way")
+        if not OLDEST_VERSION <= welcome.version <= NEWEST_VERSION:
+            raise ProtocolError(
+                "version", f"the server chose version {welcome.version}, which was not offered"
+            )
+        if welcome.name != self._server:
+            raise _wrong_node(welcome.name, self._server)
+        self._open(welcome.version)
+
+
+def _opening_frame(body: bytes) -> bytes:
+    """As in every version of the protocol, so that an older side understands why it is refused."""
+    return len(body).to_bytes(_HEADER, "big") + body
+
+
+def _checked(body: bytes, before: bytes = b"") -> bytes:
+    """A body that ends with room for its check, with the check."""
+    body = body[:-CHECK_BYTES]
+    return body + check(body, before)
+
+
+def _wanted(hello: Hello, body: bytes) -> tuple[str, bool]:
+    """The server that a HELLO asks for, and whether its sender has a key. Raises ProtocolError."""
+    auth = hello.auth
+    size = auth[0] if auth else 0
+    if size not in (CHECK_BYTES, NONCE_BYTES) or len(auth) < 1 + size:
+        raise ProtocolError(
+            "malformed", "HELLO: auth is not the wanted name with a nonce or a check"
+        )
+    if size == CHECK_BYTES and body and auth[-size:] != check(body[:-size]):
+        raise ProtocolError("bad_check", "HELLO was changed on its way")
+    try:
+        return auth[1:-size].decode(), size == NONCE_BYTES
+    except UnicodeDecodeError:
+        raise ProtocolError("malformed", "HELLO: the wanted name is not UTF-8") from None
+
+
+def _wrong_node(here: str, wanted: str) -> ProtocolError:
+    remedy = f"check host and port of {wanted} in services.toml"
+    return ProtocolError(
+        "wrong_node", f"this is {here}, {wanted or 'nobody'} was asked for: {remedy}"
+    )

@@ -1,0 +1,351 @@
+"""Image sources behind one interface, and the images' wire format over TCP (cv2 devices and files:
+`capture.py`).
+
+Wire format, network byte order. Image: b"PIMG", generation u32, sequence u64, age f64 (s since
+mid-exposure when sent), height u16, width u16, length u32, then the grey levels row by row. Control
+(receiver to camera): b"PCTL", generation u32, rate f64 (images/s, 0: stop). The camera repeats the
+generation of the last control, so images of an earlier start are known and dropped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import socket
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petrobot.services.comm.protocol.security import is_loopback
+from petrobot.services.comm.streams.capture import CaptureImages
+from petrobot.services.comm.streams.image import Image, ImageSource
+
+Clock = Callable[[], float]
+Pixels = NDArray[np.uint8]
+
+IMAGE_HEADER = struct.Struct("!4sIQdHHI")
+CONTROL = struct.Struct("!4sId")
+IMAGE_MAGIC, CONTROL_MAGIC = b"PIMG", b"PCTL"
+LARGEST_IMAGE = 16 * 1024 * 1024
+BUFFER = 4 * 1024 * 1024
+CHUNK = 1 << 20
+RECEIVERS = 16
+"""Receivers at a time; above it one that wants no images gives way."""
+ADMITTED = 4
+"""Connections taken in a poll: strangers must not hold up the loop that polls."""
+RETRY = 0.5
+"""s between attempts to reach a camera that is away."""
+IN_PROGRESS = (errno.EINPROGRESS, errno.EALREADY, errno.EWOULDBLOCK, errno.EAGAIN)
+
+
+class ImageFormatError(ValueError):
+    """Bytes that are no image of this format."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireImage:
+    """An image as it crosses the wire: its age (s since mid-exposure), never a time."""
+
+    generation: int
+    sequence: int
+    age: float
+    pixels: Pixels
+
+
+def encode_image(image: WireImage) -> bytes:
+    """Header and grey levels of one image, pixels (height, width) uint8."""
+    height, width = image.pixels.shape
+    header = IMAGE_HEADER.pack(
+        IMAGE_MAGIC, image.generation, image.sequence, image.age, height, width, height * width
+    )
+    return header + np.ascontiguousarray(image.pixels).tobytes()
+
+
+class ImageDecoder:
+    """Takes bytes cut anywhere; keeps only the newest whole image."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self._newest: WireImage | None = None
+
+    def feed(self, data: bytes | memoryview) -> None:
+        """Take bytes from the wire. Raises ImageFormatError when they are no images."""
+        self._bytes += data
+        while len(self._bytes) >= IMAGE_HEADER.size:
+            magic, generation, sequence, age, height, width, length = IMAGE_HEADER.unpack_from(
+                self._bytes
+            )
+            if (
+                magic != IMAGE_MAGIC
+                or length != height * width
+                or length > LARGEST_IMAGE
+                or not age >= 0.0
+            ):
+                raise ImageFormatError(
+                    f"no image header: {bytes(self._bytes[: IMAGE_HEADER.size]).hex()}"
+                )
+            end = IMAGE_HEADER.size + length
+            if len(self._bytes) < end:
+                return
+            pixels = np.frombuffer(bytes(self._bytes[IMAGE_HEADER.size : end]), np.uint8).reshape(
+                height, width
+            )
+            self._newest = WireImage(generation, sequence, age, pixels)
+            del self._bytes[:end]
+
+    def take(self) -> WireImage | None:
+        """The newest whole image, once."""
+        newest, self._newest = self._newest, None
+        return newest
+
+
+class StreamImages:
+    """Images of a camera elsewhere, over TCP. Nothing blocks; a camera that is away is tried again
+    every half second."""
+
+    def __init__(self, host: str, port: int, clock: Clock) -> None:
+        self._address = host, port
+        self._clock = clock
+        self._socket: socket.socket | None = None
+        self._decoder = ImageDecoder()
+        self._connected = False
+        self._retry_at = -float("inf")
+        self._generation = 0
+        self._rate = 0.0
+
+    def start(self, rate: float) -> None:
+        """Send images at about this rate (1/s); what was sent before counts no more."""
+        self._control(rate)
+
+    def stop(self) -> None:
+        """Send no more images."""
+        self._control(0.0)
+
+    def close(self) -> None:
+        """Leave the camera."""
+        self._drop(self._clock())
+
+    def newest(self) -> Image | None:
+        """The newest image not taken yet; everything older in the socket is dropped."""
+        self._connect()
+        if not self._connected or self._socket is None:
+            return None
+        try:
+            self._drain(self._socket)
+        except (OSError, ImageFormatError):
+            self._drop(self._clock())
+        image = self._decoder.take()
+        if image is None or image.generation != self._generation:
+            return None
+        return Image(image.pixels, self._clock() - image.age, image.sequence)
+
+    def _control(self, rate: float) -> None:
+        self._generation += 1
+        self._rate = rate
+        if self._connected:
+            self._say()
+        else:
+            self._connect()
+
+    def _say(self) -> None:
+        if self._socket is None:
+            return
+        try:
+            self._socket.sendall(CONTROL.pack(CONTROL_MAGIC, self._generation, self._rate))
+        except OSError:  # 16 bytes that do not fit into the buffer mean that nobody reads there
+            self._drop(self._clock())
+
+    def _connect(self) -> None:
+        now = self._clock()
+        if self._connected or (self._socket is None and now < self._retry_at):
+            return
+        if self._socket is None:
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        fault = self._socket.connect_ex(self._address)
+        if fault in (0, errno.EISCONN):
+            self._connected = True
+            self._say()
+        elif fault not in IN_PROGRESS:
+            self._drop(now)
+
+    def _drain(self, source: socket.socket) -> None:
+        while True:
+            try:
+                data = source.recv(CHUNK)
+            except BlockingIOError:
+                return
+            if not data:
+                raise ConnectionError("the camera left")
+            self._decoder.feed(data)
+
+    def _drop(self, now: float) -> None:
+        if self._socket is not None:
+            self._socket.close()
+        self._socket, self._connected, self._decoder = None, False, ImageDecoder()
+        self._retry_at = now + RETRY
+
+
+class _Receiver:
+    """One receiver of an ImageServer: what it asked for and what is still to be written."""
+
+    def __init__(self, link: socket.socket) -> None:
+        self.link = link
+        self.generation = 0
+        self.rate = 0.0
+        self.asked = bytearray()
+        self.rest = memoryview(b"")
+
+    def listen(self) -> None:
+        """Take its controls. Raises OSError or ImageFormatError when it is no receiver any more."""
+        with contextlib.suppress(BlockingIOError):
+            data = self.link.recv(4096)
+            if not data:
+                raise ConnectionError("the receiver left")
+            self.asked += data
+        while len(self.asked) >= CONTROL.size:
+            magic, generation, rate = CONTROL.unpack_from(self.asked)
+            if magic != CONTROL_MAGIC or not 0.0 <= rate <= 10_000.0:
+                raise ImageFormatError("no control of a camera")
+            self.generation, self.rate = generation, rate
+            del self.asked[: CONTROL.size]
+
+    def write(self) -> None:
+        """Write as much as the socket takes."""
+        with contextlib.suppress(BlockingIOError):
+            while self.rest:
+                self.rest = self.rest[self.link.send(self.rest) :]
+
+
+class ImageServer:
+    """The camera's end of the wire, for the simulated camera. Nothing blocks: a slow receiver
+    misses images, no one waits."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Bind; port 0 takes a free one. Raises OSError when the address is taken, ValueError for
+        one that other hosts reach: images have neither secrecy nor authentication."""
+        if not is_loopback(host):
+            raise ValueError(
+                f'address "{host}:{port}" leaves this host, and images are not protected: '
+                "use 127.0.0.1"
+            )
+        self._listener = socket.create_server((host, port))
+        self._listener.setblocking(False)
+        self._receivers: list[_Receiver] = []
+        self._sequence = 0
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on."""
+        return int(self._listener.getsockname()[1])
+
+    @property
+    def rate(self) -> float:
+        """The highest rate (images/s) that a receiver wants, 0 when none wants any."""
+        return max((receiver.rate for receiver in self._receivers), default=0.0)
+
+    def poll(self) -> None:
+        """Take new receivers and controls, and go on writing. Call it often."""
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(ADMITTED):
+                link, _ = self._listener.accept()
+                if len(self._receivers) >= RECEIVERS:
+                    self._leave(
+                        next(
+                            (one for one in self._receivers if one.rate <= 0.0), self._receivers[0]
+                        )
+                    )
+                link.setblocking(False)
+                link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER)
+                self._receivers.append(_Receiver(link))
+        for receiver in list(self._receivers):
+            try:
+                receiver.listen()
+                receiver.write()
+            except (OSError, ImageFormatError):
+                self._leave(receiver)
+
+    def send(self, pixels: Pixels, age: float) -> None:
+        """Send an image, `age` s after mid-exposure, to all that want images and have taken the
+        last one whole."""
+        for receiver in list(self._receivers):
+            if receiver.rate <= 0.0 or receiver.rest:
+                continue
+            body = encode_image(WireImage(receiver.generation, self._sequence, age, pixels))
+            receiver.rest = memoryview(body)
+            try:
+                receiver.write()
+            except OSError:
+                self._leave(receiver)
+        self._sequence += 1
+
+    def close(self) -> None:
+        """Stop listening and leave all receivers."""
+        for receiver in list(self._receivers):
+            self._leave(receiver)
+        self._listener.close()
+
+    def _leave(self, receiver: _Receiver) -> None:
+        receiver.link.close()
+        self._receivers.remove(receiver)
+
+
+class MemoryImages:
+    """Images of a camera in the same process (lock step): whoever has the camera puts them in."""
+
+    def __init__(self, control: Callable[[float], None] = lambda rate: None) -> None:
+        """`control` is called with the wanted rate (images/s), 0 to stop."""
+        self._control = control
+        self._newest: Image | None = None
+        self._on = False
+
+    def start(self, rate: float) -> None:
+        """Send images at about this rate (1/s)."""
+        self._on, self._newest = True, None
+        self._control(rate)
+
+    def stop(self) -> None:
+        """Send no more images."""
+        self._on, self._newest = False, None
+        self._control(0.0)
+
+    def put(self, image: Image) -> None:
+        """Put in the newest image; dropped when images are not wanted."""
+        if self._on:
+            self._newest = image
+
+    def newest(self) -> Image | None:
+        """The newest image not taken yet, None if there is none."""
+        newest, self._newest = self._newest, None
+        return newest
+
+    def close(self) -> None:
+        """Let the camera go."""
+        self.stop()
+
+
+def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
+    """The source that a device's config names: `source = "sim"` (with `address = "host:port"`),
+    "capture:0" or "file:PATH".
+
+    Raises ValueError naming key and remedy.
+    """
+    source = str(config.get("source", ""))
+    kind, _, target = source.partition(":")
+    if source == "sim":
+        host, _, port = str(config.get("address", "")).rpartition(":")
+        if not host or not port.isdigit():
+            raise ValueError('source = "sim" needs address = "host:port" of the simulated camera')
+        return StreamImages(host, int(port), clock)
+    if kind == "capture" and target.isdigit():
+        return CaptureImages(int(target), clock, float(config.get("latency", 0.0)))
+    if kind == "file" and target:
+        return CaptureImages(target, clock)
+    raise ValueError(f'source = {source!r}: use "sim", "capture:NUMBER" or "file:PATH"')

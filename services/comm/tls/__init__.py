@@ -1,0 +1,1 @@
+"""Mutual TLS: certificates, their expiry, and the listening socket."""

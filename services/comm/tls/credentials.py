@@ -1,0 +1,157 @@
+"""What a party of the cell proves itself with: nothing on loopback, the shared key, or a
+certificate of its own (mutual TLS).
+
+`[keys]` in services.toml says which: `file = "cell.key"` names the shared key, `certificates =
+"keys"` a folder with the cell's `ca.pem` and, on each host, `NAME.pem` and `NAME.key` of the
+parties that run there. TLS 1.3 (RFC 8446) only, and both ends show a certificate. A client asks for
+the node by its name, so no node can stand in for another; a server lets a party speak under the
+name of its certificate alone, but for the coordinator's, under which all of the operator's tools
+speak.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ssl
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.protocol.security import KeyFileError, Keys, read_key, read_secret
+from petrobot.services.comm.tls.expiry import watch
+
+COORDINATOR: Final = "coordinator"
+"""The party whose certificate the coordinator and the operator's tools show."""
+CA_FILE: Final = "ca.pem"
+MADE_BY: Final = "`petrobot keys --tls`"
+RENEW: Final = "run {command} where the authority's key is, and copy {name}.pem and {name}.key here"
+RENEW_CA: Final = (
+    "make a new authority with `petrobot keys --tls` and the name of another folder, copy it "
+    "to every host and name it under "
+    "[keys] in services.toml"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """One party's. `key` is the shared key, or all that are accepted; `folder` that of the
+    certificates, `party` whose of them."""
+
+    party: str = ""
+    key: Keys | None = None
+    folder: Path | None = None
+    also: Path | None = None
+    """Folder of another authority whose certificates are accepted, too, while it is being
+    replaced."""
+
+    @property
+    def guarded(self) -> bool:
+        """Whether strangers are kept out, so that a socket may be open to other hosts."""
+        return self.key is not None or self.folder is not None
+
+    def server(self) -> ssl.SSLContext | None:
+        """TLS of a listening end; None without certificates. Raises KeyFileError."""
+        return self._context(ssl.PROTOCOL_TLS_SERVER)
+
+    def client(self) -> ssl.SSLContext | None:
+        """TLS of a connecting end; None without certificates. Raises KeyFileError."""
+        return self._context(ssl.PROTOCOL_TLS_CLIENT)
+
+    def stream_key(self, ticket: str) -> Keys | None:
+        """What seals a set-point stream: the shared key, else, with certificates, one made of the
+        ticket that crossed TLS.
+
+        So no TLS stands in the servo's cycle. A ticket is the receiving device's secret, a dot, and
+        the stream's own; both are drawn anew at each start of the receiver and told to nobody but
+        through an authenticated connection.
+        """
+        if self.key is not None or self.folder is None:
+            return self.key
+        secret = ticket.partition(".")[0].encode()
+        return hmac.digest(secret, b"petrobot set-point stream", hashlib.sha256) if secret else None
+
+    def tell_ends(self, now: datetime | None = None) -> None:
+        """Say on standard error, once in this process each, which of the certificates shown here
+        end soon or have ended."""
+        if self.folder is None:
+            return
+        now = now or datetime.now(UTC)
+        command = f"`petrobot keys --tls {self.folder.name}`"
+        watch(
+            self.folder / f"{self.party}.pem", now, RENEW.format(command=command, name=self.party)
+        )
+        watch(self.folder / CA_FILE, now, RENEW_CA)
+
+    def _context(self, side: ssl._SSLMethod) -> ssl.SSLContext | None:
+        if self.folder is None:
+            return None
+        certificate, key, ca = (
+            self.folder / name for name in (f"{self.party}.pem", f"{self.party}.key", CA_FILE)
+        )
+        try:
+            read_secret(key)
+        except OSError as fault:
+            raise KeyFileError(
+                f"{key}: {fault.strerror}; make it with {MADE_BY} and copy it here from "
+                "where that was run"
+            ) from None
+        context = ssl.SSLContext(side)
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.verify_mode = ssl.CERT_REQUIRED
+        try:
+            context.load_verify_locations(ca)
+            if self.also is not None:
+                context.load_verify_locations(self.also / CA_FILE)
+            context.load_cert_chain(certificate, key)
+        except (OSError, ssl.SSLError) as fault:
+            reason = (
+                getattr(fault, "strerror", "")
+                or getattr(fault, "reason", "")
+                or type(fault).__name__
+            )
+            text = f"{self.folder}: no certificate of {self.party} can be used ({reason})"
+            raise KeyFileError(
+                f"{text}; make them with {MADE_BY} and copy {self.party}'s files here"
+            ) from None
+        self.tell_ends()
+        return context
+
+
+def credentials(directory: Directory, party: str) -> Credentials:
+    """The credentials of a node or of the coordinator. Raises KeyFileError when what services.toml
+    names cannot be used."""
+    keys = directory.keys
+    if "certificates" not in keys:
+        return Credentials(party, shared_keys(directory))
+    also = directory.file(keys["also"]) if "also" in keys else None
+    return Credentials(party, None, directory.file(keys["certificates"]), also)
+
+
+def shared_keys(directory: Directory) -> Keys | None:
+    """The shared key that services.toml names, with the one that it names as accepted beside it.
+    Raises KeyFileError."""
+    keys = directory.keys
+    if "file" not in keys:
+        return None
+    key = read_key(directory.file(keys["file"]))
+    return (key, read_key(directory.file(keys["also"]))) if "also" in keys else key
+
+
+def name_on(certificate: dict[str, Any] | None) -> str:
+    """The common name on a certificate as `ssl.SSLSocket.getpeercert` gives it; empty if there is
+    none."""
+    for part in (certificate or {}).get("subject", ()):
+        for field, value in part:
+            if field == "commonName":
+                return str(value)
+    return ""
+
+
+def may_speak_as(certified: str, role: str, name: str) -> bool:
+    """Whether the owner of a certificate may introduce itself with this role and name."""
+    if certified == COORDINATOR:
+        return role in ("coordinator", "client")
+    return bool(certified) and role in ("node", "stream") and name == certified

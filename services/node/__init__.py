@@ -1,0 +1,1 @@
+"""A node: the server process of one host, which offers actions and services."""

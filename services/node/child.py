@@ -1,0 +1,206 @@
+"""One child process of a node and the pipe to it, in the node's asyncio loop.
+
+Its end is that of the process, never that of the pipe: what user code has left running may hold the
+pipe open, or close it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
+from petrobot.services.worker.keeper import KILL_ORDER
+from petrobot.services.worker.pipe import Counter, counter_memory, pipe_pair
+from petrobot.services.worker.process import BORN, Setup
+
+NONE = -1
+LEAVE_LIMIT = 4.0
+"""Seconds that a process has to end in good order."""
+PIPE_LIMIT = 0.5
+"""Seconds after the end of its pipe when a process is killed: the node can neither order nor hear
+anything any more."""
+KEEPER_LIMIT = 3.0
+"""Seconds that a keeper has to carry out the order to kill; then it is killed itself, and its
+worker by the kernel."""
+
+
+class Child:
+    """A running process of `services.worker` under its keeper. `heard(child, items)` receives each
+    list that it sends; `ended(child)` is called once, when neither it nor anything that it has
+    started runs any more."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        heard: Callable[[Child, list[Any]], None],
+        ended: Callable[[Child], None],
+        link: socket.socket | None = None,
+    ) -> None:
+        """Start it; `link` is the worker's end of the link to its device, closed here. Raises
+        OSError when that fails."""
+        self._heard = heard
+        self._ended = ended
+        self._loop = asyncio.get_running_loop()
+        self.pipe, pipe_end = pipe_pair()
+        self._descriptors, descriptors_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        passed = [pipe_end, descriptors_end, *([link] if link else [])]
+        memory = counter_memory()
+        numbers = [
+            pipe_end.fileno(),
+            descriptors_end.fileno(),
+            link.fileno() if link else NONE,
+            memory,
+        ]
+        # Only what owns a device has something to do after the node's end: its stop routine.
+        patience = int(STOP_ROUTINE) if setup.device and link is None else 0
+        try:
+            self.process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "petrobot.services.worker.keeper",
+                    *map(str, (os.getpid(), patience, *numbers)),
+                ],
+                pass_fds=[number for number in numbers if number != NONE],
+                stdin=subprocess.DEVNULL,
+                # a Ctrl-C in the node's terminal is for the node: it ends its children in order
+                start_new_session=True,
+            )
+        except OSError:
+            self.pipe.close()
+            self._descriptors.close()
+            os.close(memory)
+            raise
+        finally:
+            for end in passed:
+                end.close()
+        self._begun = Counter(memory)
+        self._worker = 0
+        self._killed = ""
+        self._let_go = False
+        self._limits: list[asyncio.TimerHandle] = []
+        self.pipe.post([dict(setup.items())])
+        self._loop.add_reader(self.pipe.socket, self._read)
+        self._watch = self._loop.create_task(self._wait_for_end())
+
+    @property
+    def pid(self) -> int:
+        """Process id of the worker; until it has said so, that of its keeper."""
+        return self._worker or self.process.pid
+
+    @property
+    def closed(self) -> bool:
+        """Whether it can be ordered nothing any more: its pipe has ended."""
+        return self.pipe.closed
+
+    @property
+    def begun(self) -> int:
+        """How many of the runs that it was given it has begun. What it has not begun when it dies
+        was not executed."""
+        return self._begun.value
+
+    @property
+    def code(self) -> int | None:
+        """Its exit code, minus the number of the signal that ended it, None while it runs."""
+        return self.process.poll()
+
+    def post(self, items: list[Any]) -> None:
+        """Send it a list; what does not fit now is sent when it reads."""
+        self.pipe.post(items)
+        if self.pipe.unsent and not self.pipe.closed:
+            self._loop.add_writer(self.pipe.socket, self._flush)
+
+    def _flush(self) -> None:
+        self.pipe.flush()
+        if not self.pipe.unsent or self.pipe.closed:
+            self._loop.remove_writer(self.pipe.socket)
+
+    def pass_link(self, end: socket.socket, word: str) -> None:
+        """Pass it an end of a socket, and tell it so; the end is closed here."""
+        with contextlib.suppress(OSError):
+            socket.send_fds(self._descriptors, [b"."], [end.fileno()])
+        end.close()
+        self.post([word])
+
+    def kill(self, why: str = "") -> None:
+        """End it at once, and all that it has started."""
+        if self.process.poll() is None:
+            self._killed = self._killed or why
+            self.process.send_signal(KILL_ORDER)
+            self._limit(KEEPER_LIMIT, self.process.kill)
+
+    def leave(self) -> None:
+        """Let it end in good order: its pipe closes, so that it stops its device and leaves. Killed
+        after `LEAVE_LIMIT`."""
+        if not self._let_go:
+            self._close_pipe()
+            self._limit(LEAVE_LIMIT, self.kill)
+
+    async def wait(self) -> None:
+        """Wait until it has ended."""
+        await self._watch
+
+    def describe(self) -> str:
+        """How it ended, for people."""
+        code = self.process.poll()
+        if code is None or (self._killed and code == -signal.SIGKILL):
+            return self._killed or "it closed its pipe"
+        # Else it had ended by itself before the order to kill it came.
+        if code >= 0:
+            return f"it exited with code {code}"
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+        return f"it was ended by {name}"
+
+    def _limit(self, seconds: float, act: Callable[[], None]) -> None:
+        self._limits.append(self._loop.call_later(seconds, act))
+
+    def _read(self) -> None:
+        try:
+            received = self.pipe.read()
+        except ValueError:
+            received = []
+            self._close_pipe()
+            self.kill("it wrote into its pipe what is no record, and was killed")
+        for items in received:
+            if items and items[0] == BORN:
+                self._worker = items[1]
+            else:
+                self._heard(self, items)
+        if self.pipe.closed and not self._let_go:
+            self._close_pipe()
+            self._limit(PIPE_LIMIT, lambda: self.kill("it closed its pipe, and was killed"))
+
+    async def _wait_for_end(self) -> None:
+        await until_ended(self.process.pid)
+        self.process.wait()
+        for limit in self._limits:
+            limit.cancel()
+        if not self._let_go:
+            self._read()  # its last words
+            self._close_pipe()
+        for limit in self._limits:
+            limit.cancel()
+        if self._worker:
+            # It has ended before its keeper, unless that was killed: then it ends now, as the
+            # kernel sees to.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LEAVE_LIMIT):
+                    await until_ended(self._worker)
+        self._descriptors.close()
+        self._ended(self)
+        self._begun.close()
+
+    def _close_pipe(self) -> None:
+        if not self._let_go:
+            self._let_go = True
+            self._loop.remove_reader(self.pipe.socket)
+            self._loop.remove_writer(self.pipe.socket)
+            self.pipe.close()

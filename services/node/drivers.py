@@ -1,0 +1,48 @@
+"""Makes the driver of a device from services.toml; whatever it does not like is one fault that
+names the device."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+from petrobot.services.comm.location_file import DeviceEntry, Directory, DirectoryError, resolve
+from petrobot.services.device import Driver, Ports
+from petrobot.services.worker.callables import describe
+
+_log = logging.getLogger(__name__)
+
+
+def make_driver(directory: Directory, device: DeviceEntry, ports: Ports) -> Driver:
+    """The device's driver, `Class(config, ports)`. Raises DirectoryError naming the device, its
+    driver and what was wrong."""
+    here = f"{directory.source}: devices.{device.name}"
+    try:
+        driver: Driver = resolve(device.driver)(device.config, ports)
+    except ImportError as fault:
+        raise DirectoryError((f"{here}.driver: {fault}",)) from fault
+    except (KeyError, TypeError, ValueError, OSError) as fault:
+        told = f"is missing {fault}" if isinstance(fault, KeyError) else str(fault)
+        raise DirectoryError(
+            (f"{here}: {device.driver} refuses it: {told}; mend the keys of this table",)
+        ) from fault
+    except Exception as fault:  # not what a constructor says of bad keys, but a fault of its code
+        _log.exception("device %s: its driver cannot be made", device.name)
+        raise DirectoryError(
+            (f"{here}: {device.driver} failed: {describe(fault)}; mend the driver",)
+        ) from fault
+    missing = [
+        m
+        for m in ("period", "state", "stop", "stopped", "hold", "release", "close")
+        if not hasattr(driver, m)
+    ]
+    if missing:
+        text = (
+            f"{device.driver} is no driver: it has no {', '.join(missing)}; see services/device.py"
+        )
+        raise DirectoryError((f"{here}.driver: {text}",))
+    period = driver.period
+    if period is not None and not (isinstance(period, int | float) and 0.0 <= period < math.inf):
+        text = f"{device.driver}.period: expected seconds or None, found {period!r:.40}"
+        raise DirectoryError((f"{here}.driver: {text}",))
+    return driver

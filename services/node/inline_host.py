@@ -1,0 +1,267 @@
+"""Where the runs of one device (or of none) take place; inline: the device's driver and its actions
+in the node itself."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+from petrobot.services.action import Status
+from petrobot.services.comm.location_file import ActionEntry
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
+from petrobot.services.worker.callables import describe
+from petrobot.services.worker.remote import (
+    BARRED,
+    CLEAR_EMERGENCY,
+    EMERGENCY_STOP,
+    CyclicDriver,
+    DeviceCommand,
+    DirectDevice,
+    RemoteDriver,
+)
+from petrobot.services.worker.runner import DeviceControl, Runner
+from petrobot.services.worker.runs import Begin, Ended, Hold, Order, Report, Stop, Told
+
+_log = logging.getLogger(__name__)
+
+SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
+
+
+class Place(Protocol):
+    """Runs of one device, or of all actions that need none. Orders in, reports out, nothing
+    blocks."""
+
+    @property
+    def idle(self) -> bool:
+        """Whether `advance` would do nothing and `reports` say nothing until an order or a command
+        comes."""
+
+    def take(self, now: float, order: Order) -> None:
+        """Take an order about a run."""
+
+    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+        """Carry out an operator's `hold`, `release`, `stop`, `emergency_stop`, `clear_emergency`,
+        `status` or `picture`; a report `Told` with this id answers it."""
+
+    def advance(self, now: float) -> None:
+        """Do all that is due."""
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s)."""
+
+    def reports(self) -> list[Report]:
+        """What happened since the last call, in order."""
+
+    def close(self, now: float) -> None:
+        """Stop everything and let the device go."""
+
+
+class InlinePlace:
+    """A place whose actions run in this process: in lock step, in a worker, and for services of the
+    node's loop.
+
+    Its device is a `driver` of this process, or one elsewhere at the end of a `remote`, or none.
+    """
+
+    def __init__(
+        self,
+        actions: Mapping[str, ActionEntry],
+        *,
+        clock: Callable[[], float],
+        driver: Driver | None = None,
+        remote: DeviceControl | None = None,
+        streams: Mapping[str, float] | None = None,
+        substitutes: Mapping[str, Callable[..., Any]] | None = None,
+        virtual: bool = False,
+    ) -> None:
+        self._actions = actions
+        self._driver = driver
+        self._cyclic = CyclicDriver(driver) if driver is not None and driver.period else None
+        self._remote = RemoteDriver(self._post, clock)
+        self._outside = remote if isinstance(remote, RemoteDriver) else None
+        self.failed = ""
+        """Why the driver works no more: what it raised, and where. Its runs have ended, and no
+        other begins."""
+        if self._cyclic is not None:
+            self._remote.expect(self._cyclic.state)
+        self._commands: list[DeviceCommand] = []
+        self._next_step: float | None = None
+        self._told: list[Report] = []
+        self._runner = Runner(
+            actions,
+            clock=clock,
+            device=remote or self._control(),
+            streams=streams,
+            substitutes=substitutes,
+            virtual=virtual,
+            fenced=remote is not None,
+        )
+
+    def _control(self) -> DeviceControl | None:
+        if self._driver is None:
+            return None
+        return self._remote if self._cyclic is not None else DirectDevice(self._driver)
+
+    def _post(self, command: DeviceCommand) -> None:
+        self._commands.append(command)
+
+    def warm(self) -> None:
+        """Import all actions now, so that no call waits for it. One that fails says so when it is
+        called."""
+        for action in self._actions:
+            with contextlib.suppress(ImportError):
+                self._runner.load(action)
+
+    def take(self, now: float, order: Order) -> None:
+        """Take an order about a run."""
+        if self.failed and isinstance(order, Begin):
+            text = f"its device does not work: {self.failed}"
+            self._told.append(Ended(order.id, Status.ERROR, {}, "not_ready", text, Executed.NO))
+            return
+        held = self._runner.held and bool(self._runner.runs)
+        self._runner.take(now, order)
+        if held and not self._runner.runs:
+            self._carry_out(now, "release")  # what was held was stopped before it began
+
+    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+        """Carry out an operator's command at once."""
+        if not self.failed:
+            try:
+                self._told.append(Told(id, *self._carry_out(now, verb)))
+                return
+            except Exception as fault:
+                self._fail(now, fault)
+        self._told.append(Told(id, "not ready", {"text": self.failed}))
+
+    def bar(self, now: float, cause: str) -> None:
+        """Stop the device and its runs without an order: nobody may be able to give one."""
+        for run in self._runner.runs:
+            self._runner.take(now, Stop(run, cause, BARRED[cause]))
+        try:
+            self._stop_driver(now, cause)
+        except Exception as fault:
+            self._fail(now, fault)
+
+    def _fail(self, now: float, fault: Exception) -> None:
+        """The driver has raised what it must not: its runs end, and it is stopped as far as it
+        still can be."""
+        self.failed = f"its driver failed: {describe(fault)}"
+        _log.error("the driver of a device failed", exc_info=fault)
+        driver, self._driver, self._cyclic = self._driver, None, None
+        self._told += self._runner.reports()
+        self._told += self._runner.give_up_all(now, "device_died", self.failed)
+        if driver is not None:
+            with contextlib.suppress(Exception):
+                stop_at_once(driver, now)
+
+    def _carry_out(self, now: float, verb: str) -> tuple[str, Mapping[str, Any]]:
+        driver = self._driver
+        if verb == "hold":
+            answer = driver.hold(now) if driver else "held"
+            if answer != "cannot hold":
+                self._runner.take(now, Hold(True))
+            return answer, {}
+        if verb == "release":
+            if driver:
+                driver.release(now)
+            self._runner.take(now, Hold(False))
+            return "released", {}
+        if verb in ("stop", EMERGENCY_STOP):
+            for run in self._runner.runs:
+                self.take(now, Stop(run, "stopped" if verb == "stop" else verb, "by command"))
+            self._stop_driver(now, verb)
+            return "stopped" if driver is None or driver.stopped() else "stopping", {}
+        if verb == CLEAR_EMERGENCY:
+            if self._cyclic:
+                self._cyclic.clear_emergency()
+            return "cleared", {}
+        if verb == PICTURE:
+            return PICTURE, picture_of(driver)
+        data = {"runs": list(self._runner.runs), "fenced": self._runner.fenced}
+        data["state"] = plain(driver.state(), "state") if driver else {}
+        if self._cyclic:
+            data["refused"] = self._cyclic.refused
+        return "up", data
+
+    def _stop_driver(self, now: float, verb: str) -> None:
+        if self._cyclic is not None and verb == EMERGENCY_STOP:
+            self._cyclic.emergency_stop(now)
+        elif self._driver is not None and verb == EMERGENCY_STOP:
+            stop_at_once(self._driver, now)
+        elif self._driver is not None:
+            self._driver.stop(now)
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Ids of the runs that have not ended."""
+        return self._runner.runs
+
+    @property
+    def polling(self) -> bool:
+        """Whether a run waits for more than time, so that `advance` must be called often."""
+        return self._runner.polling
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is neither a run nor a cyclic driver, nor anything to report."""
+        return self._cyclic is None and not self._told and self._runner.idle
+
+    def advance(self, now: float) -> None:
+        """Runs first, then as many cycles of the driver as are due."""
+        if self.failed:
+            return
+        try:
+            self._advance(now)
+        except (
+            Exception
+        ) as fault:  # code of actions is guarded where it is called: this was the driver's
+            self._fail(now, fault)
+
+    def _advance(self, now: float) -> None:
+        if self._outside is not None and (barred := self._outside.barred):
+            for run in self._runner.runs:
+                self._runner.take(now, Stop(run, barred, BARRED[barred]))
+        held = self._runner.held and bool(self._runner.runs)
+        self._runner.advance(now)
+        if held and not self._runner.runs:
+            self._carry_out(now, "release")  # what was held is over
+        if self._cyclic is None or self._driver is None or not self._driver.period:
+            return
+        due = now if self._next_step is None else self._next_step
+        while due <= now + SLACK:
+            commands, self._commands = self._commands, []
+            for command in commands:
+                self._cyclic.take(now, command)
+            self._driver.step(now)
+            self._remote.expect(self._cyclic.state)
+            due += self._driver.period
+        self._next_step = due
+        self._runner.commands_taken(now)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s)."""
+        if self.failed:
+            return None
+        times = (self._runner.due(), self._next_step)
+        return min((t for t in times if t is not None), default=None)
+
+    def reports(self) -> list[Report]:
+        """What happened since the last call, in order."""
+        reports = self._runner.reports()
+        if self._told:
+            reports += self._told
+            self._told = []
+        return reports
+
+    def close(self, now: float) -> None:
+        """Stop routine, then let the device go."""
+        if self._driver is not None:
+            try:
+                self._driver.stop(now)
+                self._driver.close()
+            except Exception:
+                _log.exception("a driver failed while it was let go")

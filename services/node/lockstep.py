@@ -1,0 +1,367 @@
+"""A node as a party of a lock-step cell: drivers and actions inline, the outside world through
+envelopes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.location_file import DeviceEntry, Directory
+from petrobot.services.comm.lockstep.cell import CellError
+from petrobot.services.comm.lockstep.channels import (
+    can_body,
+    images_wanted,
+    read_can,
+    read_image,
+    read_set_point,
+    set_point_body,
+)
+from petrobot.services.comm.lockstep.party import Envelope
+from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Call,
+    Event,
+    Feedback,
+    Hello,
+    Message,
+    Outcome,
+    Pong,
+    Refuse,
+    Welcome,
+)
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.comm.streams.camera import MemoryImages, open_images
+from petrobot.services.comm.streams.image import ImageSource
+from petrobot.services.node.drivers import make_driver
+from petrobot.services.node.inline_host import InlinePlace, Place
+from petrobot.services.node.node import GENERAL, Node
+from petrobot.services.node.watchdog import Watchdog
+from petrobot.services.worker.callables import describe
+from petrobot.services.worker.context import checked
+from petrobot.services.worker.execution import Hung
+from petrobot.services.worker.setpoints import SetpointReceiver
+
+# What a driver may reach in a lock-step cell: bus, images and streams in memory, on the other side envelopes.
+
+
+class MemoryCan:
+    """A port on the laboratory's bus: frames out are collected, frames in are put in."""
+
+    def __init__(self) -> None:
+        self.out: list[Frame] = []
+        self.arrived: list[Frame] = []
+        self._closed = False
+
+    def send(self, frame: Frame) -> None:
+        """Put a frame on the bus. Raises ConnectionError when the port is closed."""
+        if self._closed:
+            self._check()
+        self.out.append(frame)
+
+    def receive(self) -> Sequence[Frame]:
+        """All frames that arrived since the last call, oldest first."""
+        self._check()
+        arrived, self.arrived = self.arrived, []
+        return arrived
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._closed = True
+
+    def _check(self) -> None:
+        if self._closed:
+            raise ConnectionError("this port has left the bus")
+
+
+class LockstepPorts:
+    """Implements `services.device.Ports` for one device; `post` takes what goes out to the
+    laboratory."""
+
+    def __init__(
+        self,
+        directory: Directory,
+        device: DeviceEntry,
+        clock: Callable[[], float],
+        post: Callable[[Envelope], None],
+    ) -> None:
+        self._directory = directory
+        self._device = device
+        self._clock = clock
+        self._post = post
+        self._can: MemoryCan | None = None
+        self._images: MemoryImages | None = None
+        self._wish = 0
+        self._streams: dict[str, SetpointReceiver] = {}
+        self._raised: list[tuple[str, Mapping[str, Any]]] = []
+        self._lives_at = ""
+
+    @property
+    def now(self) -> float:
+        """The cell's clock (s)."""
+        return self._clock()
+
+    def can(self) -> MemoryCan:
+        """The laboratory's CAN bus."""
+        if self._can is None:
+            self._laboratory()
+            self._can = MemoryCan()
+        return self._can
+
+    def images(self) -> ImageSource:
+        """The laboratory's camera when the device says `source = "sim"`, else what it names (a
+        file)."""
+        if self._device.config.get("source") != "sim":
+            return open_images(self._device.config, self._clock)
+        if self._images is None:
+            self._laboratory()
+            self._images = MemoryImages(self._want_images)
+        return self._images
+
+    def stream(self, name: str) -> SetpointReceiver:
+        """The receiving end of a stream that services.toml leads to this device. Raises ValueError
+        for any other."""
+        entry = self._directory.streams.get(name)
+        if entry is None or entry.to != self._device.name:
+            raise ValueError(
+                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
+            )
+        return self._streams.setdefault(name, SetpointReceiver(entry.period, self._clock))
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise an external event."""
+        raised = plain(name, "name"), plain(data, "data")
+        checked(Event(raised[0], self._device.name, 1, raised[1]))
+        self._raised.append(raised)
+
+    def file(self, path: str) -> bytes:
+        """A file named in services.toml, relative to it."""
+        return self._directory.file(path).read_bytes()
+
+    def receive(self, envelope: Envelope) -> None:
+        """Take what the laboratory or a stream sends to this device."""
+        if envelope.channel == "can" and self._can is not None:
+            self._can.arrived += read_can(envelope.body)
+        elif envelope.channel == "image" and self._images is not None:
+            image, wish = read_image(envelope.body, self.now)
+            if wish == self._wish:
+                self._images.put(image)
+        elif envelope.channel == "stream":
+            point = read_set_point(envelope.body)
+            if point.stream in self._streams:
+                self._streams[point.stream].take(point.values, point.held)
+
+    def flush(self) -> None:
+        """Send the frames of this tick."""
+        if self._can is not None and self._can.out:
+            self._send("can", can_body(self._can.out))
+            self._can.out.clear()
+
+    def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """Events raised since the last call, in order."""
+        if not self._raised:
+            return []
+        raised, self._raised = self._raised, []
+        return raised
+
+    def _want_images(self, rate: float) -> None:
+        self._wish += 1
+        self._send("control", images_wanted(rate, self._wish))
+
+    def _send(self, channel: str, body: Any) -> None:
+        laboratory = self._laboratory()
+        self._post(Envelope(laboratory, self._device.name, laboratory, channel, body))
+
+    def _laboratory(self) -> str:
+        if not self._lives_at:
+            self._lives_at = self._directory.laboratory()
+        if not self._lives_at:
+            raise ValueError(
+                'lock step needs a simulated node; write sim = "module:function" in one '
+                "[nodes.NAME]"
+            )
+        return self._lives_at
+
+
+Substitutes = Mapping[str, Callable[..., Any]]
+_ANSWERS = (Welcome, Refuse, Accept, Feedback, Outcome, Event, Answer, Pong)
+"""Messages that a called end sends."""
+
+
+class LockstepNode:
+    """Implements `services.comm.party.Party` for one node of services.toml. Raises DirectoryError
+    when a driver refuses.
+
+    Endpoints send under their own names (action, device, service, timer), whatever node they live
+    on, and a call to one's own node takes the same way as any other: so moving an action to another
+    node changes nothing.
+    """
+
+    def __init__(
+        self, directory: Directory, name: str, *, substitutes: Substitutes | None = None
+    ) -> None:
+        self.name = name
+        self._directory = directory
+        self._substitutes = substitutes
+        self._watchdog = Watchdog(name)
+        self._now = 0.0
+        self._out: list[Envelope] = []
+        self._ports: dict[str, LockstepPorts] = {}
+        self._heard = True
+        """Whether a message has come since the last tick."""
+        self._parties: dict[str, str] = {}
+        """By endpoint, as far as it was asked: the party that it lives in."""
+        self._ends: dict[str, tuple[str, str]] = {}
+        """By call id: the endpoint that calls, and the one that is called."""
+        devices = [d for d in directory.devices.values() if d.node == name]
+        places: dict[str, Place] = {d.name: self._place(d.name) for d in devices}
+        places[GENERAL] = self._place(GENERAL)
+        boot = f"{name} in lock step"
+        self.node = Node(directory, name, boot=boot, clock=self._clock, places=places, virtual=True)
+        for peer in sorted(directory.nodes):
+            self.node.caller(peer).open(0.0)
+
+    def _clock(self) -> float:
+        return self._now
+
+    def _place(self, device: str) -> Place:
+        directory, driver = self._directory, None
+        if device != GENERAL:
+            entry = directory.devices[device]
+            ports = self._ports[device] = LockstepPorts(
+                directory, entry, self._clock, self._out.append
+            )
+            driver = make_driver(directory, entry, ports)
+        return InlinePlace(
+            {
+                a.name: a
+                for a in directory.actions.values()
+                if a.node == self.name and a.device == device
+            },
+            clock=self._clock,
+            driver=driver,
+            streams={s.name: s.period for s in directory.streams.values()},
+            substitutes=self._substitutes,
+            virtual=True,
+        )
+
+    # --- party --------------------------------------------------------------------------------
+
+    def receive(self, now: float, envelope: Envelope) -> None:
+        """Take an envelope that is due. Raises CellError when code that is called hangs."""
+        self._guarded(lambda: self._receive(now, envelope))
+
+    def _receive(self, now: float, envelope: Envelope) -> None:
+        self._now = now
+        if envelope.channel == "call":
+            self._heard = True
+            self._receive_message(now, envelope, envelope.body)
+        elif envelope.target in self._ports:
+            self._ports[envelope.target].receive(envelope)
+
+    def advance(self, now: float) -> None:
+        """Do all that is due. Raises CellError when code that is called hangs."""
+        self._guarded(lambda: self._advance(now))
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        self._watchdog.begin()
+        try:
+            step()
+        except Hung as fault:  # not in an action, or its run would have ended with it
+            raise CellError(f"node {self.name}: {describe(fault)}") from fault
+        finally:
+            self._watchdog.end()
+
+    def _advance(self, now: float) -> None:
+        self._now = now
+        news = self._advance_node(now)
+        for device, ports in self._ports.items():
+            ports.flush()
+            for name, data in ports.raised():
+                self.node.callee.raise_event(now, name, data, source=device, latched=True)
+                news = True
+        if news:
+            self._send_set_points()
+            self._send_messages(now)
+
+    def _advance_node(self, now: float) -> bool:
+        """Let the node do all that is due; says whether anything may have come of it. In most ticks
+        no message has come, and the ends of calls need not be looked at."""
+        node = self.node
+        if self._heard or not node.ends_quiet(now):
+            self._heard = False
+            node.advance(now)
+            return True
+        news = node.advance_places(now)
+        if news:
+            node.settle(now)
+        return news
+
+    def _send_set_points(self) -> None:
+        for action, sent in self.node.sent:
+            stream = self._directory.streams[sent.stream]
+            body = set_point_body(sent.stream, sent.values, sent.elapsed, stream.period)
+            self._out.append(
+                Envelope(self._directory.where(sent.stream), action, stream.to, "stream", body)
+            )
+        self.node.sent.clear()
+
+    def drain(self) -> Sequence[Envelope]:
+        """What was sent since the last call, in order."""
+        if not self._out:
+            return ()
+        out = self._out[:]
+        self._out.clear()
+        return out
+
+    def close(self) -> None:
+        """Let the devices go."""
+        self._watchdog.close()
+        self.node.close(self._now)
+
+    # --- messages -----------------------------------------------------------------------------
+
+    def _receive_message(self, now: float, envelope: Envelope, message: Message) -> None:
+        peer = self._parties.get(envelope.source)
+        if peer is None:
+            peer = self._parties[envelope.source] = self._directory.party(envelope.source)
+        if isinstance(message, _ANSWERS):
+            self.node.caller(peer).receive(now, message)
+        elif isinstance(message, Hello):
+            local = self._directory.same_host(self.name, peer)
+            self._post(
+                peer, self.name, peer, self.node.callee.link_up(now, peer, message, local=local)
+            )
+        else:
+            if isinstance(message, Call):
+                self._ends[message.id] = (envelope.source, message.service)
+            self.node.callee.receive(now, peer, message)
+
+    def _send_messages(self, now: float) -> None:
+        for peer, message in self.node.callee.messages():
+            source, target = self._answering_ends(peer, message)
+            self._post(peer, source, target, message)
+        for peer, caller in self.node.callers.items():
+            for message in caller.messages(now):
+                source, target = self._calling_ends(peer, message)
+                self._post(peer, source, target, message)
+
+    def _answering_ends(self, peer: str, message: Message) -> tuple[str, str]:
+        if isinstance(message, Event):
+            return message.source, peer
+        if isinstance(message, Outcome) and message.id in self._ends:
+            target, source = self._ends.pop(message.id)
+            return source, target
+        if isinstance(message, Accept | Feedback) and message.id in self._ends:
+            target, source = self._ends[message.id]
+            return source, target
+        return self.name, peer
+
+    def _calling_ends(self, peer: str, message: Message) -> tuple[str, str]:
+        if isinstance(message, Call):
+            return self.node.action_of(message.parent), message.service
+        return self.name, peer
+
+    def _post(self, party: str, source: str, target: str, message: Message) -> None:
+        self._out.append(Envelope(party, source, target, "call", message))

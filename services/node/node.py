@@ -1,0 +1,565 @@
+"""A node as one machine for lock step and real time: its offers, the places of its runs, its
+memory, timers and calls."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from petrobot.services.action import Status
+from petrobot.services.comm.calls.callee import (
+    Callee,
+    CancelRun,
+    Commanded,
+    Inline,
+    Offer,
+    Order,
+    StartRun,
+)
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.latch import Latch
+from petrobot.services.comm.calls.notices import Ended as CallEnded
+from petrobot.services.comm.calls.notices import Notice
+from petrobot.services.comm.calls.peers import COORDINATOR, NODE
+from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.services.comm.location_file import (
+    MEMORY,
+    MEMORY_CALLS,
+    ActionEntry,
+    Directory,
+    DirectoryError,
+    ServiceEntry,
+    resolve,
+)
+from petrobot.services.comm.protocol.messages import Call, Executed, Hello, Outcome
+from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
+from petrobot.services.device import PICTURE
+from petrobot.services.node.emergency_stops import NEVER, EmergencyStops
+from petrobot.services.node.inline_host import InlinePlace, Place
+from petrobot.services.node.memory import Memory, event_name
+from petrobot.services.worker.callables import check_arguments, describe, from_outside
+from petrobot.services.worker.context import RunContext, checked_result
+from petrobot.services.worker.execution import Hung
+from petrobot.services.worker.outlets import Outlets
+from petrobot.services.worker.remote import CLEAR_EMERGENCY, EMERGENCY_STOP, IN_EMERGENCY
+from petrobot.services.worker.runs import (
+    Answered,
+    Asked,
+    Begin,
+    Dropped,
+    Ended,
+    Judged,
+    Progressed,
+    Raised,
+    Report,
+    Sent,
+    Stop,
+    Told,
+)
+
+# Timers of a node: external pulse events on an absolute grid.
+
+SLACK = 1e-6  # s: binary fractions of a period must not cost a whole tick
+
+
+class Timers:
+    """A machine: `advance(now)` gives the names whose time has come. Who listens is the event
+    board's business.
+
+    Pulses lie on the grid start + k * period, where start is the moment of the first advance: so
+    they do not drift, and neither listening nor load moves them. Pulses missed while the process
+    stood still are left out, not made up for.
+    """
+
+    def __init__(self, periods: Mapping[str, float]) -> None:
+        self._periods = dict(periods)
+        self._next: dict[str, float] = {}
+
+    def advance(self, now: float) -> list[str]:
+        """Names whose pulse is due, in the order of services.toml."""
+        fired = []
+        for name, period in self._periods.items():
+            due = self._next.setdefault(name, now + period)
+            if now + SLACK < due:
+                continue
+            self._next[name] = due + period * (1 + math.floor((now + SLACK - due) / period))
+            fired.append(name)
+        return fired
+
+    def due(self) -> float | None:
+        """When the next pulse comes (s), None without timers."""
+        return min(self._next.values(), default=None)
+
+
+# A general-purpose service written as a plain function, answered on the spot in the node's loop.
+
+EventSink = Callable[[str, str, Mapping[str, Any]], None]
+"""Takes (service, event, data) of an event that a service raises."""
+VerdictSink = Callable[[str, Judged], None]
+"""Takes (service, verdict) of a verdict that a service gives on an earlier run."""
+
+
+def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink) -> Inline:
+    """The callee's end of such a service. Raises ImportError when its function cannot be loaded.
+
+    The function takes a context and keyword arguments like an action; of its context it may use
+    what does not wait.
+    """
+    function = resolve(service.run)
+
+    def report(told: Report) -> None:
+        if isinstance(told, Raised):
+            raised(service.name, told.name, told.data)
+        elif isinstance(told, Judged):
+            judged(service.name, told)
+
+    def answer(now: float, call: Call) -> Outcome:
+        context = RunContext(
+            Begin(call.id, service.name, call.arguments), None, lambda: now, Outlets({}), report
+        )
+        try:
+            check_arguments(function, call.arguments)
+        except TypeError as fault:
+            return Outcome(
+                call.id, Status.ERROR, {}, "bad_arguments", f"{service.name}: {fault}", Executed.NO
+            )
+        before = time.process_time()
+        try:
+            result = function(context, **call.arguments)
+        except (
+            BaseException
+        ) as fault:  # a service may raise SystemExit or its like: that must not end the node
+            if from_outside(fault):
+                raise
+            return Outcome(
+                call.id,
+                Status.ERROR,
+                {},
+                "hung" if isinstance(fault, Hung) else "exception",
+                describe(fault),
+            )
+        try:
+            result = checked_result(call.id, result, "values")
+        except ValueError as fault:
+            return Outcome(
+                call.id, Status.ERROR, {}, "bad_result", f"what it returned cannot be sent: {fault}"
+            )
+        cpu = time.process_time() - before
+        return Outcome(
+            call.id, result.status, result.values, result.cause, result.text, cpu_seconds=cpu
+        )
+
+    return answer
+
+
+GENERAL = ""
+"""Key of the place of actions that need no device."""
+LOOP = "*"
+"""Key of the place of services that wait, in the node's own loop."""
+STREAM_PREFIX = "stream:"
+SENDERS = frozenset((COORDINATOR, NODE))
+"""Roles that may ask for the ticket of a stream: an action of a node sends set points, a
+coordinator may order anything."""
+"""Name of a stream's address service: this and the stream's name."""
+ANSWER_WITHIN = 1.0
+"""Seconds that the devices have to answer an operator's command."""
+VERBS = frozenset({"hold", "release", "stop", "status", PICTURE, EMERGENCY_STOP, CLEAR_EMERGENCY})
+"""What a COMMAND may order."""
+_OWN_CAUSES = ("deadline", "orphan", EMERGENCY_STOP)
+_WELL_HELD = ("held", "stopped")
+
+
+@dataclass
+class _Commanded:
+    """An operator's command under way: whose answers are missing, and those that are there."""
+
+    verb: str
+    due: float
+    missing: set[str]
+    answers: dict[str, str] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    """What else is to be told."""
+
+
+class Node:
+    """Everything of a node but sockets, processes and the clock.
+
+    `callee` and `callers` (one for each peer) are driven by a shell: it brings them what comes in
+    and takes out what goes. `places` are by device, `GENERAL` for actions without. Then
+    `advance(now)` does all that is due; `due()` says when next.
+    """
+
+    def __init__(
+        self,
+        directory: Directory,
+        name: str,
+        *,
+        boot: str,
+        clock: Callable[[], float],
+        places: Mapping[str, Place],
+        virtual: bool = False,
+        connect: Callable[[str], None] | None = None,
+        stream_address: Callable[[str], Mapping[str, Any] | None] | None = None,
+        latch: Latch | None = None,
+    ) -> None:
+        """`connect(peer)` is called when the first call to a peer is about to be made;
+        `stream_address(stream)` tells where a set-point stream of this node is received; `latch`
+        keeps an emergency stop over a restart."""
+        self.directory = directory
+        self.name = name
+        self.boot = boot
+        services = [s for s in directory.services.values() if s.node == name and s.run]
+        waiting = {
+            s.name: _as_action(s) for s in services if inspect.iscoroutinefunction(resolve(s.run))
+        }
+        self.places: dict[str, Place] = {
+            **places,
+            LOOP: InlinePlace(waiting, clock=clock, virtual=virtual),
+        }
+        self.memory = Memory(self._memory_changed)
+        self._connect = connect
+        self._stream_address = stream_address
+        self.callee = Callee(name, boot, self._offers(waiting), directory=directory.hash)
+        self.callers: dict[str, Caller] = {}
+        self.sent: list[tuple[str, Sent]] = []
+        """Set points that left since the shell looked, with the action that published them (inline
+        places only)."""
+        self._timers = Timers(
+            {t.name: t.period for t in directory.timers.values() if t.node == name}
+        )
+        self._now = 0.0
+        self._at: dict[str, str] = {}
+        self._asked: dict[str, str] = {}
+        self._commands: dict[str, _Commanded] = {}
+        self._stops = EmergencyStops(
+            [key for key in self.places if key not in (LOOP, GENERAL)], latch
+        )
+        self._stop_places(0.0, self._stops.at_start())
+
+    def _offers(self, waiting: Mapping[str, ActionEntry]) -> dict[str, Offer]:
+        offers = {
+            a.name: Offer(device=a.device, orphan_time=a.orphan_time, deadline=a.deadline)
+            for a in self.directory.actions.values()
+            if a.node == self.name
+        }
+        for service in self.directory.services.values():
+            if service.node == self.name:
+                scope = "local" if service.local else "network"
+                offers.update(self._service_offers(service, scope, service.name in waiting))
+        if self._stream_address is not None:
+            streams = [s for s in self.directory.streams if self.directory.where(s) == self.name]
+            offers.update(
+                {stream_service(s): Offer(inline=self._stream_call, roles=SENDERS) for s in streams}
+            )
+        return offers
+
+    def _service_offers(self, service: ServiceEntry, scope: str, waits: bool) -> dict[str, Offer]:
+        if service.name == MEMORY and not service.run:
+            return {call: Offer(scope, inline=self._memory_call) for call in MEMORY_CALLS}
+        if waits or not service.run:
+            return {service.name: Offer(scope)}
+        inline: Inline = inline_service(service, self._service_event, self._judge)
+        return {service.name: Offer(scope, inline=inline)}
+
+    def caller(self, peer: str) -> Caller:
+        """The calling end for a peer, made when first wanted."""
+        if peer not in self.callers:
+            self.callers[peer] = Caller(peer, self.hello(), auto_ack=True)
+            if self._connect is not None:
+                self._connect(peer)
+        return self.callers[peer]
+
+    def hello(self) -> Hello:
+        """How this node introduces itself to a peer."""
+        return Hello(
+            OLDEST_VERSION, NEWEST_VERSION, "node", self.name, self.boot, 0, self.directory.hash
+        )
+
+    def action_of(self, run: str) -> str:
+        """Action or service that a run or call under way belongs to; the node's name when it is
+        unknown."""
+        return self.callee.running().get(run, self.name)
+
+    # --- time ---------------------------------------------------------------------------------
+
+    def advance(self, now: float) -> None:
+        """Do all that is due: orders of callers, runs, devices, timers, and what comes of them."""
+        self._now = now
+        if now >= self._stops.due:
+            self._stop_places(now, self._stops.look(now))
+        self._advance_ends(now)
+        self.obey(now, self.callee.orders())
+        self._answer_runs(now)
+        self.advance_places(now)
+        self.settle(now)
+
+    def advance_places(self, now: float) -> bool:
+        """Timers, runs and devices alone; says whether anything came of it. That is all that
+        `advance` does while nothing has come in and `ends_quiet` holds: a shell that knows may call
+        this instead, then `settle` if something came."""
+        self._now = now
+        news = False
+        for name in self._timers.advance(now):
+            self.callee.raise_event(now, name, source=name)
+            news = True
+        for key, place in self.places.items():
+            if place.idle:
+                continue
+            place.advance(now)
+            for report in place.reports():
+                self._take_report(now, key, report)
+                news = True
+        return news
+
+    def settle(self, now: float) -> None:
+        """What follows from what `advance_places` has found."""
+        self._answer_runs(now)
+        self._answer_commands(now)
+
+    def ends_quiet(self, now: float) -> bool:
+        """Whether time alone gives calls, commands and the emergency stop nothing to do yet."""
+        if self._commands or now >= self.callee.soonest or now >= self._stops.due:
+            return False
+        return all(now < caller.soonest for caller in self.callers.values())
+
+    def _advance_ends(self, now: float) -> None:
+        """What time does at both ends of calls; asking for the next due time keeps `soonest` up to
+        date."""
+        ends: tuple[Callee | Caller, ...] = (self.callee, *self.callers.values())
+        for end in ends:
+            if now >= end.soonest:
+                end.advance(now)
+                end.due()
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s), None if only what comes in can
+        matter."""
+        times = [self._stops.due if self._stops.due < NEVER else None]
+        times += [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
+        times += [caller.due() for caller in self.callers.values()]
+        times += [place.due() for place in self.places.values()]
+        return min((t for t in times if t is not None), default=None)
+
+    def close(self, now: float) -> None:
+        """Stop routines of all devices, and let them go."""
+        for place in self.places.values():
+            place.close(now)
+
+    # --- orders of callers --------------------------------------------------------------------
+
+    def obey(self, now: float, orders: Iterable[Order]) -> None:
+        """Carry out what the callee orders."""
+        for order in orders:
+            if isinstance(order, StartRun):
+                self._start(now, order.call)
+            elif isinstance(order, CancelRun):
+                cause = order.reason if order.reason in _OWN_CAUSES else "cancelled"
+                self.places[self._at[order.id]].take(now, Stop(order.id, cause, order.reason))
+            elif isinstance(order, Commanded):
+                self._command(now, order)
+
+    def _start(self, now: float, call: Call) -> None:
+        action = self.directory.actions.get(call.service)
+        key = LOOP if action is None else action.device or GENERAL
+        deadline = call.deadline
+        if deadline is None and action is not None:
+            deadline = action.deadline
+        self._stop_places(now, self._stops.look(now))
+        if key in self._stops:
+            self.callee.finish(
+                now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO
+            )
+            return
+        self._at[call.id] = key
+        self.places[key].take(
+            now, Begin(call.id, call.service, call.arguments, deadline, call.seed)
+        )
+
+    def _command(self, now: float, order: Commanded) -> None:
+        command = order.command
+        keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
+        if command.verb not in VERBS:
+            self.callee.answer(
+                now,
+                command.id,
+                False,
+                {"cause": "unknown_verb", "text": f"no verb {command.verb!r}"},
+            )
+        elif not keys and command.target:
+            text = f"{self.name} has no device {command.target!r}"
+            self.callee.answer(now, command.id, False, {"cause": "unknown_device", "text": text})
+        else:
+            if command.verb == CLEAR_EMERGENCY and (why := self._stops.clear(keys)):
+                self.callee.answer(now, command.id, False, {"cause": "latched", "text": why})
+                return
+            self._commands[command.id] = _Commanded(command.verb, now + ANSWER_WITHIN, set(keys))
+            for key in keys:
+                self.places[key].command(now, command.id, command.verb)
+            if (
+                command.verb == EMERGENCY_STOP
+            ):  # the devices first, the disk then; both before the answer
+                self._commands[command.id].note = self._stops.stop(
+                    [key for key in keys if key != GENERAL]
+                )
+
+    def stopped_in_emergency(self) -> tuple[str, ...]:
+        """Devices that obey nobody until that is cleared."""
+        return self._stops.names
+
+    def _stop_places(self, now: float, keys: Iterable[str]) -> None:
+        for key in keys:
+            self.places[key].command(now, "", EMERGENCY_STOP)
+
+    def _answer_commands(self, now: float) -> None:
+        if not self._commands:
+            return
+        for id_, command in list(self._commands.items()):
+            if not command.missing or now >= command.due:
+                del self._commands[id_]
+                answers = {
+                    **command.answers,
+                    **{key or self.name: "no answer" for key in command.missing},
+                }
+                held = command.verb != "hold" or all(a in _WELL_HELD for a in answers.values())
+                data: dict[str, Any] = {"answers": answers, "devices": command.data}
+                if command.note:
+                    data["note"] = command.note
+                if command.verb == "status":
+                    data["emergency"] = list(self.stopped_in_emergency())
+                self.callee.answer(now, id_, held and not command.missing, data)
+
+    # --- reports of places --------------------------------------------------------------------
+
+    def _take_report(self, now: float, key: str, report: Report) -> None:
+        if isinstance(report, Ended):
+            self._end(now, report)
+        elif isinstance(report, Asked):
+            self._ask(now, key, report)
+        elif isinstance(report, Sent):
+            self.sent.append((self.action_of(report.run), report))
+        elif isinstance(report, Raised):
+            self._raise(now, key, report)
+        elif isinstance(report, Judged):
+            self._judge(self.action_of(report.by), report)
+        elif isinstance(report, Told):
+            if report.id in self._commands:
+                command = self._commands[report.id]
+                command.missing.discard(key)
+                command.answers[key or self.name] = report.answer
+                command.data[key or self.name] = report.data
+        elif isinstance(report, Dropped):
+            for caller in self.callers.values():
+                caller.cancel(now, report.id, "its run no longer waits")
+        elif isinstance(report, Progressed) and report.id in self._at:
+            self.callee.feedback(now, report.id, report.fraction, report.data)
+
+    def _end(self, now: float, end: Ended) -> None:
+        if self._at.pop(end.id, None) is None:
+            return
+        for caller in self.callers.values():
+            caller.cancel_children(now, end.id, "its run is over")
+        executed = Executed(end.executed)
+        self.callee.finish(
+            now,
+            end.id,
+            end.status,
+            end.values,
+            end.cause,
+            end.text,
+            executed,
+            end.seconds,
+            end.cpu_seconds,
+            end.deferred,
+        )
+
+    def _raise(self, now: float, key: str, raised: Raised) -> None:
+        if not raised.run:
+            self.callee.raise_event(
+                now, raised.name, raised.data, source=key or self.name, latched=True
+            )
+        elif raised.run in self._at:
+            source = self.action_of(raised.run)
+            self.callee.raise_event(
+                now, raised.name, raised.data, source=source, latched=True, run=raised.run
+            )
+
+    def _judge(self, source: str, judged: Judged) -> None:
+        """The verdict goes to the coordinator of the judged run: latched, so that a lost link only
+        delays it."""
+        said = VerdictSaid(judged.run, judged.status, judged.cause, judged.text)
+        name = verdict_event(mission_of(judged.run))
+        self.callee.raise_event(self._now, name, said.to_data(), source=source, latched=True)
+
+    def _ask(self, now: float, key: str, asked: Asked) -> None:
+        try:
+            peer = self.directory.where(asked.service)
+        except DirectoryError as fault:
+            self.places[key].take(
+                now, Answered(asked.id, Status.ERROR, {}, "unknown_service", str(fault))
+            )
+            return
+        self._asked[asked.id] = key
+        call = Call(
+            asked.id,
+            asked.service,
+            asked.arguments,
+            asked.deadline,
+            parent=asked.run,
+            seed=asked.seed,
+        )
+        self.caller(peer).call(now, call)
+
+    def _answer_runs(self, now: float) -> None:
+        for caller in self.callers.values():
+            notices = caller.notices()
+            if notices:
+                self.take_notices(now, notices)
+
+    def take_notices(self, now: float, notices: Iterable[Notice]) -> None:
+        """Hand the ends of calls to the runs that made them."""
+        for notice in notices:
+            if isinstance(notice, CallEnded):
+                end = notice.outcome
+                key = self._asked.pop(end.id, None)
+                if key is not None:
+                    self.places[key].take(
+                        now, Answered(end.id, end.status, end.values, end.cause, end.text)
+                    )
+
+    # --- services of the node itself ----------------------------------------------------------
+
+    def _memory_call(self, now: float, call: Call) -> Outcome:
+        self._now = now
+        result = self.memory.call(call.service, call.arguments)
+        executed = Executed.NO if result.status is Status.ERROR else Executed.YES
+        return Outcome(call.id, result.status, result.values, result.cause, result.text, executed)
+
+    def _memory_changed(self, name: str, value: Any, version: int) -> None:
+        data = {"name": name, "value": value, "version": version}
+        self.callee.raise_event(self._now, event_name(name), data, source=MEMORY, latched=True)
+
+    def _stream_call(self, now: float, call: Call) -> Outcome:
+        """Where a set-point stream is received, and the ticket that opens it."""
+        stream = call.service.removeprefix(STREAM_PREFIX)
+        address = self._stream_address(stream) if self._stream_address else None
+        if address is None:
+            text = f"nobody receives {stream!r} at the moment"
+            return Outcome(call.id, Status.ERROR, {}, "not_ready", text, Executed.NO)
+        return Outcome(call.id, Status.SUCCESS, address)
+
+    def _service_event(self, service: str, name: str, data: Mapping[str, Any]) -> None:
+        self.callee.raise_event(self._now, name, data, source=service, latched=True)
+
+
+def _as_action(service: ServiceEntry) -> ActionEntry:
+    return ActionEntry(service.name, service.run, "", service.node)
+
+
+def stream_service(stream: str) -> str:
+    """Name of the service that tells where a stream is received."""
+    return STREAM_PREFIX + stream

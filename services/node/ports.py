@@ -1,0 +1,131 @@
+"""What a driver may reach in real time: a real or simulated bus, a camera, and the receiving ends
+of streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from petrobot.services.comm.canopen.bus import CanBus
+from petrobot.services.comm.location_file import DeviceEntry, Directory
+from petrobot.services.comm.protocol.messages import Event
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.comm.streams.image import ImageSource
+from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
+from petrobot.services.comm.tls.credentials import credentials
+from petrobot.services.worker.context import checked
+from petrobot.services.worker.setpoints import SetpointReceiver
+
+CAN_KEYS = ("interface", "channel", "bitrate")
+
+
+class ProcessPorts:
+    """Implements `services.device.Ports` for the driver of one device in its process."""
+
+    def __init__(
+        self,
+        directory: Directory,
+        device: DeviceEntry,
+        clock: Callable[[], float],
+        tickets: Mapping[str, str],
+    ) -> None:
+        self._directory = directory
+        self._device = device
+        self._clock = clock
+        self._tickets = tickets
+        self._can: CanBus | None = None
+        self._images: ImageSource | None = None
+        self._setpoints: dict[str, SetpointReceiver] = {}
+        self._incoming: dict[str, Incoming] = {}
+        self._receiver: StreamReceiver | None = None
+        self._raised: list[tuple[str, Mapping[str, Any]]] = []
+
+    @property
+    def now(self) -> float:
+        """The cell's clock (s)."""
+        return self._clock()
+
+    def can(self) -> CanBus:
+        """The bus that the device's keys `interface`, `channel`, `bitrate` (or its table `can`)
+        name, as for python-can."""
+        if self._can is None:
+            from petrobot.services.comm.canopen.ports import open_can
+
+            config = self._device.config
+            self._can = open_can(
+                config.get("can") or {key: config[key] for key in CAN_KEYS if key in config}
+            )
+        return self._can
+
+    def images(self) -> ImageSource:
+        """The image source that the device's key `source` names."""
+        if self._images is None:
+            from petrobot.services.comm.streams.camera import open_images
+
+            self._images = open_images(self._located(self._device.config), self._clock)
+        return self._images
+
+    def _located(self, config: Mapping[str, Any]) -> Mapping[str, Any]:
+        """With the path of a recording taken relative to services.toml. Raises ValueError if it is
+        not there."""
+        kind, _, path = str(config.get("source", "")).partition(":")
+        if kind != "file" or not path:
+            return config
+        recording = self._directory.file(path)
+        if not recording.is_file():
+            raise ValueError(
+                f'source = "file:{path}": no file {recording}; write the path of a recording'
+            )
+        return {**config, "source": f"file:{recording}"}
+
+    def stream(self, name: str) -> SetpointReceiver:
+        """The receiving end of a stream that services.toml leads to this device. Raises ValueError
+        for any other."""
+        entry = self._directory.streams.get(name)
+        if entry is None or entry.to != self._device.name:
+            raise ValueError(
+                f"no stream {name!r} leads here; write [streams.{name}] to = {self._device.name!r}"
+            )
+        if name not in self._setpoints:
+            self._setpoints[name] = setpoint = SetpointReceiver(entry.period, self._clock)
+            self._incoming[name] = Incoming(entry.period, setpoint, self._tickets[name])
+        if self._receiver is None:
+            host = self._directory.nodes[self._device.node].host
+            key = credentials(self._directory, self._device.node).stream_key(self._tickets[name])
+            self._receiver = StreamReceiver(
+                self._device.name, self._incoming, host=host, key=key, clock=self._clock
+            )
+        return self._setpoints[name]
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise an external event."""
+        raised = plain(name, "name"), plain(data, "data")
+        checked(Event(raised[0], self._device.name, 1, raised[1]))
+        self._raised.append(raised)
+
+    def file(self, path: str) -> bytes:
+        """A file named in services.toml, relative to it."""
+        return self._directory.file(path).read_bytes()
+
+    def stream_ports(self) -> dict[str, int]:
+        """Port of each stream that is received here."""
+        return (
+            {}
+            if self._receiver is None
+            else dict.fromkeys(self._setpoints, self._receiver.address[1])
+        )
+
+    def poll(self) -> None:
+        """Take in the set points that have come."""
+        if self._receiver is not None:
+            self._receiver.poll()
+
+    @property
+    def busy(self) -> bool:
+        """Whether `poll` must be called often."""
+        return self._receiver is not None
+
+    def raised(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """Events raised since the last call, in order."""
+        raised, self._raised = self._raised, []
+        return raised

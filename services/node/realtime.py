@@ -1,0 +1,272 @@
+"""The asyncio shell of a node in real time: its server, its clients to other nodes, its processes,
+and the clock."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import signal
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from petrobot.services.action import Status
+from petrobot.services.comm.calls.callee import Order
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.latch import STATE, latch_of
+from petrobot.services.comm.calls.listening import listening, refuse_unusable
+from petrobot.services.comm.calls.notices import Notice
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.protocol.security import require_key
+from petrobot.services.comm.tls.credentials import credentials
+from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
+from petrobot.services.node.emergency_stops import BEAT, BEAT_EVERY
+from petrobot.services.node.inline_host import Place
+from petrobot.services.node.node import GENERAL, Node, stream_service
+from petrobot.services.node.worker_host import START_LIMIT, WorkerPlace
+from petrobot.services.node.worker_pool import WorkerPool
+from petrobot.services.worker.process import Setup
+from petrobot.services.worker.remote import IN_EMERGENCY
+
+
+class NodeShell:
+    """A running node. Between `start` and `close` it serves; its loop does protocol and quick
+    services only."""
+
+    def __init__(
+        self, directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0
+    ) -> None:
+        """`text` is that of services.toml, as all processes of the node shall know it; `memory`
+        limits workers (bytes)."""
+        self._directory = directory
+        self._name = name
+        self._loop = asyncio.get_running_loop()
+        self._tickets = _tickets(directory, name)
+        self._setup = Setup(str(directory.source), text, name, "", mock, memory, self._tickets)
+        self._credentials = credentials(directory, name)
+        self._workers = {device: self._worker_place(device) for device in self._devices()}
+        places: dict[str, Place] = {**self._workers}
+        self.latch = latch_of(directory.source, name)
+        self.node = Node(
+            directory,
+            name,
+            boot=secrets.token_hex(8),
+            clock=self._loop.time,
+            places=places,
+            connect=self._connect,
+            stream_address=self._stream_address,
+            latch=self.latch,
+        )
+        key, tls = self._credentials.key, self._credentials.server()
+        self.server = Server(self.node.callee, on_orders=self._obey, key=key, tls=tls)
+        self._client_tls = self._credentials.client()
+        self._clients: dict[str, Client] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._timer: asyncio.TimerHandle | None = None
+        self._soon: asyncio.Handle | None = None
+        self._beating: asyncio.TimerHandle | None = None
+        self._change = asyncio.Event()
+        self._serving = False
+
+    def _devices(self) -> list[str]:
+        devices = [d.name for d in self._directory.devices.values() if d.node == self._name]
+        general = any(
+            a.node == self._name and not a.device for a in self._directory.actions.values()
+        )
+        return [*devices, GENERAL] if general else devices
+
+    def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
+        setup, clock = replace(self._setup, device=device), self._loop.time
+
+        def wanted(stream: str) -> None:
+            self._find_stream(device, stream)
+
+        if device == GENERAL:
+            most = self._directory.nodes[self._name].workers
+            return WorkerPool(setup, clock=clock, changed=self._changed, wanted=wanted, most=most)
+        return WorkerPlace(setup, clock=clock, changed=self._changed, wanted=wanted)
+
+    # --- life ---------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Bring the devices up, then listen. Raises DirectoryError when a device cannot be started
+        or the address cannot be had, KeyNeededError."""
+        host, port = self._directory.address(self._name)
+        require_key(self._name, host, self._credentials.guarded)
+        refuse_unusable(self._directory, self._name)
+        try:
+            for place in self._workers.values():
+                place.start()
+            self._beat()
+            async with asyncio.timeout(START_LIMIT):
+                await self._until_ready()
+            with listening(self._directory, self._name):
+                await self.server.start(host, port)
+            self._serving = True
+        except TimeoutError:
+            await self.close()
+            late = ", ".join(
+                device or "actions" for device, place in self._workers.items() if not place.ready
+            )
+            raise DirectoryError(
+                (f"node {self._name}: {late} not up within {START_LIMIT:g} s",)
+            ) from None
+        except BaseException:
+            await self.close()
+            raise
+        self._step()
+
+    def _beat(self) -> None:
+        """Let the processes of devices know that this loop runs: they stop their devices when it
+        does not."""
+        for place in self._workers.values():
+            for child in place.children():
+                if not child.pipe.unsent:  # it does not read: more of the same would only pile up
+                    child.post([BEAT])
+        self._beating = self._loop.call_later(BEAT_EVERY, self._beat)
+
+    async def _until_ready(self) -> None:
+        while not all(place.ready for place in self._workers.values()):
+            failed = next((place.failed for place in self._workers.values() if place.failed), "")
+            if failed:
+                raise DirectoryError((failed,))
+            self._change.clear()
+            await self._change.wait()
+
+    async def close(self) -> None:
+        """Stop routines of all devices, then good-bye to all."""
+        if self._beating is not None:
+            self._beating.cancel()
+        self._cancel_timers()
+        self.node.close(self._loop.time())
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(client.close() for client in self._clients.values()))
+        self._serving = False
+        await self.server.close()
+        children = [child for place in self._workers.values() for child in place.children()]
+        await asyncio.gather(*(child.wait() for child in children))
+        self._cancel_timers()
+
+    def _cancel_timers(self) -> None:
+        for handle in (self._timer, self._soon):
+            if handle is not None:
+                handle.cancel()
+        self._timer = self._soon = None
+
+    # --- steps --------------------------------------------------------------------------------
+
+    def _obey(self, now: float, orders: list[Order]) -> None:
+        self.node.obey(now, orders)
+        self._changed()
+
+    def _take_notices(self, now: float, notices: list[Notice]) -> None:
+        self.node.take_notices(now, notices)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Something came in: step once in this turn of the loop, however much it was."""
+        self._change.set()
+        if self._soon is None:
+            self._soon = self._loop.call_soon(self._step)
+
+    def _step(self) -> None:
+        if self._soon is not None:
+            self._soon.cancel()
+            self._soon = None
+        now = self._loop.time()
+        self.node.advance(now)
+        if self._serving:
+            self.server.flush(now)
+        for client in self._clients.values():
+            client.flush(now)
+        self._arm()
+
+    def _arm(self) -> None:
+        due = self.node.due()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if due is not None:
+            self._timer = self._loop.call_at(max(due, self._loop.time()), self._step)
+
+    # --- other nodes --------------------------------------------------------------------------
+
+    def _connect(self, peer: str) -> None:
+        host, port = self._directory.address(peer)
+        caller, key = self.node.callers[peer], self._credentials.key
+        client = Client(
+            host, port, caller, on_notices=self._take_notices, key=key, tls=self._client_tls
+        )
+        self._clients[peer] = client
+        client.start()
+
+    def _stream_address(self, stream: str) -> Mapping[str, Any] | None:
+        place = self._workers[self._directory.streams[stream].to]
+        if stream not in place.streams:
+            return None
+        host = self._directory.nodes[self._name].host
+        return {"host": host, "port": place.streams[stream], "ticket": self._tickets[stream]}
+
+    def _find_stream(self, device: str, stream: str) -> None:
+        """An action wants to send a stream: ask its receiver's node where to."""
+        task = self._loop.create_task(self._tell_stream(device, stream))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _tell_stream(self, device: str, stream: str) -> None:
+        peer = self._directory.where(stream)
+        self.node.caller(peer)
+        outcome = await self._clients[peer].call(stream_service(stream), deadline=1.0)
+        if outcome.status == Status.SUCCESS:
+            at = outcome.values
+            self._workers[device].stream_at(stream, at["host"], at["port"], at["ticket"])
+
+
+def _tickets(directory: Directory, node: str) -> dict[str, str]:
+    """What opens each stream that a node receives: a secret of the receiving device, a dot, and one
+    of the stream."""
+    streams = [s for s in directory.streams.values() if directory.where(s.name) == node]
+    devices = {stream.to: secrets.token_hex(16) for stream in streams}
+    return {stream.name: f"{devices[stream.to]}.{secrets.token_hex(16)}" for stream in streams}
+
+
+def _end_with_launcher(launcher: int, over: asyncio.Event) -> None:
+    """End in good order when the launcher is gone; by force if that takes too long, be it that a
+    service hangs in the loop."""
+    outlive(launcher, GOOD_ORDER)
+    try:
+        asyncio.get_running_loop().add_reader(os.pidfd_open(launcher), over.set)
+    except ProcessLookupError:
+        over.set()
+
+
+async def serve(
+    directory: Directory, name: str, text: str, *, mock: str = "", memory: int = 0
+) -> None:
+    """Run a node until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
+    over = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    if wanted_with_parent():
+        _end_with_launcher(os.getppid(), over)
+    shell = NodeShell(directory, name, text, mock=mock, memory=memory)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, over.set)
+    await shell.start()
+    host, port = shell.server.address
+    if not shell.latch.kept:
+        places = " and ".join(str(path.parent) for path in shell.latch.paths)
+        print(
+            f"node {name}: an emergency stop could not be kept in {places}; name a folder in "
+            f"${STATE}",
+            file=sys.stderr,
+        )
+    if stopped := shell.node.stopped_in_emergency():
+        print(f"node {name}: {', '.join(stopped)}: {IN_EMERGENCY}", file=sys.stderr, flush=True)
+    print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
+    await over.wait()
+    await shell.close()

@@ -1,0 +1,163 @@
+"""Ends what hangs in lock step, where no other process could: code that does not come back would
+stop simulated time for ever.
+
+A thread looks now and then at the step that a node is in. What counts is the processor time that
+the step has used, and the time that it slept: on a busy machine a step takes long without hanging,
+and then it does neither.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import sys
+import threading
+import time
+import traceback
+import weakref
+from pathlib import Path
+from types import FrameType
+
+from petrobot.services.worker.execution import Execution, Hung
+
+_log = logging.getLogger(__name__)
+LIMIT = 10.0
+"""Seconds of processor time or sleep that one step of a node may take: a thousand times what the
+slowest honest one takes."""
+COMPILER = "numba"
+"""Package that may take longer: it compiles a kernel when that is first called, once on each
+machine."""
+LOOK = 0.5
+"""Seconds between looks."""
+IDLE = 1e-3
+"""Seconds of processor time between two looks below which a thread did nothing."""
+ATTEMPTS, AGAIN = 4, 2.0
+"""How often the code is interrupted, and the seconds of the same kind in between: it may catch
+that. Then the process ends."""
+_SERVICES = str(Path(__file__).parents[1])
+_raise_in_thread = ctypes.pythonapi.PyThreadState_SetAsyncExc
+
+
+class Watchdog:
+    """Watches the steps of one node. `begin` and `end` cost next to nothing: they are called each
+    tick."""
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+        self._step = 0
+        """Odd while a step is being taken."""
+        self._thread: threading.Thread | None = None
+        self._over = threading.Event()
+        self._watched = 0
+        self._seen, self._used, self._before, self._attempts = 0, 0.0, 0.0, 0
+
+    def begin(self) -> None:
+        """The node's code is called now, in this thread."""
+        if self._thread is None:
+            # It must not keep alive what it watches: a cell that nobody closes is gone with its
+            # last user.
+            self._thread = threading.Thread(
+                target=_look_on, args=(weakref.ref(self), self._over), daemon=True
+            )
+            self._thread.start()
+        self._watched = threading.get_ident()
+        self._step += 1
+
+    def end(self) -> None:
+        """It has come back."""
+        self._step += 1
+
+    def close(self) -> None:
+        """Watch no more."""
+        self._over.set()
+
+    def look(self) -> None:
+        """Interrupt the step if it has taken too long."""
+        now = _processor_time(self._watched)
+        if self._step != self._seen or self._seen % 2 == 0:
+            self._seen, self._used, self._attempts = self._step, 0.0, 0
+        else:
+            spent = now - self._before
+            # Who looks holds the interpreter, so the other thread waits for it now, whatever it did
+            # before: it slept only if it has used no time either.
+            self._used += LOOK if spent < IDLE and _sleeps(self._watched) else spent
+            if self._used >= LIMIT:
+                self._used, self._attempts = LIMIT - AGAIN, self._attempts + 1
+                self._interrupt(self._attempts)
+        self._before = now
+
+    def _interrupt(self, attempts: int) -> None:
+        frame = sys._current_frames().get(self._watched)
+        if _compiles(frame):
+            self._used, self._attempts = 0.0, 0
+            return
+        where = _described(frame)
+        text = (
+            f"node {self._node}: {where} has not come back for {LIMIT:g} s of processor "
+            "time or sleep"
+        )
+        if attempts > ATTEMPTS:
+            print(
+                f"{text}, and cannot be interrupted; the process ends", file=sys.stderr, flush=True
+            )
+            os._exit(3)
+        stack = "".join(traceback.format_stack(frame)) if frame is not None else ""
+        _log.error("%s; it is interrupted\n%s", text, stack)
+        _raise_in_thread(ctypes.c_ulong(self._watched), ctypes.py_object(Hung))
+
+
+def _look_on(watchdog: weakref.ref[Watchdog], over: threading.Event) -> None:
+    while not over.wait(LOOK) and (alive := watchdog()) is not None:
+        alive.look()
+        del alive
+
+
+def _described(frame: FrameType | None) -> str:
+    """Whose code a stack is in, and at which line."""
+    line, whose = "", "its code"
+    while frame is not None:
+        code = frame.f_code
+        if not line and not (
+            code.co_filename.startswith(_SERVICES) and frame.f_globals.get("__name__") in _OWN
+        ):
+            line = f"{code.co_name} ({code.co_filename}:{frame.f_lineno})"
+        owner = frame.f_locals.get("self")
+        if isinstance(owner, Execution):
+            whose = f"action {owner.begin.action}, run {owner.begin.id},"
+            break
+        frame = frame.f_back
+    return f"{whose} in {line}" if line else whose
+
+
+def _compiles(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).partition(".")[0] == COMPILER:
+            return True
+        frame = frame.f_back
+    return False
+
+
+_OWN = frozenset(
+    f"services.{name}"
+    for name in ("execution", "runner", "place", "node", "lockstep_node", "watchdog")
+)
+
+
+def _processor_time(thread: int) -> float:
+    """Seconds of processor time that a thread has used."""
+    try:
+        return time.clock_gettime(time.pthread_getcpuclockid(thread))
+    except OSError:  # it has ended
+        return 0.0
+
+
+def _sleeps(thread: int) -> bool:
+    """Whether a thread waits for something, as against being ready to run on a busy machine."""
+    native = next((t.native_id for t in threading.enumerate() if t.ident == thread), None)
+    try:
+        return (
+            Path(f"/proc/self/task/{native}/stat").read_text().rpartition(")")[2].split()[0] == "S"
+        )
+    except (OSError, IndexError):
+        return False

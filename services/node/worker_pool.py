@@ -1,0 +1,346 @@
+"""The runs of a node's actions that use no device: each has a worker process of its own while it
+runs.
+
+So an action that blocks, crashes or takes all its memory ends no other run. Workers are started as
+they are needed, with one more that waits for the next run, since a process takes its time to start.
+Those that nobody has needed for a while retire.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from petrobot.services.action import Status
+from petrobot.services.comm.protocol.messages import Executed
+from petrobot.services.device import PICTURE
+from petrobot.services.node.child import Child
+from petrobot.services.node.worker_host import DONE, Spawn, Stage, WorkerPlace
+from petrobot.services.worker.process import Setup
+from petrobot.services.worker.runs import (
+    Answered,
+    Asked,
+    Begin,
+    Dropped,
+    Ended,
+    Order,
+    Report,
+    Stop,
+    Told,
+)
+
+KEPT = 2
+"""Idle workers that stay however long nothing is to be done."""
+IDLE_LIMIT = 30.0
+"""Seconds after which an idle worker beyond these retires."""
+
+
+@dataclass
+class _Gathered:
+    """A command that several workers carry out."""
+
+    verb: str
+    missing: set[int]
+    answers: list[str] = field(default_factory=list)
+
+
+class WorkerPool:
+    """Implements `services.place.Place` for actions without a device, with one `WorkerPlace` for
+    each worker.
+
+    `most` is how many workers there may be; a run beyond that is refused: `busy`, executed = no.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        clock: Callable[[], float],
+        changed: Callable[[], None],
+        wanted: Callable[[str], None],
+        most: int,
+        spawn: Spawn = Child,
+    ) -> None:
+        self._setup = setup
+        self._clock = clock
+        self._changed = changed
+        self._wanted = wanted
+        self._most = most
+        self._spawn = spawn
+        self._workers: dict[int, WorkerPlace] = {}
+        """By number from 1, the lowest first: a node that has little to do uses the same ones again
+        and again."""
+        self._leaving: list[WorkerPlace] = []
+        self._idle_since: dict[int, float] = {}
+        self._touched: set[int] = set()
+        """Those to which something has happened since the last step. The others need no look before
+        they are due: a step must not take longer the more workers there are."""
+        self._due: dict[int, float] = {}
+        self._soonest = math.inf
+        self._at: dict[str, int] = {}
+        """Number of the worker that each run was given to."""
+        self._asked: dict[str, int] = {}
+        """That of each call that a run made and that was not answered."""
+        self._streams: dict[str, set[int]] = {}
+        """Those that want to know where a stream is received."""
+        self._commands: dict[str, _Gathered] = {}
+        self._held = False
+        self._reports: list[Report] = []
+        self.streams: Mapping[str, int] = {}
+        """Actions without a device receive no stream."""
+
+    # --- workers ------------------------------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        """Whether a worker is up."""
+        return any(worker.ready for worker in self._workers.values())
+
+    @property
+    def failed(self) -> str:
+        """Why a worker could not be started, empty if one is up or none has failed."""
+        return (
+            "" if self.ready else next((w.failed for w in self._workers.values() if w.failed), "")
+        )
+
+    @property
+    def condition(self) -> tuple[str, str]:
+        """`up` if a run would be taken, else `busy`, `starting`, `restarting` or `failed`; and
+        why."""
+        if self._idle() or len(self._workers) < self._most:
+            return (
+                ("up", "")
+                if self.ready
+                else next((w.condition for w in self._workers.values()), ("starting", ""))
+            )
+        return "busy", self._full()
+
+    def _full(self) -> str:
+        return f"all {self._most} workers run an action; see `workers` of the node in services.toml"
+
+    def pids(self) -> dict[str, int]:
+        """Process ids: `actions` of the first worker, `actions 2` of the second, ..."""
+        found = {}
+        for number, worker in sorted(self._workers.items()):
+            for name, process in worker.pids().items():
+                found[name if number == 1 else f"{name} {number}"] = process
+        return found
+
+    def start(self) -> None:
+        """Start the first worker, unless there is one."""
+        if not self._workers:
+            self._add()
+
+    def _add(self) -> int:
+        number = next(n for n in range(1, self._most + 1) if n not in self._workers)
+        self._workers[number] = WorkerPlace(
+            self._setup,
+            clock=self._clock,
+            changed=lambda: self._touch(number),
+            wanted=lambda stream: self._want(number, stream),
+            spawn=self._spawn,
+        )
+        self._workers = dict(sorted(self._workers.items()))
+        self._touched.add(number)
+        self._workers[number].start()
+        return number
+
+    def _touch(self, number: int) -> None:
+        self._touched.add(number)
+        self._changed()
+
+    def _idle(self) -> list[int]:
+        """Workers without a run, the best first: ready ones, then those that start, then those that
+        wait to be started again."""
+        idle = [number for number, worker in self._workers.items() if not worker.busy]
+        return sorted(idle, key=lambda number: (self._rank(number), number))
+
+    def _rank(self, number: int) -> int:
+        worker = self._workers[number]
+        return 0 if worker.ready else 1 if worker.stage is Stage.ACTIONS_START else 2
+
+    def children(self) -> list[Child]:
+        """Its processes, those included that were told to leave."""
+        return [
+            child
+            for worker in (*self._workers.values(), *self._leaving)
+            for child in worker.children()
+        ]
+
+    # --- runs ---------------------------------------------------------------------------------
+
+    def take(self, now: float, order: Order) -> None:
+        """Take an order about a run."""
+        if isinstance(order, Begin):
+            self._begin(now, order)
+        elif isinstance(order, Stop | Answered):
+            known = (
+                self._at.get(order.id)
+                if isinstance(order, Stop)
+                else self._asked.pop(order.id, None)
+            )
+            if known in self._workers:
+                self._touched.add(known)
+                self._workers[known].take(now, order)
+
+    def _begin(self, now: float, begin: Begin) -> None:
+        number = self._choose()
+        if number is None:
+            self._reports.append(
+                Ended(begin.id, Status.ERROR, {}, "busy", self._full(), Executed.NO)
+            )
+            return
+        self._at[begin.id] = number
+        self._touched.add(number)
+        if self._held:
+            self._workers[number].command(now, "", "hold")
+        self._workers[number].take(now, begin)
+        if len(self._workers) < self._most and all(
+            worker.busy for worker in self._workers.values()
+        ):
+            self._add()
+
+    def _choose(self) -> int | None:
+        """Number of the worker for the next run, started if need be; None at the limit."""
+        for number, worker in self._workers.items():
+            if not worker.busy and worker.ready:
+                return number
+        idle = self._idle()
+        # One that waits to be started again is the last choice: it may have to wait long.
+        if (not idle or self._rank(idle[0]) == 2) and len(self._workers) < self._most:
+            return self._add()
+        return idle[0] if idle else None
+
+    idle = False
+    """Its processes may say something at any time."""
+
+    def advance(self, now: float) -> None:
+        """Do all that is due, and let those go that are needed no more."""
+        if now >= self._soonest:
+            self._touched.update(number for number, due in self._due.items() if now >= due)
+        for number in tuple(self._touched):
+            if number in self._workers:
+                self._workers[number].advance(now)
+        if self._leaving:
+            self._leaving = [worker for worker in self._leaving if worker.children()]
+        if self._idle_since or len(self._workers) > KEPT:
+            self._retire(now)
+
+    def _retire(self, now: float) -> None:
+        """Of idle workers only the lowest numbers stay; the others leave when they have been idle
+        for long."""
+        before = self._idle_since
+        spare = sorted(number for number, worker in self._workers.items() if not worker.busy)[KEPT:]
+        self._idle_since = {number: before.get(number, now) for number in spare}
+        self._touched |= before.keys() ^ self._idle_since.keys()  # what is due of these has changed
+        for number in [n for n, since in self._idle_since.items() if now >= since + IDLE_LIMIT]:
+            leaver = self._workers.pop(number)
+            for wanting in self._streams.values():
+                wanting.discard(number)
+            leaver.close(now)
+            self._leaving.append(leaver)
+            del self._idle_since[number]
+            self._due.pop(number, None)
+
+    def due(self) -> float | None:
+        """When `advance` has something to do at the latest (s)."""
+        if self._touched:
+            self._gather_reports()
+            for number in self._touched & self._workers.keys():
+                self._learn_due(number)
+            self._touched.clear()
+            self._soonest = min(self._due.values(), default=math.inf)
+        if self._reports:
+            return self._clock()
+        return self._soonest if self._soonest < math.inf else None
+
+    def _learn_due(self, number: int) -> None:
+        due = self._workers[number].due()
+        retires = self._idle_since.get(number, math.inf) + IDLE_LIMIT
+        self._due[number] = min(retires, math.inf if due is None else due)
+
+    def reports(self) -> list[Report]:
+        """What happened since the last call, in order."""
+        if self._touched:
+            self._gather_reports()
+        reports, self._reports = self._reports, []
+        return reports
+
+    def _gather_reports(self) -> None:
+        for number in sorted(self._touched):
+            if number in self._workers:
+                for report in self._workers[number].reports():
+                    self._take_report(number, report)
+
+    def _take_report(self, number: int, report: Report) -> None:
+        if isinstance(report, Told):
+            self._take_answer(number, report)
+            return
+        if isinstance(report, Ended):
+            self._at.pop(report.id, None)
+            self._held = self._held and bool(self._at)  # a hold ends with the runs that it held
+        elif isinstance(report, Asked):
+            self._asked[report.id] = number
+        elif isinstance(report, Dropped):
+            self._asked.pop(report.id, None)
+        self._reports.append(report)
+
+    # --- streams ------------------------------------------------------------------------------
+
+    def _want(self, number: int, stream: str) -> None:
+        self._streams.setdefault(stream, set()).add(number)
+        self._wanted(stream)
+
+    def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
+        """Tell the workers that have asked where a stream is received: another one would take the
+        stream over."""
+        for number in self._streams.pop(stream, ()):
+            if number in self._workers:
+                self._workers[number].stream_at(stream, host, port, ticket)
+
+    # --- operator -----------------------------------------------------------------------------
+
+    def command(self, now: float, id: str, verb: str) -> None:  # noqa: A002
+        """Carry out an operator's command in every worker that has a run. What only the node knows
+        needs none of them: `status` is answered although all of them may be blocked by their
+        actions."""
+        if verb in ("hold", "release"):
+            self._held = verb == "hold"
+        asked = set() if verb in ("status", PICTURE) else set(self._at.values())
+        if not asked:
+            word, why = self.condition if verb == "status" else (DONE.get(verb, "stopped"), "")
+            self._tell(id, word, why)
+            return
+        self._commands[id] = _Gathered(verb, asked)
+        self._touched |= asked
+        for number in sorted(asked):
+            self._workers[number].command(now, id, verb)
+
+    def _take_answer(self, number: int, told: Told) -> None:
+        command = self._commands.get(told.id)
+        if command is None or number not in command.missing:
+            return
+        command.missing.discard(number)
+        command.answers.append(told.answer)
+        if not command.missing:
+            del self._commands[told.id]
+            good = DONE.get(command.verb, "stopped")
+            self._tell(
+                told.id, next((answer for answer in command.answers if answer != good), good)
+            )
+
+    def _tell(self, id_: str, word: str, why: str = "") -> None:
+        data = {
+            "text": why,
+            "runs": list(self._at),
+            "pids": self.pids(),
+            "state": {},
+            "workers": len(self._workers),
+        }
+        self._reports.append(Told(id_, word, data))
+
+    def close(self, now: float) -> None:
+        """Let the processes end in good order."""
+        for worker in self._workers.values():
+            worker.close(now)

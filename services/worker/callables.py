@@ -1,0 +1,91 @@
+"""Code of users as Python callables: arguments checked against their signature, what they raise
+described in one line."""
+
+from __future__ import annotations
+
+import dis
+import inspect
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+_SERVICES = Path(__file__).parents[1]
+_OURS = (f"{_SERVICES}/worker/", f"{_SERVICES}/node/", f"{_SERVICES}/device.py")
+"""Files whose frames are left out of the traceback that users see."""
+LONGEST = 2_000
+"""Characters of a description: what an exception says may be as long as what it is about."""
+_RAISE = dis.opmap["RAISE_VARARGS"]
+
+
+@lru_cache(maxsize=4096)
+def _parameters(function: Callable[..., Any]) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names of a callable's parameters after the context, those without default, and whether it
+    takes any name."""
+    parameters = list(inspect.signature(function).parameters.values())[1:]
+    named = [p for p in parameters if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    needed = tuple(p.name for p in named if p.default is p.empty)
+    return (
+        tuple(sorted(p.name for p in named)),
+        needed,
+        any(p.kind is p.VAR_KEYWORD for p in parameters),
+    )
+
+
+def check_arguments(function: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+    """Raise TypeError that names the argument which does not fit and what would; the first
+    parameter is the context."""
+    names, needed, takes_any = _parameters(function)
+    for name in arguments:
+        if name not in names and not takes_any:
+            raise TypeError(f"takes no argument {name!r}; it takes: {', '.join(names) or 'none'}")
+    for name in needed:
+        if name not in arguments:
+            raise TypeError(
+                f"needs the argument {name!r}; give it as args in services.toml or in the task"
+            )
+
+
+def words_of(fault: BaseException) -> str:
+    """The message of an exception as a text that can always be sent: cut at `LONGEST` characters,
+    and what is not Unicode escaped."""
+    try:
+        said = str(fault)
+    except Exception as worse:
+        said = f"(its message cannot be had: {type(worse).__name__})"
+    if len(said) > LONGEST:
+        said = f"{said[:LONGEST]}... ({len(said):,} characters)"
+    return said.encode("utf-8", "backslashreplace").decode()
+
+
+def describe(fault: BaseException) -> str:
+    """Type and message of an exception and the last three places of the user's own code that it
+    came through."""
+    frames = [
+        f for f in traceback.extract_tb(fault.__traceback__) if not f.filename.startswith(_OURS)
+    ][-3:]
+    places = " < ".join(f"{f.name} ({Path(f.filename).name}:{f.lineno})" for f in reversed(frames))
+    return f"{type(fault).__name__}: {words_of(fault)}" + (f" in {places}" if places else "")
+
+
+def from_outside(fault: BaseException) -> bool:
+    """Whether the exception is the Ctrl-C of a person at a terminal, and no doing of the code that
+    it hit.
+
+    Python raises KeyboardInterrupt for it wherever the main thread is; code that raises one itself
+    does it by a `raise`.
+    """
+    if (
+        not isinstance(fault, KeyboardInterrupt)
+        or threading.current_thread() is not threading.main_thread()
+    ):
+        return False
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return False  # a worker ignores the signal, a node takes it in its loop
+    place = fault.__traceback__
+    while place is not None and place.tb_next is not None:
+        place = place.tb_next
+    return place is None or place.tb_frame.f_code.co_code[place.tb_lasti] != _RAISE

@@ -1,0 +1,224 @@
+"""The context of one run: the only way in which an action touches the world."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from petrobot.services.action import Result, Status, Wait
+from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.services.comm.protocol.codec import NAME_LENGTH, ProtocolError, encode
+from petrobot.services.comm.protocol.messages import Call, Event, Feedback, Message, Outcome
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.worker.callables import describe, words_of
+from petrobot.services.worker.outlets import Outlets
+from petrobot.services.worker.runs import (
+    Answered,
+    Asked,
+    Begin,
+    Dropped,
+    Judged,
+    Progressed,
+    Raised,
+    Report,
+)
+
+
+class CallFailed(Exception):  # noqa: N818 - what happened, not a class of errors
+    """A service that the action depends on answered FAILURE or ERROR; `result` says how."""
+
+    def __init__(self, service: str, result: Result) -> None:
+        super().__init__(f"{service}: {result.status} {result.cause} {result.text}".rstrip())
+        self.result = result
+
+
+def never() -> bool:
+    """What a run waits for that only waits for time."""
+    return False
+
+
+def checked(message: Message) -> None:
+    """Refuse what no peer would take, where the value is made: later it could only cost the
+    connection. Raises ValueError."""
+    try:
+        encode(message)
+    except ProtocolError as fault:
+        raise ValueError(fault.text) from None
+
+
+def checked_result(identity: str, returned: Any, where: str = "result") -> Result:
+    """What an action or a service returned as a result in plain data that can be sent. Raises
+    ValueError for any other, naming its values as `where` says."""
+    if not isinstance(returned, Result):
+        name = type(returned).__name__
+        raise ValueError(f"returned a {name}; return success(), failure() or error()")
+    try:
+        values = plain(returned.values, where)
+        if type(values) is not dict:
+            raise ValueError(f"{where}: expected values by name, found a {type(values).__name__}")
+        said = (plain(str(returned.cause)), plain(str(returned.text)), bool(returned.deferred))
+        result = Result(Status(returned.status), values, *said)
+        checked(
+            Outcome(
+                identity, result.status, values, result.cause, result.text, deferred=result.deferred
+            )
+        )
+    except (TypeError, ValueError, MemoryError) as fault:
+        raise ValueError(words_of(fault) or type(fault).__name__) from None
+    except Exception as fault:  # the value's own code: an object may raise whatever is asked of it
+        raise ValueError(f"its values cannot be read: {describe(fault)}") from None
+    return result
+
+
+class RunContext:
+    """Implements `services.action.Context` for one run of a `Runner`."""
+
+    def __init__(
+        self,
+        begin: Begin,
+        device: Any,
+        clock: Callable[[], float],
+        outlets: Outlets,
+        report: Callable[[Report], None],
+    ) -> None:
+        self.held = 0.0
+        """Seconds for which the operator has held the run."""
+        self._begin = begin
+        self._device = device
+        self._clock = clock
+        self._outlets = outlets
+        self._report = report
+        self._children = 0
+        self._answers: dict[str, Result] = {}
+        self._waiting: set[str] = set()
+        self._generators: dict[str, np.random.Generator] = {}
+
+    @property
+    def now(self) -> float:
+        """The cell's clock, without the time for which the run was held (s)."""
+        return self._clock() - self.held
+
+    @property
+    def run(self) -> str:
+        """This run's id."""
+        return self._begin.id
+
+    @property
+    def device(self) -> Any:
+        """The handle of the action's device, None without one."""
+        return self._device
+
+    def wait(self, ready: Callable[[], bool], timeout: float | None = None) -> Wait:
+        """Awaitable: True as soon as `ready()` holds, False after `timeout` seconds."""
+        return Wait(ready, None if timeout is None else self._clock() + timeout)
+
+    def sleep(self, seconds: float) -> Wait:
+        """Awaitable: goes on after so many seconds of the cell's clock."""
+        return Wait(never, self._clock() + seconds)
+
+    def publish(self, stream: str, values: Sequence[float]) -> None:
+        """Make `values` the newest set point of a stream; repeated while the run goes on and stands
+        by it."""
+        self._outlets.publish(self._clock(), self.run, stream, values)
+
+    def withdraw(self, stream: str) -> None:
+        """Stop standing by the last set point of a stream."""
+        self._outlets.withdraw(stream, self.run)
+
+    def raise_event(self, name: str, **data: Any) -> None:
+        """Raise a named internal event while the run goes on."""
+        raised = Raised(self.run, plain(name, "name"), plain(data, "data"))
+        checked(Event(raised.name, self._begin.action, 1, raised.data, self.run))
+        self._report(raised)
+
+    def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
+        """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's
+        id or no status."""
+        said = VerdictSaid(run, Status(status).value, str(cause), str(text))
+        name = verdict_event(mission_of(run))
+        checked(Outcome(run, said.status, cause=said.cause, text=said.text))
+        checked(Event(name, self._begin.action, 1, said.to_data()))
+        self._report(Judged(self.run, run, said.status, said.cause, said.text))
+
+    def progress(self, fraction: float, **data: Any) -> None:
+        """Tell how far the run is, 0 to 1 (clipped)."""
+        if not math.isfinite(fraction):
+            raise ValueError(f"progress is {fraction}; give a number from 0 to 1")
+        progressed = Progressed(self.run, min(1.0, max(0.0, float(fraction))), plain(data, "data"))
+        checked(Feedback(self.run, progressed.fraction, progressed.data))
+        self._report(progressed)
+
+    async def call(
+        self, service: str, /, deadline: float | None = None, **arguments: Any
+    ) -> Result:
+        """Call any network service by its name; a call still open when the run is cancelled is
+        cancelled with it. Raises ValueError or TypeError for what cannot be sent."""
+        self._children += 1
+        child = f"{self.run}/{self._children}"
+        limit = None if deadline is None else float(deadline)
+        asked = Asked(
+            self.run,
+            child,
+            plain(service, "service"),
+            plain(arguments, "arguments"),
+            limit,
+            self._begin.seed,
+        )
+        # The node adds the boot of its peer: as long as any name of it, so that what passes here
+        # passes there.
+        boot = "b" * NAME_LENGTH
+        checked(
+            Call(child, asked.service, asked.arguments, limit, 0, boot, self.run, self._begin.seed)
+        )
+        self._report(asked)
+        self._waiting.add(child)
+        try:
+            await Wait(lambda: child in self._answers)
+        finally:
+            self._waiting.discard(child)
+            if child not in self._answers:
+                self._report(Dropped(child))
+        return self._answers.pop(child)
+
+    async def get(self, name: str) -> Any:
+        """Read a global-memory variable (None if it was never written). Raises CallFailed."""
+        return (await self._memory("memory.get", name=name)).values.get("value")
+
+    async def put(self, name: str, value: Any) -> int:
+        """Write a global-memory variable; gives its new version. Raises CallFailed."""
+        return int((await self._memory("memory.put", name=name, value=value)).values["version"])
+
+    async def compare_and_set(self, name: str, version: int, value: Any) -> bool:
+        """Write a variable if its version is still the given one (0: never written). Raises
+        CallFailed."""
+        result = await self._memory(
+            "memory.compare_and_set", name=name, version=version, value=value
+        )
+        return result.status is Status.SUCCESS
+
+    async def _memory(self, service: str, **arguments: Any) -> Result:
+        result = await self.call(service, None, **arguments)
+        if result.status is Status.ERROR:
+            raise CallFailed(service, result)
+        return result
+
+    def random(self, purpose: str) -> np.random.Generator:
+        """A generator keyed by (seed, run, purpose); asking again goes on with the same one."""
+        if purpose not in self._generators:
+            key = f"{self._begin.seed}\0{self.run}\0{purpose}".encode()
+            words = np.frombuffer(hashlib.sha256(key).digest(), dtype="<u4")
+            self._generators[purpose] = np.random.default_rng([int(w) for w in words])
+        return self._generators[purpose]
+
+    def answer(self, answered: Answered) -> bool:
+        """Take the end of a call; False when this run does not wait for it."""
+        if answered.id not in self._waiting:
+            return False
+        self._answers[answered.id] = Result(
+            Status(answered.status), answered.values, answered.cause, answered.text
+        )
+        return True

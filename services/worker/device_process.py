@@ -1,0 +1,259 @@
+"""The process of a cyclic driver: paced by absolute deadline, no user code of actions in it.
+
+Commands of actions come and states go over a `NewestLink` to the device's worker; the node's orders
+come over its pipe. When the worker is gone the stop routine is called; when the node is gone the
+device is stopped and the process ends. When the node is silent, or its latch says that somebody has
+stopped the device in an emergency, the device is stopped and stays so.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import math
+import os
+import socket
+import time
+from typing import Any
+
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.device import PICTURE, Driver, picture_of, stop_at_once
+from petrobot.services.node.emergency_stops import BEAT, Guard
+from petrobot.services.node.ports import ProcessPorts
+from petrobot.services.worker.callables import describe
+from petrobot.services.worker.pipe import NewestLink, Pipe
+from petrobot.services.worker.remote import (
+    BARRED,
+    CLEAR_EMERGENCY,
+    EMERGENCY_STOP,
+    NODE_SILENT,
+    CyclicDriver,
+    DeviceCommand,
+)
+from petrobot.services.worker.runner import STOP_LIMIT
+from petrobot.services.worker.runs import Told, flat
+
+LINKED = "linked"
+"""What the node says when it has passed the link of a new worker."""
+HALT = "halt"
+"""Verb of the node's own stop order, answered when the device stands still."""
+_log = logging.getLogger(__name__)
+TELL_OVERRUN = 1.0
+"""Seconds that a driver must have stood still for the log to say so."""
+PRIORITY = 50
+"""SCHED_FIFO priority, where the system permits it."""
+
+
+def take_priority() -> bool:
+    """Ask for real-time scheduling; False where it is not permitted (needs CAP_SYS_NICE or an
+    rtprio limit)."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except (PermissionError, OSError):
+        return False
+    return True
+
+
+class DeviceError(Exception):
+    """A driver has raised what it must not; the text says what and where. Its device was stopped as
+    far as it still could be."""
+
+
+class DeviceLoop:
+    """Steps one driver for as long as its node lives."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        ports: ProcessPorts,
+        node: Pipe,
+        descriptors: socket.socket,
+        guard: Guard | None = None,
+    ) -> None:
+        """`descriptors` is the socket through which the node passes the link of each new worker."""
+        assert driver.period
+        self._descriptors = descriptors
+        self._driver = driver
+        self._cyclic = CyclicDriver(driver)
+        self._period = driver.period
+        self._ports = ports
+        self._node = node
+        self._guard = guard
+        self._worker: NewestLink | None = None
+        self._stopping: dict[str, float] = {}
+        self._overruns = 0
+        self._latest = 0.0
+        self._tell_due = 0.0
+
+    def run(self) -> None:
+        """Step until the node is gone and the device stands still (or the stop routine's time is
+        over). Raises DeviceError."""
+        gc.collect()
+        gc.freeze()
+        try:
+            self._step_on()
+        except Exception as fault:
+            _log.exception("the driver of a device failed; its process ends and is started again")
+            self._stop_broken()
+            raise DeviceError(f"its driver failed: {describe(fault)}") from fault
+        finally:
+            try:
+                self._driver.close()
+            except Exception:
+                _log.exception("a driver failed while it was let go")
+            if self._worker is not None:
+                self._worker.close()
+
+    def _stop_broken(self) -> None:
+        """Stop a device whose driver has failed: as long as it still can be stepped, until it
+        stands or time is over."""
+        end = time.monotonic() + STOP_LIMIT
+        try:
+            stop_at_once(self._driver, time.monotonic())
+            while (now := time.monotonic()) < end and not self._driver.stopped():
+                self._driver.step(now)
+                time.sleep(self._period)
+        except Exception as fault:
+            _log.error("it could not be stopped either: %s", describe(fault))
+
+    def _step_on(self) -> None:
+        due, end = time.monotonic(), float("inf")
+        while True:
+            now = self._sleep_until(due)
+            if self._node.closed and end == float("inf"):
+                self._driver.stop(now)
+                end = now + STOP_LIMIT
+            self._cycle(now)
+            if now >= end or (end < float("inf") and self._driver.stopped()):
+                break
+            due = self._next(due, time.monotonic())
+
+    def _sleep_until(self, due: float) -> float:
+        now = time.monotonic()
+        if now < due:
+            time.sleep(due - now)
+            now = time.monotonic()
+        self._latest = max(self._latest, now - due)
+        return now
+
+    def _next(self, due: float, now: float) -> float:
+        """The next point of the grid. Missed cycles are left out: made up for in a burst, they
+        would make a drive jump."""
+        missed = max(0, math.floor((now - due) / self._period))
+        if missed:
+            self._overruns += missed
+            late = now - due - self._period
+            self._latest = max(self._latest, late)
+            if late >= TELL_OVERRUN and now >= self._tell_due:
+                self._tell_due = now + 10 * TELL_OVERRUN
+                _log.warning(
+                    "a cycle of %g s took %.3f s: %d cycles were left out",
+                    self._period,
+                    now - due,
+                    missed,
+                )
+        return due + (missed + 1) * self._period
+
+    def _cycle(self, now: float) -> None:
+        if not self._node.closed:
+            for items in self._node.read():
+                if self._guard is not None:
+                    self._guard.heard(now, items[0] == BEAT)
+                self._obey(now, items)
+            if self._guard is not None and now >= self._guard.due:
+                self._watch(now, self._guard)
+        self._take_commands(now)
+        self._ports.poll()
+        state = self._cyclic.step(now)
+        if self._worker is not None:
+            published = plain(state.state, "state")
+            self._worker.send(
+                [
+                    state.handled,
+                    state.refused,
+                    state.stopped,
+                    published,
+                    state.refusal,
+                    state.barred,
+                ]
+            )
+        for id_, until in list(self._stopping.items()):
+            if state.stopped or now >= until:
+                del self._stopping[id_]
+                self._tell(id_, "stopped" if state.stopped else "moving")
+        for name, data in self._ports.raised():
+            self._node.post(["raised", "", name, data])
+
+    def _watch(self, now: float, guard: Guard) -> None:
+        """Stop the device without an order where nobody may be able to give one."""
+        cause, before = guard.look(now), self._cyclic.barred
+        if cause == EMERGENCY_STOP:
+            if before != EMERGENCY_STOP:
+                self._cyclic.emergency_stop(now)
+        elif cause == NODE_SILENT:
+            if not before:
+                self._cyclic.node_silent(now)
+        else:
+            self._cyclic.node_speaks()
+        if self._cyclic.barred != before:
+            _log.warning(
+                "%s",
+                BARRED.get(self._cyclic.barred, "the node speaks again: commands are taken again"),
+            )
+
+    def _take_commands(self, now: float) -> None:
+        if self._worker is None:
+            return
+        for number, verb, body in self._worker.read():
+            self._cyclic.take(now, DeviceCommand(number, verb, body))
+        if self._worker.closed:
+            self._driver.stop(now)
+            self._worker.socket.close()
+            self._worker = None
+
+    def _obey(self, now: float, items: list[Any]) -> None:
+        if items[0] == BEAT:
+            return
+        if items[0] == LINKED:
+            self._attach()
+        elif items[0] == "command":
+            _, id_, verb = items
+            if verb == HALT:
+                self._driver.stop(now)
+                self._stopping[id_] = now + STOP_LIMIT
+            elif verb == "stop":
+                self._driver.stop(now)
+                self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
+            elif verb == EMERGENCY_STOP:
+                self._cyclic.emergency_stop(now)
+                self._tell(id_, "stopped" if self._driver.stopped() else "stopping")
+            elif verb == CLEAR_EMERGENCY:
+                self._cyclic.clear_emergency()
+                self._tell(id_, "cleared")
+            elif verb == "hold":
+                self._tell(id_, self._driver.hold(now))
+            elif verb == "release":
+                self._driver.release(now)
+                self._tell(id_, "released")
+            elif verb == PICTURE:
+                self._node.post(flat(Told(id_, PICTURE, picture_of(self._driver))))
+            else:
+                self._tell(id_, "up")
+
+    def _attach(self) -> None:
+        """A new worker: take the end of its link."""
+        _, found, _, _ = socket.recv_fds(self._descriptors, 1, 1)
+        end = socket.socket(fileno=found[0])
+        if self._worker is not None:
+            self._worker.close()
+        self._worker = NewestLink(end)
+        self._cyclic.forget()
+
+    def _tell(self, id_: str, answer: str) -> None:
+        data = {
+            "state": plain(self._driver.state(), "state"),
+            "late_ms": round(1e3 * self._latest, 3),
+            "overruns": self._overruns,
+            "refused": self._cyclic.refused,
+        }
+        self._node.post(flat(Told(id_, answer, data)))

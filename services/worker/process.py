@@ -1,0 +1,301 @@
+"""A process of a node: the warm worker that runs the actions of a device (or of none), or the
+process of a cyclic driver.
+
+Forked by its keeper (`services/worker/keeper.py`) with the numbers of the inherited sockets PIPE
+DESCRIPTORS LINK (-1: none) and of the memory BEGUN, where it counts the runs that it begins. The
+node says over the pipe which it is to be. A process that makes its device's driver and finds it
+cyclic serves the driver alone.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import resource
+import select
+import selectors
+import signal
+import socket
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from petrobot.services.comm.calls.latch import latch_of
+from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.device import Driver
+from petrobot.services.host.parent_death import STOP_ROUTINE, outlive
+from petrobot.services.node.drivers import make_driver
+from petrobot.services.node.emergency_stops import BEAT, Guard
+from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.ports import ProcessPorts
+from petrobot.services.scripted import load as load_script
+from petrobot.services.worker.device_process import DeviceError, DeviceLoop, take_priority
+from petrobot.services.worker.outlets import StreamOutlets
+from petrobot.services.worker.pipe import Counter, NewestLink, Pipe, keep_from_copies
+from petrobot.services.worker.remote import DeviceCommand, DeviceState, RemoteDriver
+from petrobot.services.worker.runs import Begin, Order, Raised, Sent, flat, record
+
+POLL = 0.002
+"""Seconds between looks at what a run waits for, when it is more than time."""
+BORN, READY, FAILED, COMMAND, PING, PONG = "born", "ready", "failed", "command", "ping", "pong"
+WANTED, STREAM_AT = "wanted", "stream_at"
+LINK_LOST, NO_MEMORY = 90, 91
+"""Exit codes: the driver's process is gone; not even the report of a run fits into the memory that
+is left."""
+
+
+_IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What the node tells its new process."""
+
+    source: str
+    """Path of services.toml, and its text as the node read it."""
+    text: str
+    node: str
+    device: str
+    """Empty: actions that need none."""
+    mock: str = ""
+    memory: int = 0
+    """Limit of the address space (bytes), 0 for none."""
+    tickets: Mapping[str, str] = field(default_factory=dict)
+    """What opens each stream that this node receives."""
+
+    def items(self) -> Mapping[str, Any]:
+        """As plain data."""
+        return asdict(self)
+
+
+class Worker:
+    """Runs actions: orders come and reports go over the node's pipe, device commands and states
+    over the link."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        directory: Directory,
+        node: Pipe,
+        begun: Counter,
+        *,
+        link: NewestLink | None = None,
+        driver: Driver | None = None,
+        ports: ProcessPorts | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        self._node = node
+        self._guard = guard
+        self._barred = ""
+        self._begun = begun
+        self._link = link
+        self._ports = ports
+        self._remote = RemoteDriver(self._post_command, time.monotonic) if link else None
+        actions = {
+            a.name: a
+            for a in directory.actions.values()
+            if (a.node, a.device) == (setup.node, setup.device)
+        }
+        scripted = load_script(setup.mock) if setup.mock else {}
+        self._place = InlinePlace(
+            actions,
+            clock=time.monotonic,
+            driver=driver,
+            remote=self._remote,
+            streams={s.name: s.period for s in directory.streams.values()},
+            substitutes={name: script for name, script in scripted.items() if name in actions},
+        )
+        self._place.warm()
+        self._outlets = StreamOutlets(directory, f"{setup.node} {setup.device or 'actions'}")
+        self._connecting = False
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(node, selectors.EVENT_READ)
+        if link is not None:
+            self._selector.register(link, selectors.EVENT_READ)
+
+    def await_device(self) -> None:
+        """Wait for the first state of the driver at the other end of the link."""
+        while self._remote is not None and self._remote.age == float("inf"):
+            self._selector.select()
+            if self._link is not None:
+                self._read_link(self._link)
+
+    def run(self) -> None:
+        """Serve until the node is gone. Exits when the driver fails."""
+        while not self._node.closed:
+            self._selector.select(self._pause())
+            if self._link is not None:
+                self._read_link(self._link)
+            now = time.monotonic()
+            for items in self._node.read():
+                self._take(now, items)
+            if self._ports is not None:
+                self._ports.poll()
+            now = time.monotonic()
+            if self._guard is not None and now >= self._guard.due:
+                self._watch(now, self._guard)
+            self._place.advance(now)
+            if self._place.failed:
+                # Before the ends of its runs: no other run is to come here.
+                self._node.post([FAILED, self._place.failed])
+                self._report(now)
+                sys.exit(1)
+            self._report(now)
+        self._place.close(time.monotonic())
+        self._outlets.close()
+
+    def _watch(self, now: float, guard: Guard) -> None:
+        """Stop device and runs without an order where nobody may be able to give one."""
+        cause, before = guard.look(now), self._barred
+        self._barred = cause
+        # With a run again and again: it may have begun between a clearing and the next stop, both
+        # since the last look.
+        if cause and (cause != before or self._place.runs):
+            self._place.bar(now, cause)
+
+    def _pause(self) -> float | None:
+        """How long nothing can be due (s), None for as long as nothing comes in."""
+        if self._node.unsent:
+            return POLL
+        due = self._place.due()
+        if self._guard is not None:
+            due = self._guard.due if due is None else min(due, self._guard.due)
+        pause = None if due is None else max(0.0, due - time.monotonic())
+        busy = self._ports is not None and self._ports.busy
+        if self._place.polling or self._connecting or busy:
+            return POLL if pause is None else min(pause, POLL)
+        return pause
+
+    def _take(self, now: float, items: list[Any]) -> None:
+        if self._guard is not None:
+            self._guard.heard(now, items[0] == BEAT)
+        if items[0] == BEAT:
+            return
+        if items[0] == PING:
+            self._node.post([PONG, items[1]])
+        elif items[0] == COMMAND:
+            self._place.command(now, items[1], items[2])
+        elif items[0] == STREAM_AT:
+            _, stream, host, port, ticket = items
+            self._outlets.found(stream, host, port, ticket)
+        else:
+            order = record(items)
+            assert isinstance(order, Order)
+            if isinstance(order, Begin):
+                self._begun.count()  # before it: what is not counted was certainly not executed
+            self._place.take(now, order)
+
+    def _report(self, now: float) -> None:
+        for report in self._place.reports():
+            if not isinstance(report, Sent):
+                self._node.post(flat(report))
+            elif self._outlets.send(now, report):
+                self._node.post([WANTED, report.stream])
+        self._connecting = self._place.runs != () and self._outlets.advance()
+        for name, data in self._ports.raised() if self._ports else ():
+            self._node.post(flat(Raised("", name, data)))
+        if self._node.unsent:
+            self._node.flush()
+
+    def _read_link(self, link: NewestLink) -> None:
+        items = link.newest()
+        if items is not None and self._remote is not None:
+            self._remote.take(DeviceState(*items))
+        if link.closed:
+            # Without its driver nothing here can be done; the node starts both again.
+            os._exit(LINK_LOST)
+
+    def _post_command(self, command: DeviceCommand) -> None:
+        assert self._link is not None
+        if not self._link.send([command.number, command.verb, dict(command.body)]):
+            raise ConnectionError("the driver's process does not take commands")
+
+
+def _first(node: Pipe) -> Setup:
+    while True:
+        select.select([node], [], [])
+        for items in node.read():
+            return Setup(**items[0])
+        if node.closed:
+            sys.exit(0)
+
+
+def serve(
+    node: Pipe, descriptors: socket.socket | None, link: NewestLink | None, begun: Counter
+) -> None:
+    """Be what the node says. Faults of the driver go back to it as text."""
+    node.post([BORN, os.getpid()])
+    setup = _first(node)
+    if link is None and setup.device:
+        outlive(os.getppid(), STOP_ROUTINE)
+    if setup.memory:
+        resource.setrlimit(resource.RLIMIT_AS, (setup.memory, setup.memory))
+    try:
+        directory = parse(setup.text, Path(setup.source))
+        if link is None and setup.device:
+            ports = ProcessPorts(
+                directory, directory.devices[setup.device], time.monotonic, setup.tickets
+            )
+            driver = make_driver(directory, directory.devices[setup.device], ports)
+            guard = Guard(setup.device, latch_of(directory.source, setup.node))
+            if driver.period and descriptors is not None:
+                node.post(
+                    [
+                        READY,
+                        {
+                            "period": driver.period,
+                            "streams": ports.stream_ports(),
+                            "fifo": take_priority(),
+                        },
+                    ]
+                )
+                DeviceLoop(driver, ports, node, descriptors, guard).run()
+                return
+            worker = Worker(setup, directory, node, begun, driver=driver, ports=ports, guard=guard)
+            streams = ports.stream_ports()
+        else:
+            worker, streams = Worker(setup, directory, node, begun, link=link), {}
+        worker.await_device()
+        node.post([READY, {"period": None, "streams": streams, "fifo": False}])
+        worker.run()
+    except (DirectoryError, DeviceError, OSError, ValueError) as fault:
+        node.post([FAILED, str(fault)])
+        sys.exit(1)
+
+
+def log_to_stderr() -> None:
+    """Write what the modules of services log to the process's standard error, which is its node's
+    log."""
+    logging.basicConfig(
+        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s",
+        level=logging.INFO,
+    )
+
+
+def main(arguments: list[str]) -> None:
+    """What the process does, once it is forked."""
+    for number in _IGNORED:
+        # The node decides when its children end. A handler, unlike SIG_IGN, is not passed on to
+        # programs that user code starts.
+        signal.signal(number, lambda *_: None)
+    os.register_at_fork(after_in_child=_take_signals)
+    log_to_stderr()
+    pipe, descriptors, link = (
+        socket.socket(fileno=int(a)) if int(a) >= 0 else None for a in arguments[:3]
+    )
+    begun = Counter(int(arguments[3]))
+    assert pipe is not None
+    node, driver_link = Pipe(pipe), NewestLink(link) if link is not None else None
+    keep_from_copies(*([descriptors] if descriptors is not None else []))
+    try:
+        serve(node, descriptors, driver_link, begun)
+    except MemoryError:
+        os._exit(NO_MEMORY)
+
+
+def _take_signals() -> None:
+    for number in _IGNORED:
+        signal.signal(number, signal.SIG_DFL)

@@ -1,0 +1,267 @@
+"""A cyclic driver and the actions that use it, one command line apart: both ends as machines,
+inline and across processes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+from petrobot.services.comm.protocol.plain import plain
+from petrobot.services.device import Driver, stop_at_once
+from petrobot.services.worker.callables import describe, words_of
+
+_log = logging.getLogger(__name__)
+
+COMMAND, STOP = "command", "stop"
+EMERGENCY_STOP, CLEAR_EMERGENCY = "emergency_stop", "clear_emergency"
+"""An operator's verbs: stop at once and obey no action any more; obey actions again (nothing moves
+by that alone)."""
+IN_EMERGENCY = "emergency stop: clear it with `petrobot estop --clear` when the cell is safe"
+NODE_SILENT = "node_silent"
+NODE_IS_SILENT = (
+    "the device's node was silent, so the device was stopped: look why the node stood still"
+)
+BARRED: Mapping[str, str] = {EMERGENCY_STOP: IN_EMERGENCY, NODE_SILENT: NODE_IS_SILENT}
+"""Why a device accepts no commands, in words: by the cause that its runs end with."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceCommand:
+    """From the actions' end: a command of an action, or the stop routine."""
+
+    number: int
+    """Counts up from 1."""
+    verb: str = COMMAND
+    body: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceState:
+    """From the driver's end, each cycle; only the newest counts."""
+
+    handled: int = 0
+    refused: str = ""
+    """Why the last command was refused; empty if it was not."""
+    stopped: bool = False
+    state: Mapping[str, Any] = field(default_factory=dict)
+    refusal: tuple[int, str] = (0, "")
+    """Number of the last command that was refused (0: none), and why: a later command does not hide
+    it."""
+    barred: str = ""
+    """Cause for which the device was stopped and accepts no commands (a key of `BARRED`); empty if
+    it accepts them."""
+
+
+@runtime_checkable
+class Refusing(Protocol):
+    """A device whose driver may refuse commands after they were sent."""
+
+    @property
+    def sent(self) -> int:
+        """Number of the last command sent."""
+
+    @property
+    def age(self) -> float:
+        """Seconds since the driver last published its state."""
+
+    def refusal(self, since: int) -> str | None:
+        """Why a command after number `since` was refused that no action has looked at; empty if
+        none was, None as long as the driver still has commands to take."""
+
+
+class RemoteDriver:
+    """The actions' end: implements `services.device.Remote` for them and
+    `services.runner.DeviceControl` for the runner.
+
+    `post` sends a command; `take` is given each newer state. Where the driver lives in the same
+    process, `expect` is told instead where to get it: nothing is put together that nobody looks at.
+    """
+
+    def __init__(self, post: Callable[[DeviceCommand], None], clock: Callable[[], float]) -> None:
+        self._post = post
+        self._clock = clock
+        self._sent = 0
+        self._seen = 0
+        """Number of the last refused command whose refusal an action has looked at."""
+        self._taken = DeviceState()
+        self._source: Callable[[], DeviceState] | None = None
+        self._arrived = -float("inf")
+
+    @property
+    def _newest(self) -> DeviceState:
+        if self._source is not None:
+            self._taken, self._source = self._source(), None
+        return self._taken
+
+    @property
+    def handle(self) -> RemoteDriver:
+        """What actions see as `ctx.device`."""
+        return self
+
+    def send(self, body: Mapping[str, Any]) -> int:
+        """Send a command; gives its number. Raises ConnectionError when the driver's process is
+        gone."""
+        return self._number(COMMAND, plain(body, "command"))
+
+    @property
+    def handled(self) -> int:
+        """Number of the last command that the driver has taken."""
+        return self._newest.handled
+
+    @property
+    def refused(self) -> str:
+        """Why the last command was refused; empty if it was not. An action that reads the words
+        decides what they mean; a refusal that it never reads ends its run in ERROR."""
+        newest = self._newest
+        if newest.refused:
+            self._seen = newest.refusal[0]
+        return newest.refused
+
+    @property
+    def sent(self) -> int:
+        """Number of the last command sent."""
+        return self._sent
+
+    def refusal(self, since: int) -> str | None:
+        """Implements `Refusing`."""
+        newest = self._newest
+        number, why = newest.refusal
+        if number > max(since, self._seen):
+            return why
+        return "" if newest.handled >= self._sent else None
+
+    @property
+    def barred(self) -> str:
+        """Cause for which the device accepts no commands, empty if it accepts them."""
+        return self._newest.barred
+
+    @property
+    def state(self) -> Mapping[str, Any]:
+        """The driver's newest published state."""
+        return self._newest.state
+
+    @property
+    def age(self) -> float:
+        """Seconds since that state was published (inf before the first)."""
+        return self._clock() - self._arrived
+
+    def stop(self, now: float) -> None:
+        """Call the driver's stop routine."""
+        self._number(STOP, {})
+
+    def stopped(self) -> bool:
+        """Whether the device stands still after all that was sent to it."""
+        return self._newest.handled >= self._sent and self._newest.stopped
+
+    def take(self, state: DeviceState) -> None:
+        """A newer state came in."""
+        self._taken, self._source, self._arrived = state, None, self._clock()
+
+    def expect(self, source: Callable[[], DeviceState]) -> None:
+        """A newer state is there; `source` gives it when it is wanted."""
+        self._source, self._arrived = source, self._clock()
+
+    def _number(self, verb: str, body: Mapping[str, Any]) -> int:
+        self._sent += 1
+        self._post(DeviceCommand(self._sent, verb, body))
+        return self._sent
+
+
+class CyclicDriver:
+    """The driver's end: gives it the commands in order, steps it, and tells its state."""
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+        self.refused = 0
+        """How many commands were refused."""
+        self._handled = 0
+        self._refusal = (0, "")
+        self._emergency = self._silent = False
+
+    def emergency_stop(self, now: float) -> None:
+        """Stop at once, and refuse every command until `clear_emergency`."""
+        self._emergency = True
+        stop_at_once(self.driver, now)
+
+    def clear_emergency(self) -> None:
+        """Take commands again; the device stays as it is until one comes."""
+        self._emergency = False
+
+    def node_silent(self, now: float) -> None:
+        """Stop, and refuse every command until `node_speaks`: nobody could stop what the device
+        does."""
+        self._silent = True
+        self.driver.stop(now)
+
+    def node_speaks(self) -> None:
+        """Take commands again."""
+        self._silent = False
+
+    @property
+    def barred(self) -> str:
+        """Cause for which it takes no commands, empty if it takes them."""
+        return EMERGENCY_STOP if self._emergency else NODE_SILENT if self._silent else ""
+
+    def take(self, now: float, command: DeviceCommand) -> None:
+        """Carry out a command; what the driver refuses is told in the next state."""
+        self._handled = command.number
+        if command.verb == STOP:
+            self.driver.stop(now)
+            return
+        if self.barred:
+            self._refuse(command, BARRED[self.barred])
+            return
+        try:
+            self.driver.command(now, command.body)
+        except ValueError as fault:
+            self._refuse(command, words_of(fault) or type(fault).__name__)
+        except Exception as fault:
+            _log.exception("a driver failed on the command %.200r", command.body)
+            self._refuse(command, describe(fault))
+
+    def _refuse(self, command: DeviceCommand, why: str) -> None:
+        if why != self._refusal[1]:  # an action that repeats its command must not fill the log
+            _log.warning("command %.200r refused: %s", command.body, why)
+        self.refused += 1
+        self._refusal = (command.number, why)
+
+    def step(self, now: float) -> DeviceState:
+        """One cycle, and the state after it."""
+        self.driver.step(now)
+        return self.state()
+
+    def state(self) -> DeviceState:
+        """The state to publish."""
+        number, why = self._refusal
+        refused = why if number == self._handled else ""
+        # A driver that computes with numpy answers with a numpy bool, which no message carries.
+        stopped = bool(self.driver.stopped())
+        return DeviceState(
+            self._handled, refused, stopped, self.driver.state(), self._refusal, self.barred
+        )
+
+    def forget(self) -> None:
+        """The actions' end is another one now: its numbers begin anew."""
+        self._handled, self._refusal = 0, (0, "")
+
+
+class DirectDevice:
+    """A driver without period as the runner guards it: actions use the driver itself."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+
+    @property
+    def handle(self) -> Driver:
+        """What actions see as `ctx.device`."""
+        return self._driver
+
+    def stop(self, now: float) -> None:
+        """Call the stop routine."""
+        self._driver.stop(now)
+
+    def stopped(self) -> bool:
+        """Whether it is known to stand still."""
+        return self._driver.stopped()

@@ -1,0 +1,55 @@
+"""The receiving end of a set-point stream: newest value wins, and a watchdog on its age."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from petrobot.services.comm.streams.stream import STALE_AFTER
+
+SLACK = 1e-6  # s: three periods to the tick are not yet too old
+
+
+class SetpointReceiver:
+    """Implements `services.device.Setpoint` for the driver, and the `Sink` of whoever receives the
+    stream's messages."""
+
+    def __init__(self, period: float, clock: Callable[[], float]) -> None:
+        self._limit = STALE_AFTER * period + SLACK
+        self._clock = clock
+        self._values: tuple[float, ...] | None = None
+        self._arrived = -math.inf
+        self._published = -math.inf
+        self._count = 0
+
+    @property
+    def values(self) -> tuple[float, ...] | None:
+        """The newest set point, None before the first or when it is stale (older than three of its
+        periods)."""
+        return self._values if self.age <= self._limit else None
+
+    @property
+    def age(self) -> float:
+        """Seconds since the newest one arrived (inf before the first)."""
+        return self._clock() - self._arrived
+
+    @property
+    def held(self) -> float:
+        """Seconds since the sender first sent these values, but for their way here: a repeat makes
+        them no younger."""
+        return self._clock() - self._published
+
+    @property
+    def count(self) -> int:
+        """How many have arrived."""
+        return self._count
+
+    def take(self, values: Sequence[float], held: float = 0.0) -> None:
+        """A set point arrived, `held` seconds after its sender first sent these values."""
+        now = self._clock()
+        self._values, self._arrived, self._published = tuple(values), now, now - held
+        self._count += 1
+
+    def withdraw(self) -> None:
+        """The sender stands by it no more, or is gone: it is stale at once."""
+        self._values = None

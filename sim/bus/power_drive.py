@@ -1,0 +1,209 @@
+"""A CiA 402 drive's power state machine, whatever its mode of operation: commands, faults, quick
+stop, loss of master and SYNC."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, Final
+
+from petrobot.services.comm.canopen.cia301 import Abort, NmtState, SdoAbortError
+from petrobot.services.comm.canopen.cia402 import (
+    Command,
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    after,
+    command_of,
+    from_units,
+)
+from petrobot.sim.bus.canopen_node import CanopenNode
+
+_REGISTERS: Final = {
+    Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,
+    Fault.HEARTBEAT: 0x11, Fault.SYNC_LOST: 0x11, Fault.CAN_PASSIVE: 0x11, Fault.BUS_OFF_RECOVERED: 0x11,
+}  # fmt: skip
+_POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
+"""Faults after which a drive cannot brake by its motor: the brake takes over at once."""
+_CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
+POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+"""States in which the motor has torque."""
+_DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+_ENABLED: Final = State.OPERATION_ENABLED
+_REMOTE, _VOLTAGE, _FOLLOWS = (
+    int(StatusBit.REMOTE),
+    int(StatusBit.VOLTAGE_ENABLED),
+    int(StatusBit.FOLLOWS_COMMAND),
+)
+RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
+"""Statusword of a drive that follows its set points, without the bits of its mode."""
+ENABLE_MASK, ENABLE = Command.ENABLE_OPERATION.value
+"""Bits of a controlword that count for the command to follow set points, and their value."""
+
+
+def _calm() -> None:
+    """Nobody wants to know."""
+
+
+class PowerDrive(CanopenNode, ABC):
+    """One drive without its motor. A motor's drive names its `mode` and says how it begins, ramps
+    down and loses its torque."""
+
+    mode: ClassVar[Mode]
+    """The one mode of operation that it knows."""
+    fixed: ClassVar[tuple[Object, ...]] = (Object.MODE,)
+    """What must not be written while the motor has torque."""
+
+    def __init__(
+        self, node: int, eds: str, sync_patience: int, stir: Callable[[], None] = _calm
+    ) -> None:
+        """`sync_patience`: periods of 1006h without SYNC after which an enabled drive stops by
+        itself; `stir` is called whenever something happens that may change the motor's torque."""
+        super().__init__(node, eds)
+        self.stir = stir
+        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.powered = True
+        self.fault = Fault.NONE
+        self._patient_periods = sync_patience
+        self._sync_patience = math.inf
+        self._controlword = 0
+        self._synced = 0.0
+
+    # What a motor and its mode of operation add.
+    @abstractmethod
+    def begin(self, resumed: bool) -> None:
+        """Operation is enabled: let the brake go and take set points; `resumed`: out of a quick
+        stop."""
+
+    @abstractmethod
+    def ramp_down(self, deceleration: float) -> None:
+        """Come to rest at so many rad/s^2."""
+
+    @abstractmethod
+    def cut_power(self) -> None:
+        """No torque any more: the brake holds."""
+
+    def flags(self) -> int:
+        """Bits of the statusword that depend on the mode, while operation is enabled."""
+        return 0
+
+    def refresh(self) -> None:
+        """The objects have their defaults again, or the network state has changed: show what is
+        so."""
+
+    # Hooks of the CANopen node.
+    def on_nmt(self, now: float, before: NmtState) -> None:
+        """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion
+        (6007h = 2)."""
+        if before is NmtState.BOOT_UP:
+            if self.state not in _DOWN:
+                self._enter(State.SWITCH_ON_DISABLED)
+        elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:
+            self._quick_stop(State.QUICK_STOP_ACTIVE)
+        self._synced = now
+        self.refresh()
+
+    def after_receiving(self, now: float) -> None:
+        """Obey the controlword."""
+        word = self.values[_CONTROLWORD]
+        before, self._controlword = self._controlword, word
+        if word & ENABLE_MASK == ENABLE and self.state is _ENABLED:
+            return  # nothing new
+        command = command_of(word)
+        if command is Command.FAULT_RESET and before & 0x80:
+            return
+        if command is not None:
+            self._obey(now, command)
+
+    def on_master_lost(self, now: float) -> None:
+        """Stop by itself."""
+        self.trip(Fault.HEARTBEAT)
+
+    def after_configuring(self) -> None:
+        """Take over how the drive watches itself."""
+        self._sync_patience = (
+            self._patient_periods * self.values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
+        )
+
+    def check_write(self, index: int, sub: int, value: int) -> None:
+        """No other mode than its own, and no change of configuration while the motor has torque."""
+        if index == Object.MODE and value not in (Mode.NONE, self.mode):
+            raise SdoAbortError(Abort.VALUE, index, sub)
+        if index in self.fixed and self.state in POWERED:
+            raise SdoAbortError(Abort.STATE, index, sub)
+
+    # What happens to a drive.
+    def trip(self, fault: Fault) -> None:
+        """A fault occurs: EMCY, then a ramp to rest (the brake at once if there is no power for
+        it), then FAULT."""
+        if self.state in _DOWN:
+            return
+        self.fault = fault
+        self.report(fault, _REGISTERS.get(fault, 0x21))
+        if (
+            self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+            or fault in _POWERLESS
+        ):
+            self._enter(State.FAULT)
+        else:
+            self._quick_stop(State.FAULT_REACTION_ACTIVE)
+
+    def ramp_ended(self) -> None:
+        """The motor has come to rest after a fault."""
+        self._enter(State.FAULT)
+
+    def statusword(self) -> int:
+        """Object 6041h."""
+        if self.state is _ENABLED and self.powered:
+            return RUNNING | self.flags()
+        word: int = self.state.word | _REMOTE
+        if self.powered:
+            word |= _VOLTAGE
+        if self.state is _ENABLED:
+            word |= _FOLLOWS | self.flags()
+        return word
+
+    def late(self, now: float) -> bool:
+        """Whether SYNC has not come for too long."""
+        return now - self._synced > self._sync_patience + 1e-9
+
+    @property
+    def waits_until(self) -> float:
+        """When the drive misses SYNC (s)."""
+        return self._synced + self._sync_patience if self.state is _ENABLED else math.inf
+
+    # The state machine.
+    def _obey(self, now: float, command: Command) -> None:
+        state = after(self.state, command)
+        if state is self.state:
+            return
+        if self.state is State.FAULT:
+            if not self.powered:
+                return  # the cause is still there
+            self.fault = Fault.NONE
+            self.report(Fault.NONE, 0)
+        if state is State.OPERATION_ENABLED:
+            if self.nmt is not NmtState.OPERATIONAL or self.values[Object.MODE, 0] != self.mode:
+                return
+            self.begin(self.state is State.QUICK_STOP_ACTIVE)
+            self._synced = now
+            self.state = state
+            self.stir()
+        elif state is State.QUICK_STOP_ACTIVE:
+            self._quick_stop(state)
+        else:
+            self._enter(state)
+
+    def _quick_stop(self, state: State) -> None:
+        self.ramp_down(from_units(self.values[Object.QUICK_STOP_DECELERATION, 0]))
+        self.state = state
+        self.stir()
+
+    def _enter(self, state: State) -> None:
+        """A state without torque: the brake holds."""
+        self.cut_power()
+        self.state = state
+        self.stir()

@@ -1,0 +1,1 @@
+"""The laboratory of the catching cell: ball, table, arm and camera."""

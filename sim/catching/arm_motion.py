@@ -1,0 +1,250 @@
+"""A step of the arm's joints as pure numbers: motors, semi-implicit Euler, dry friction, hard
+stops. A kernel of sim/catching/puma.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from petrobot.services.host.numba_kernels import kernel
+
+Six = tuple[float, float, float, float, float, float]
+"""One number a joint, base to flange."""
+Matrix = tuple[Six, Six, Six, Six, Six, Six]
+
+STILL = 1e-4
+"""rad/s; slower than this and held by friction, a joint stops."""
+FADE = 0.15
+"""Above its greatest speed the motor's torque fades to nothing within this share of it (back
+EMF)."""
+
+
+@kernel
+def motor(tau: float, limit: float, speed: float, greatest: float) -> float:
+    """Torque (N m) of a motor that is asked for `tau`: within its limit, and beyond its greatest
+    speed less, at last none, for what would speed it up."""
+    high = low = limit
+    if speed > greatest:
+        high = max(0.0, 1.0 - (speed / greatest - 1.0) / FADE) * limit
+    elif speed < -greatest:
+        low = max(0.0, 1.0 - (-speed / greatest - 1.0) / FADE) * limit
+    return high if tau > high else -low if tau < -low else tau
+
+
+@kernel
+def motors(tau: Six, limit: Six, speed: Six, greatest: Six) -> Six:
+    """The same of six motors."""
+    return (
+        motor(tau[0], limit[0], speed[0], greatest[0]),
+        motor(tau[1], limit[1], speed[1], greatest[1]),
+        motor(tau[2], limit[2], speed[2], greatest[2]),
+        motor(tau[3], limit[3], speed[3], greatest[3]),
+        motor(tau[4], limit[4], speed[4], greatest[4]),
+        motor(tau[5], limit[5], speed[5], greatest[5]),
+    )
+
+
+@kernel
+def held(drive: Six, bias: Six, hold: Six) -> bool:
+    """Whether friction and brakes can hold a standing arm against what pulls at it."""
+    return (
+        -hold[0] <= drive[0] - bias[0] <= hold[0]
+        and -hold[1] <= drive[1] - bias[1] <= hold[1]
+        and -hold[2] <= drive[2] - bias[2] <= hold[2]
+        and -hold[3] <= drive[3] - bias[3] <= hold[3]
+        and -hold[4] <= drive[4] - bias[4] <= hold[4]
+        and -hold[5] <= drive[5] - bias[5] <= hold[5]
+    )
+
+
+@kernel
+def _row(row: Six, t: Six) -> float:
+    return (
+        row[0] * t[0]
+        + row[1] * t[1]
+        + row[2] * t[2]
+        + row[3] * t[3]
+        + row[4] * t[4]
+        + row[5] * t[5]
+    )
+
+
+@kernel
+def pushed(dt: float, speed: Six, inverse: Matrix, t: Six) -> Six:
+    """Speeds (rad/s) after `dt` (s) under torques `t` (N m), by the inverse of the mass matrix."""
+    return (
+        speed[0] + dt * _row(inverse[0], t),
+        speed[1] + dt * _row(inverse[1], t),
+        speed[2] + dt * _row(inverse[2], t),
+        speed[3] + dt * _row(inverse[3], t),
+        speed[4] + dt * _row(inverse[4], t),
+        speed[5] + dt * _row(inverse[5], t),
+    )
+
+
+@kernel
+def _stopping(friction: float, speed: float, gain: float, hold: float) -> float:
+    """The friction that stops a joint within the step, at most what friction can hold."""
+    f = friction - speed / gain
+    return hold if f > hold else -hold if f < -hold else f
+
+
+@kernel
+def rubbed(dt: float, speed: Six, inverse: Matrix, before: Six, hold: Six) -> tuple[Six, Six]:
+    """Dry friction (N m) and the speeds that it leaves: the torque that would stop a joint within
+    the step, at most `hold`.
+
+    Last step's friction `before` is the first guess (already in `speed`), so the coupling of the
+    joints settles over a few steps. Where the guess was right, as it is while all joints slide,
+    there is nothing to take off.
+    """
+    friction = (
+        _stopping(before[0], speed[0], dt * inverse[0][0], hold[0]),
+        _stopping(before[1], speed[1], dt * inverse[1][1], hold[1]),
+        _stopping(before[2], speed[2], dt * inverse[2][2], hold[2]),
+        _stopping(before[3], speed[3], dt * inverse[3][3], hold[3]),
+        _stopping(before[4], speed[4], dt * inverse[4][4], hold[4]),
+        _stopping(before[5], speed[5], dt * inverse[5][5], hold[5]),
+    )
+    if friction == before:
+        return friction, speed
+    v0, v1, v2, v3, v4, v5 = speed
+    for f, last, row in zip(friction, before, inverse):  # noqa: B905 - numba knows no strict zip
+        if f != last:
+            push = dt * (f - last)  # the matrix is symmetric: a row is a column
+            v0, v1, v2 = v0 + push * row[0], v1 + push * row[1], v2 + push * row[2]
+            v3, v4, v5 = v3 + push * row[3], v4 + push * row[4], v5 + push * row[5]
+    return friction, (v0, v1, v2, v3, v4, v5)
+
+
+@kernel
+def accelerated(
+    dt: float,
+    qd: Six,
+    drive: Six,
+    bias: Six,
+    inverse: Matrix,
+    viscous: Six,
+    friction: Six,
+    hold: Six,
+) -> tuple[Six, Six]:
+    """Dry friction (N m) and speeds (rad/s) after `dt` (s).
+
+    `drive`: the motors' torques; `bias`: those of gravity, Coriolis and centrifugal forces;
+    `viscous` (N m s/rad); `friction`: the last step's; `hold`: what friction and brakes can hold at
+    most.
+    """
+    torque = (
+        drive[0] - bias[0] - viscous[0] * qd[0] + friction[0],
+        drive[1] - bias[1] - viscous[1] * qd[1] + friction[1],
+        drive[2] - bias[2] - viscous[2] * qd[2] + friction[2],
+        drive[3] - bias[3] - viscous[3] * qd[3] + friction[3],
+        drive[4] - bias[4] - viscous[4] * qd[4] + friction[4],
+        drive[5] - bias[5] - viscous[5] * qd[5] + friction[5],
+    )
+    return rubbed(dt, pushed(dt, qd, inverse, torque), inverse, friction, hold)
+
+
+@kernel
+def _stopped(q: float, v: float, low: float, high: float) -> tuple[float, float]:
+    return (low, 0.0) if q < low else (high, 0.0) if q > high else (q, v)
+
+
+@kernel
+def moved(dt: float, q: Six, speed: Six, lower: Six, upper: Six) -> tuple[Six, Six]:
+    """Angles (rad) and speeds after `dt` (s); a joint that comes to an end of its range stops
+    there."""
+    q0, v0 = _stopped(q[0] + dt * speed[0], speed[0], lower[0], upper[0])
+    q1, v1 = _stopped(q[1] + dt * speed[1], speed[1], lower[1], upper[1])
+    q2, v2 = _stopped(q[2] + dt * speed[2], speed[2], lower[2], upper[2])
+    q3, v3 = _stopped(q[3] + dt * speed[3], speed[3], lower[3], upper[3])
+    q4, v4 = _stopped(q[4] + dt * speed[4], speed[4], lower[4], upper[4])
+    q5, v5 = _stopped(q[5] + dt * speed[5], speed[5], lower[5], upper[5])
+    return (q0, q1, q2, q3, q4, q5), (v0, v1, v2, v3, v4, v5)
+
+
+@kernel
+def stepped(
+    dt: float,
+    q: Six,
+    qd: Six,
+    tau: Six,
+    bias: Six,
+    inverse: Matrix,
+    friction: Six,
+    limit: Six,
+    greatest: Six,
+    viscous: Six,
+    hold: Six,
+    stick: Six,
+    lower: Six,
+    upper: Six,
+) -> tuple[Six, Six, Six, bool]:
+    """Angles, speeds and dry friction after `dt` (s), and whether the arm stands still from now on.
+
+    `tau`: what the motors are asked for; `limit` (N m), `greatest` (rad/s): theirs; `stick` (N m):
+    what holds a joint at rest.
+    """
+    drive = motors(tau, limit, qd, greatest)
+    friction, speed = accelerated(dt, qd, drive, bias, inverse, viscous, friction, hold)
+    if max(speed) < STILL and min(speed) > -STILL and held(drive, bias, stick):
+        return q, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), friction, True
+    q, speed = moved(dt, q, speed, lower, upper)
+    return q, speed, friction, False
+
+
+@kernel
+def _six(numbers: Sequence[float], first: int) -> Six:
+    return (
+        numbers[first],
+        numbers[first + 1],
+        numbers[first + 2],
+        numbers[first + 3],
+        numbers[first + 4],
+        numbers[first + 5],
+    )
+
+
+@kernel
+def _matrix(rows: Sequence[float]) -> Matrix:
+    return (
+        _six(rows, 0),
+        _six(rows, 6),
+        _six(rows, 12),
+        _six(rows, 18),
+        _six(rows, 24),
+        _six(rows, 30),
+    )
+
+
+@kernel
+def stepped_packed(
+    dt: float,
+    q: Six,
+    qd: Six,
+    tau: Six,
+    bias: Six,
+    friction: Six,
+    inverse: Sequence[float],
+    numbers: Sequence[float],
+) -> tuple[Six, Six, Six, bool]:
+    """`stepped`, where what seldom changes comes packed: the matrix row by row, then limit,
+    greatest, viscous, hold, stick, lower and upper in one. Compiled, handing those over as tuples
+    takes as long as the step itself."""
+    limit, greatest, viscous = _six(numbers, 0), _six(numbers, 6), _six(numbers, 12)
+    hold, stick, lower, upper = (
+        _six(numbers, 18),
+        _six(numbers, 24),
+        _six(numbers, 30),
+        _six(numbers, 36),
+    )
+    matrix = _matrix(inverse)
+    return stepped(
+        dt, q, qd, tau, bias, matrix, friction, limit, greatest, viscous, hold, stick, lower, upper
+    )
+
+
+@kernel
+def held_packed(tau: Six, speed: Six, bias: Six, numbers: Sequence[float]) -> bool:
+    """Whether friction and brakes hold an arm that stands, its motors asked for `tau`; `numbers` as
+    in `stepped_packed`."""
+    return held(motors(tau, _six(numbers, 0), speed, _six(numbers, 6)), bias, _six(numbers, 24))

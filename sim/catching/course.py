@@ -1,0 +1,66 @@
+"""What becomes of one throw, and the light barrier that tells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from petrobot.sim.catching.ball import BallState
+from petrobot.sim.catching.thrower import Throw
+
+
+class Outcome(StrEnum):
+    """What became of a throw."""
+
+    ROLLING = "rolling"
+    """Not decided yet."""
+    CAUGHT = "caught"
+    MISSED = "missed"
+    DROPPED = "dropped"
+    """It was in the cup and left it while the cup stood upright."""
+
+
+@dataclass(slots=True)
+class Course:
+    """What was seen of one throw so far. Times are seconds after its release, lengths m, base
+    frame."""
+
+    throw: Throw
+    released_at: float
+    outcome: Outcome = Outcome.ROLLING
+    exit_time: float = math.inf
+    """When the centre left the near edge; inf if it did not."""
+    exit_state: BallState | None = None
+    crossing: float = math.inf
+    """Least distance from the centre of the cup's mouth at which the ball's centre, once off the
+    table, went through the plane of the mouth from outside; inf if it never did."""
+    approach: float = math.inf
+    """Least distance of the ball's centre from the centre of the mouth."""
+    caught_at: float = math.inf
+    ended_at: float = math.inf
+    """When the ball was taken out of play."""
+
+    @property
+    def miss(self) -> float:
+        """How far from the middle of the mouth the ball came to it (m): in the plane of the mouth
+        where it crossed that, else its closest approach."""
+        return self.crossing if self.crossing < math.inf else self.approach
+
+
+@dataclass(slots=True)
+class Barrier:
+    """A light barrier with a filter: its output follows what it sees after `delay` seconds without
+    a change."""
+
+    delay: float
+    output: bool = False
+    _since: float = field(default=0.0)
+
+    def see(self, now: float, interrupted: bool) -> None:
+        """What it sees at `now` (s); call it at least once a tick."""
+        if interrupted == self.output:
+            self._since = now
+        elif now - self._since >= self.delay:
+            self.output = interrupted
+            self._since = now

@@ -1,0 +1,483 @@
+"""Six CiA 402 servo drives and the digital inputs on the arm's bus: frames in, torques on the arm,
+frames out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Protocol
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import SYNC_ID, NmtState
+from petrobot.services.comm.canopen.cia402 import (
+    RECEIVED,
+    SENT,
+    UNITS,
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    fault_text,
+    to_units,
+)
+from petrobot.sim.bus.canopen_node import CanopenNode
+from petrobot.sim.bus.power_drive import ENABLE, ENABLE_MASK, POWERED, RUNNING, PowerDrive
+from petrobot.sim.catching.servo import DriveRating, JointServo
+
+# The digital-input node on the arm's bus (CiA 401): light barrier in the cup and arm-power chain.
+
+
+class DigitalInputs(CanopenNode):
+    """Eight inputs in object 6000h:1, sent on change and by the event timer (1800h:5, ms)."""
+
+    BALL: Final = 0x01
+    """Light barrier interrupted: something is in the cup."""
+    POWER: Final = 0x02
+    """Arm-power chain closed."""
+
+    def __init__(self, node: int) -> None:
+        super().__init__(node, "digital_inputs.eds")
+        self.inputs = self.POWER
+        self._sent = -1
+        self._due = 0.0
+
+    def put(self, mask: int, on: bool) -> None:
+        """Set or clear inputs."""
+        self.inputs = self.inputs | mask if on else self.inputs & ~mask
+
+    def before_sending(self) -> None:
+        """Show the inputs."""
+        if self.values[0x6000, 1] != self.inputs:
+            self.values[0x6000, 1] = self.inputs
+            self.changed()
+
+    def due(self) -> float:
+        """At once while a change is still to be sent."""
+        if self.tpdo.synchronous:
+            return super().due()
+        if self.inputs != self._sent:
+            return -math.inf
+        return min(super().due(), self._due) if self.values[0x1800, 5] else super().due()
+
+    def advance(self, now: float) -> None:
+        """Send on change, and again when the event timer says so."""
+        super().advance(now)
+        timer = self.values[0x1800, 5] * 1e-3
+        if not self.tpdo.synchronous and (
+            self.inputs != self._sent or (timer and now >= self._due)
+        ):
+            before = len(self.outbox)
+            self.send_tpdo()
+            if len(self.outbox) > before:
+                self._sent, self._due = self.inputs, now + timer
+
+
+INPUTS_NODE: Final = 7
+"""Node id of the digital inputs; the drives have 1 to 6, base to flange."""
+
+SYNC_PATIENCE: Final = 10
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 40 ms at 250 Hz,
+shorter than three periods of the set-point stream, longer than what a master on an ordinary Linux
+is now and then late."""
+
+_STATUSWORD: Final = (int(Object.STATUSWORD), 0)
+_CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
+_POSITION, _VELOCITY, _TORQUE, _TARGET = (
+    (int(Object.POSITION), 0),
+    (int(Object.VELOCITY), 0),
+    (int(Object.TORQUE), 0),
+    (int(Object.TARGET_POSITION), 0),
+)
+_ENABLED: Final = State.OPERATION_ENABLED
+_OPERATIONAL: Final = NmtState.OPERATIONAL
+_RPDO_KEYS, _TPDO_KEYS = (
+    tuple((int(one.index), one.sub) for one in mapped) for mapped in (RECEIVED, SENT)
+)
+_LIMIT, _ERROR = int(StatusBit.INTERNAL_LIMIT), int(StatusBit.FOLLOWING_ERROR)
+
+
+class Plant(Protocol):
+    """The arm as its drives feel it: angles (rad), speeds (rad/s) and torques (N m) by joint, and
+    the joints' brakes."""
+
+    @property
+    def q(self) -> Sequence[float]:
+        """Angles."""
+
+    @property
+    def qd(self) -> Sequence[float]:
+        """Speeds."""
+
+    def brake(self, joint: int) -> None:
+        """Engage a joint's brake and take its torque away."""
+
+    def release(self, joint: int) -> None:
+        """Release a joint's brake."""
+
+    def slow_down(self, factor: float) -> None:
+        """From now on the joints reach this share of their greatest speeds."""
+
+    def step(self, dt: float, tau: Sequence[float]) -> None:
+        """Move on by `dt` seconds under six torques."""
+
+
+def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
+    """The drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and
+    inertia (kg m^2)."""
+    return tuple(
+        DriveRating(float(joint["torque"]), math.radians(joint["speed"]), float(joint["inertia"]))
+        for joint in table["joint"]
+    )
+
+
+class Drive(PowerDrive):
+    """One joint's drive: cyclic synchronous position mode around a `JointServo`."""
+
+    mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
+    fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
+
+    def __init__(
+        self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]
+    ) -> None:
+        """`stir` is called whenever something happens that may change the torque of a joint at
+        rest."""
+        super().__init__(joint + 1, "joint_drive.eds", SYNC_PATIENCE, stir)
+        self.joint = joint
+        self.plant = plant
+        self._shown: tuple[int, float, float, float] | None = None
+        self._said: tuple[int, float, float] | None = None
+        """Status, angle and torque in the TPDO that `sync` made last, if no object has changed
+        since."""
+        self._usual = False
+        """Whether both PDOs are laid out as masters of this profile do it, and go by SYNC."""
+        self.servo = JointServo(rating, plant.q[joint])
+        self._speed_factor = 1.0
+        self._torque = 0.0
+        self._error_since: float | None = None
+        self.after_configuring()
+
+    # Hooks of the CANopen node.
+    def before_sending(self) -> None:
+        """Bring status, position, speed and torque up to date."""
+        plant, joint = self.plant, self.joint
+        usual = (
+            self.state is _ENABLED
+            and self.powered
+            and not self.servo.limited
+            and self._error_since is None
+        )
+        word = RUNNING if usual else self.statusword()
+        shown = _, q, qd, torque = word, plant.q[joint], plant.qd[joint], self._torque
+        if shown == self._shown:
+            return
+        self._shown = shown
+        values = self.values
+        values[_STATUSWORD] = word
+        values[_POSITION] = round(q * UNITS)
+        values[_VELOCITY] = round(qd * UNITS)
+        values[_TORQUE] = round(1000.0 * torque / self.servo.rating.torque)
+        self.changed()
+
+    def before_reading(self) -> None:
+        """Bring what only an SDO reads up to date as well."""
+        self.before_sending()
+        self.values[Object.FOLLOWING_ERROR, 0] = to_units(self.servo.error)
+        self.values[Object.ERROR_CODE, 0] = self.fault
+        self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
+
+    def changed(self) -> None:
+        """What a TPDO may carry is another than before."""
+        self._said = None
+        super().changed()
+
+    def sync(self, now: float) -> None:
+        """SYNC has come. Of a drive that follows its set points, with PDOs laid out as usual, six
+        are asked for this in every cycle: it does in one go what the base class does in steps, to
+        the same bytes. Objects that nobody reads meanwhile are brought up to date when somebody
+        does."""
+        if not (
+            self._usual and self.state is _ENABLED and self.nmt is _OPERATIONAL and self._goes_on()
+        ):
+            super().sync(now)
+            return
+        self._synced = now
+        servo = self.servo
+        servo.aim(self._target())
+        if not servo.standing:
+            self.stir()
+        usual = self.powered and not servo.limited and self._error_since is None
+        said = word, q, torque = (
+            RUNNING if usual else self.statusword(),
+            self.plant.q[self.joint],
+            self._torque,
+        )
+        frame = self._tpdo_frame
+        if frame is None or said != self._said:
+            self._said, self._shown = said, None
+            data = self.tpdo.layout.pack(
+                word, round(q * UNITS), round(1000.0 * torque / servo.rating.torque)
+            )
+            self._tpdo_frame = frame = Frame(self.tpdo.cob_id, data)
+        self.outbox.append(frame)
+
+    def _goes_on(self) -> bool:
+        """Take over the RPDO's set point if its controlword orders nothing but to go on; else leave
+        all as it is."""
+        data = self._latched
+        if data is not None and data != self._applied:
+            word, target = self.rpdo.layout.unpack_from(data)
+            if word & ENABLE_MASK != ENABLE:
+                return False
+            self._applied, values = data, self.values
+            self._controlword = values[_CONTROLWORD] = word
+            values[_TARGET] = target
+        elif data is not None and self._controlword & ENABLE_MASK != ENABLE:
+            return False
+        self._latched = None
+        return True
+
+    def on_sync(self, now: float) -> None:
+        """A new set point is due."""
+        self._synced = now
+        if self.state is _ENABLED:
+            self.servo.aim(self._target())
+            if not self.servo.standing:
+                self.stir()
+
+    def repeat(self, now: float, answer: Frame) -> None:
+        """SYNC again with the same set point while the joint is at rest: the same answer again."""
+        self._synced = now
+        self.outbox.append(answer)
+
+    @property
+    def tpdo_sent(self) -> Frame | None:
+        """The TPDO sent last, if it was the last frame sent and is not fetched yet."""
+        frame = self._tpdo_frame
+        return frame if frame is not None and self.outbox and self.outbox[-1] is frame else None
+
+    def after_configuring(self) -> None:
+        """Take over how the drive watches itself."""
+        super().after_configuring()
+        values, rpdo, tpdo = self.values, self.rpdo, self.tpdo
+        self._usual = rpdo.synchronous and tpdo.on and tpdo.synchronous
+        self._usual = self._usual and (rpdo.keys, tpdo.keys) == (_RPDO_KEYS, _TPDO_KEYS)
+        self._window = values[Object.FOLLOWING_ERROR_WINDOW, 0] / UNITS
+        self._patience = values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
+        self._range = values[Object.SOFTWARE_LIMITS, 1], values[Object.SOFTWARE_LIMITS, 2]
+        if values[Object.INTERPOLATION_PERIOD, 1]:
+            self.servo.period = (
+                values[Object.INTERPOLATION_PERIOD, 1]
+                * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
+            )
+        self.stir()
+
+    # Hooks of the state machine.
+    def begin(self, resumed: bool) -> None:
+        """Hold here, or take set points again from where the ramp has come to."""
+        if resumed:
+            self.servo.follow(self._target())
+        else:
+            self.servo.start(self.plant.q[self.joint])
+        self._error_since = None
+        self.plant.release(self.joint)
+
+    def ramp_down(self, deceleration: float) -> None:
+        """Bring the joint to rest."""
+        self.servo.ramp_down(deceleration)
+
+    def cut_power(self) -> None:
+        """The brake holds."""
+        self._torque = 0.0
+        self.plant.brake(self.joint)
+
+    def flags(self) -> int:
+        """Whether set points are cut, and whether the joint is too far off."""
+        limit = _LIMIT if self.servo.limited else 0
+        return limit | _ERROR if self._error_since is not None else limit
+
+    def refresh(self) -> None:
+        """Show everything anew, the greatest speed too."""
+        self._shown = None
+        self.servo.limit = self.servo.rating.speed * self._speed_factor
+        self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
+        self.stir()
+
+    # What the laboratory does to a drive.
+    def slow_down(self, factor: float) -> None:
+        """Give a share of the rated speed from now on; object 607Fh tells."""
+        self._speed_factor = factor
+        self.refresh()
+
+    def torque(self, now: float, dt: float, q: float, qd: float) -> float:
+        """Torque of the next `dt` seconds (N m) from the joint's angle and speed; 0 without
+        power."""
+        state = self.state
+        if state is not _ENABLED and state not in POWERED:
+            return 0.0
+        servo = self.servo
+        self._torque = tau = servo.torque(q, qd, dt)
+        if state is _ENABLED:
+            late = now - self._synced > self._sync_patience + 1e-9
+            if (
+                late
+                or self._error_since is not None
+                or not -self._window <= servo.error <= self._window
+            ):
+                self._watch(now, late)
+        elif state is State.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
+            self.ramp_ended()
+        return tau
+
+    @property
+    def settled(self) -> bool:
+        """Whether the torque of a joint at rest stays as it is unless something happens."""
+        if self.state not in POWERED:
+            return True
+        return (
+            self.servo.settled
+            and self._error_since is None
+            and self.state is not State.FAULT_REACTION_ACTIVE
+        )
+
+    def _watch(self, now: float, late: bool) -> None:
+        """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
+        if late:
+            self.trip(Fault.SYNC_LOST)
+        elif -self._window <= self.servo.error <= self._window:
+            self._error_since = None
+        elif self._error_since is None:
+            self._error_since = now
+        elif now - self._error_since >= self._patience:
+            self.trip(Fault.FOLLOWING_ERROR)
+
+    def _target(self) -> float:
+        """Object 607Ah within the software limits 607Dh, in rad."""
+        (low, high), target = self._range, self.values[_TARGET]
+        return (low if target < low else high if target > high else target) / UNITS
+
+
+class DriveBus:
+    """Everything on the arm's bus but the master: six drives (nodes 1 to 6) and the digital inputs
+    (node 7).
+
+    In each step of the plant (1 kHz or faster): `receive` what came, then `step(now, dt)`, which
+    also moves the plant, then send what `drain` gives. Times are seconds on the caller's clock. An
+    arm that stands still under torques that do not change is at rest: until something stirs it, a
+    step would change nothing and is left out.
+    """
+
+    def __init__(self, plant: Plant, drives: Sequence[DriveRating], now: float = 0.0) -> None:
+        self.plant = plant
+        self._resting, self._stirred = False, True
+        self._rests_until = self._due = -math.inf
+        self._tau: list[float] = []
+        self._odd = False
+        self._heard: Sequence[Frame] = ()
+        self._echoes: Sequence[Frame] = ()
+        """The set points of the newest cycle that found and left the arm at rest, and the answers,
+        one a drive."""
+        self.drives = tuple(
+            Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
+        )
+        self.inputs = DigitalInputs(INPUTS_NODE)
+        self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
+        self._own = {node.node: node for node in self._nodes}
+        self.errors = 0
+        for node in self._nodes:
+            node.boot(now)
+
+    def receive_cycle(self, now: float, frames: Sequence[Frame]) -> None:
+        """The frames of one cycle of the master's. Drives at rest that hear what they have heard
+        before answer as before."""
+        if self._echoes and frames == self._heard and self._resting:
+            for drive, echo in zip(self.drives, self._echoes, strict=True):
+                drive.repeat(now, echo)
+            self._rests_until = min([drive.waits_until for drive in self.drives])
+            return
+        resting, self._odd, self._echoes = self._resting, False, ()
+        for frame in frames:
+            self.receive(now, frame)
+        if resting and self._resting and not self._odd and not self.inputs.tpdo.synchronous:
+            self._heard, self._echoes = frames, self._answers()
+
+    def _answers(self) -> Sequence[Frame]:
+        """What each drive has just sent, nothing if one of them sent nothing."""
+        sent = [drive.tpdo_sent for drive in self.drives]
+        return [frame for frame in sent if frame is not None] if None not in sent else ()
+
+    def receive(self, now: float, frame: Frame) -> None:
+        """A frame of the master's."""
+        cob_id = frame.id
+        target = self._own.get(cob_id & 0x7F)
+        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
+            target.take_rpdo(now, frame.data)
+        elif cob_id == SYNC_ID:
+            for node in self._nodes:
+                node.sync(now)
+            self._rests_until = min([drive.waits_until for drive in self.drives])
+        else:
+            self._odd = True
+            self._due = -math.inf  # it may set any timer
+            for node in self._nodes:
+                node.receive(now, frame)
+
+    def step(self, now: float, dt: float) -> None:
+        """Torques for `dt` seconds, the plant's motion, and what the devices do on time."""
+        if now >= self._due:
+            for node in self._nodes:
+                node.advance(now)
+            self._due = min([node.due() for node in self._nodes])
+        if self._resting and now <= self._rests_until:
+            return
+        plant, before, self._stirred = self.plant, self._tau, False
+        moving = any(plant.qd)
+        self._tau = tau = [
+            drive.torque(now, dt, q, qd)
+            for drive, q, qd in zip(self.drives, plant.q, plant.qd, strict=True)
+        ]
+        plant.step(dt, tau)
+        if not (moving or self._stirred or tau != before or any(plant.qd)):
+            self._resting = all(drive.settled for drive in self.drives)
+
+    def _stir(self) -> None:
+        self._resting, self._stirred = False, True
+        self._echoes = ()
+
+    def drain(self) -> list[Frame]:
+        """Frames to the master, oldest first."""
+        frames: list[Frame] = []
+        for node in self._nodes:
+            if node.outbox:
+                frames += node.drain()
+        return frames
+
+    def ball(self, present: bool) -> None:
+        """The light barrier in the cup is interrupted, or free."""
+        self._put(DigitalInputs.BALL, present)
+
+    def power(self, closed: bool) -> None:
+        """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the
+        brakes fall in."""
+        self._put(DigitalInputs.POWER, closed)
+        self._echoes = ()
+        for drive in self.drives:
+            drive.powered = closed
+            if not closed:
+                drive.trip(Fault.UNDERVOLTAGE)
+
+    def _put(self, mask: int, on: bool) -> None:
+        if bool(self.inputs.inputs & mask) is not on:
+            self.inputs.put(mask, on)
+            self._due = -math.inf
+
+    def trip(self, joint: int, fault: Fault = Fault.OVERCURRENT) -> str:
+        """Make a drive (0 to 5) fail; gives the fault in words."""
+        self.drives[joint].trip(fault)
+        return fault_text(fault)
+
+    def slow_down(self, factor: float) -> None:
+        """A slow arm: drives and plant reach this share (0 to 1] of their speeds."""
+        self.plant.slow_down(factor)
+        for drive in self.drives:
+            drive.slow_down(factor)

@@ -1,0 +1,247 @@
+"""The laboratory: world, arm, drives, camera and thrower as one party, which answers on bus, camera
+and wire as hardware would.
+
+At a tick it takes what came, shows the camera the world as it is, and moves the world on by a tick;
+so a set point acts and is answered within the tick in which it arrives. Nothing here knows
+wall-clock time: lock step and real time drive it alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.catching.camera import Picture, PinholeCamera
+from petrobot.sim.catching.drives import DriveBus
+from petrobot.sim.catching.oracle import Oracle
+from petrobot.sim.catching.puma import ArmPlant
+from petrobot.sim.catching.puma_model import Frame3
+from petrobot.sim.catching.referee import Referee
+from petrobot.sim.catching.site import CupMount, Site, site_of
+from petrobot.sim.catching.thrower import Thrower
+from petrobot.sim.catching.truth import Truth
+from petrobot.sim.catching.world import World
+from petrobot.sim.exposures import camera_of
+from petrobot.sim.faults import Fault, FaultPlan, read_fault
+from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+
+_NOISE, _FAULTS = 0x6361, 0x6661
+"""Keep the draws of camera noise and of faults apart from other draws of the same seed."""
+
+
+class Laboratory(LaboratoryParty):
+    """The party of the simulated node `name`. `where` gives the party of an endpoint
+    (`Directory.party`)."""
+
+    def __init__(
+        self,
+        name: str,
+        site: Site,
+        where: Callable[[str], str],
+        *,
+        seed: int = 0,
+        regime: str = "A",
+        throws: int | None = None,
+        boot: str = "laboratory",
+        directory: str = "",
+    ) -> None:
+        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in
+        services.comm.callee."""
+        super().__init__(name, where, boot, directory)
+        self._site = site
+        truth = site.truth(regime)
+        self._mount = CupMount(site.arm, truth)
+        cup = site.cell["cup"]
+        load = self._mount.load(truth.settings["cup"]["mass"], cup["radius"], cup["depth"])
+        self.plant = ArmPlant(
+            site.arm, site.cell["ball"]["gravity"], site.arm.poses["home"].tolist(), load=load
+        )
+        self._home: list[float] = site.arm.poses["home"].tolist()
+        self.bus = DriveBus(self.plant, site.drives)
+        self._world: World | None = None
+        self._prepare(self.now, seed, truth, throws)
+
+    def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
+        """A new experiment: ball gone, score empty, everything drawn anew. The arm stays where it
+        is."""
+        if self._world is not None:
+            self._world.close()
+        self.truth = truth
+        self._mount = CupMount(self._site.arm, truth)
+        self._arm_dt = float(truth.settings["step"]["arm"])
+        self._world = self.world = World(self._site.cell, truth)
+        self.thrower = Thrower(self._site.cell, truth, seed, throws)
+        self.referee = Referee(
+            seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now
+        )
+        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self._noise = np.random.default_rng((seed, _NOISE))
+        self._camera: PinholeCamera | None = None
+        self.bus.power(True)
+        self.bus.slow_down(truth.arm_speed)
+        self._moves = -1
+        self._cup = self._cup_now()
+
+    # The world, as lock step and real time drive it
+
+    def tick(self, now: float) -> None:
+        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+        self._begin_faults(now)
+        self._expose(now)
+        self._throw(now)
+        self._move(now)
+        self.now = now + TICK
+
+    # Bus
+
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+        """Frames of the master's."""
+        self.bus.receive_cycle(now, self._faults.passed(frames))
+
+    def take_frames(self) -> Sequence[Frame]:
+        """Frames of drives and inputs since the last call."""
+        return self._faults.passed(self.bus.drain())
+
+    # Camera
+
+    def _expose(self, now: float) -> None:
+        if not self.exposures.due(now) or self._faults.image_lost():
+            return
+        ready = now + self.truth.settings["camera"]["readout"] + self.truth.image_latency
+        self.exposures.put(now, ready, self._picture(now))
+
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:
+        """Draw the still scene of a regime's camera ahead of its first image, which takes seconds.
+        Raises LaboratoryError."""
+        regime = str(arguments.get("regime", "A"))
+        camera_of(self._site.cell, self._site.truth(regime), self._noise).warm_up()
+
+    def camera(self) -> PinholeCamera:
+        """The camera as it hangs in this regime, ready for the next image."""
+        if self._camera is None:
+            self._camera = camera_of(self._site.cell, self.truth, self._noise)
+        self._camera.reseed(self._noise)  # others in this process may have used it since
+        return self._camera
+
+    def _picture(self, now: float) -> Picture:
+        ball, cup = self.world.ball, self._cup_now()
+        ends, radii = self._solid_parts
+        pose = np.zeros((4, 4))
+        pose[:3], pose[3, 3] = np.array(cup).T, 1.0
+        return self.camera().render(
+            None if ball is None else ball.position,
+            (0.0, 0.0, 0.0) if ball is None else ball.velocity,
+            ends,
+            radii,
+            pose,
+            self.truth.light(now),
+        )
+
+    # World
+
+    def _throw(self, now: float) -> None:
+        throw = self.thrower.advance(now, self._ready())
+        if throw is not None:
+            course = self.world.release(now, throw)
+            self.referee.enter(course, self.plant.q)
+
+    def _ready(self) -> bool:
+        """Images are taken, the last ball is gone, the cup is empty, the arm stands still at
+        home."""
+        if self.exposures.rate <= 0.0 or self.world.ball is not None or self.world.barrier:
+            return False
+        rules = self.truth.settings["thrower"]
+        still, near = rules["still_speed"], rules["home_tolerance"]
+        if max(self.plant.qd) >= still or min(self.plant.qd) <= -still:
+            return False
+        return all(
+            -near < angle - at < near for angle, at in zip(self.plant.q, self._home, strict=True)
+        )
+
+    def _move(self, now: float) -> None:
+        """The world goes on by a tick: in fine steps while the ball may touch something, else in
+        the arm's own."""
+        world, bus = self.world, self.bus
+        if world.ball is not None:
+            world.begin(now, self._cup_now)
+        fine = world.fine
+        dt = world.fine_dt if fine else self._arm_dt
+        for step in range(round(TICK / dt)):
+            bus.step(now + step * dt, dt)
+            if fine and world.fine:
+                world.fine_step(now + (step + 1) * dt, self._cup_now())
+        if world.ball is not None:
+            world.end(now + TICK, self._cup_now)
+        else:
+            world.idle(now + TICK)
+        bus.ball(world.barrier)
+
+    def _cup_now(self) -> Frame3:
+        """The cup's frame; the same object as long as the arm does not move."""
+        if self.plant.moves != self._moves:
+            self._moves = self.plant.moves
+            self._cup = self._mount.frame(self.plant.q)
+            self._parts: tuple[Any, Any] | None = None
+        return self._cup
+
+    @property
+    def _solid_parts(self) -> tuple[Any, Any]:
+        if self._parts is None:
+            self._parts = self._mount.solid_parts(self.plant.q)
+        return self._parts
+
+    # Faults and services
+
+    def _begin_faults(self, now: float) -> None:
+        if self._faults.none:
+            return
+        powerless = self._faults.active("arm_power")
+        for fault in self._faults.begin(now):
+            self._strike(fault)
+        if self._faults.active("arm_power") is not powerless:
+            self.bus.power(powerless)
+
+    def _strike(self, fault: Fault) -> None:
+        if fault.kind == "drive_fault":
+            self.bus.trip(int(fault.value) - 1)
+        elif fault.kind == "slow_arm":
+            self.bus.slow_down(fault.value)
+
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments
+        that cannot be.
+
+        laboratory_prepare(seed=0, regime="A", throws=None): a new experiment, gives nothing; other
+        parameters of the task are not the laboratory's business; laboratory_score(cycles=[]): see
+        sim.referee; laboratory_fault(kind, after=0, ...): see sim.faults.
+        """
+        if service == SCORE:
+            return self.referee.score(self.now, arguments.get("cycles", ()))
+        if service == FAULT:
+            rest = {key: value for key, value in arguments.items() if key != "kind"}
+            self._faults.add(read_fault(self.now, str(arguments.get("kind", "")), rest))
+            return {}
+        seed, throws = (
+            whole_number(arguments, "seed", 0) or 0,
+            whole_number(arguments, "throws", None),
+        )
+        self._prepare(self.now, seed, self._site.truth(str(arguments.get("regime", "A"))), throws)
+        return {}
+
+    def close(self) -> None:
+        """End the physics clients."""
+        self.world.close()
+        self.plant.close()
+
+
+def make_laboratory(directory: Directory, name: str) -> Laboratory:
+    """The laboratory of the simulated node `name` of services.toml. Raises LaboratoryError."""
+    boot = f"{name} in lock step"
+    return Laboratory(
+        name, site_of(directory), directory.party, boot=boot, directory=directory.hash
+    )

@@ -1,0 +1,152 @@
+"""Keeps the score: what was thrown, what could have been caught, what was, and how far off the rest
+went by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from petrobot.sim.catching.course import Course, Outcome
+from petrobot.sim.catching.oracle import Oracle, Verdict
+
+PLOTS: Final = {
+    "catch_map": {
+        "kind": "lines",
+        "title": "The table from above: from the release to where each ball left",
+        "x": "courses.start_y",
+        "y": "courses.start_x",
+        "x2": "courses.exit_y",
+        "y2": "courses.exit_x",
+        "x_label": "across the table, y (m)",
+        "y_label": "away from the arm, x (m)",
+        "colour": "throws.outcome",
+    },
+    "exits": {
+        "kind": "points",
+        "title": "Where and how fast each ball left the table",
+        "x": "courses.exit_y",
+        "y": "courses.exit_speed",
+        "x_label": "y at the near edge (m)",
+        "y_label": "speed (m/s)",
+        "colour": "throws.outcome",
+    },
+    "misses": {
+        "kind": "histogram",
+        "title": "How far from the middle of the cup's mouth each ball came",
+        "x": "throws.miss_mm",
+        "least": 0.0,
+        "most": 150.0,
+        "x_label": "distance (mm), up to 150",
+        "colour": "throws.outcome",
+    },
+}
+"""Pictures that reports draw of these results (docs/campaigns.md)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    course: Course
+    verdict: Verdict
+
+
+class Referee:
+    """Writes down each throw from its release on. `began` is the simulated time (s) from which
+    releases are counted."""
+
+    def __init__(self, seed: int, regime: str, oracle: Oracle, began: float) -> None:
+        self._seed = seed
+        self._regime = regime
+        self._oracle = oracle
+        self._began = began
+        self._entries: list[_Entry] = []
+
+    def enter(self, course: Course, q: Sequence[float]) -> Verdict:
+        """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again
+        for the score."""
+        verdict = self._oracle.judge(course.throw, q)
+        self._entries.append(_Entry(course, verdict))
+        return verdict
+
+    @property
+    def last(self) -> Verdict | None:
+        """Verdict on the newest throw."""
+        return self._entries[-1].verdict if self._entries else None
+
+    def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
+        """All throws so far in plain data: `throws` (see `_row`) and, for those who look closer,
+        `courses` (see `_course`); counts are of throws that are over.
+
+        `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and
+        `cause`. A throw takes the status of the cycle in which it was released, None if it was
+        released in none.
+        """
+        rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
+        over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
+        return {
+            "seed": self._seed,
+            "regime": self._regime,
+            "throws": rows,
+            "courses": [
+                _course(entry, self._began, status["run"])
+                for entry, status in zip(self._entries, rows, strict=True)
+            ],
+            "plots": PLOTS,
+            "over": len(over),
+            "caught": sum(row["caught"] for row in over),
+            "reachable": sum(row["reachable"] for row in over),
+            "reachable_caught": sum(row["reachable"] and row["caught"] for row in over),
+        }
+
+
+def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    age = now - course.released_at
+    for cycle in cycles:
+        if cycle["begun_ago"] >= age >= cycle["ended_ago"]:
+            return {
+                "status": cycle["status"],
+                "cause": cycle.get("cause", ""),
+                "run": cycle.get("n"),
+            }
+    return {"status": None, "cause": "", "run": None}
+
+
+def _row(entry: _Entry) -> dict[str, Any]:
+    """One throw: its speed at release (m/s), what became of it, how far from the middle of the
+    mouth it came (mm)."""
+    course, verdict = entry.course, entry.verdict
+    return {
+        "n": course.throw.n,
+        "speed": course.throw.speed,
+        "caught": course.outcome is Outcome.CAUGHT,
+        "outcome": str(course.outcome),
+        "miss_mm": _finite(1000.0 * course.miss),
+        "reachable": verdict.reachable,
+    }
+
+
+def _course(entry: _Entry, began: float, run: int | None) -> dict[str, Any]:
+    """How one throw went, in m, m/s and s; durations count from its release, None: it did not
+    happen."""
+    course, exit_state = entry.course, entry.course.exit_state
+    return {
+        "n": course.throw.n,
+        "run": run,
+        "start_x": course.throw.start.position[0],
+        "start_y": course.throw.start.position[1],
+        "released_after": course.released_at - began,
+        "spin_share": course.throw.spin_share,
+        "rolling_resistance": course.throw.rolling_resistance,
+        "exit_after": _finite(course.exit_time),
+        "exit_x": exit_state.position[0] if exit_state else None,
+        "exit_y": exit_state.position[1] if exit_state else None,
+        "exit_speed": math.hypot(*exit_state.velocity) if exit_state else None,
+        "caught_after": _finite(course.caught_at),
+        "ended_after": _finite(course.ended_at),
+        "margin": _finite(entry.verdict.margin),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

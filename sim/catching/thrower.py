@@ -1,0 +1,99 @@
+"""The simulated person who throws the balls: what each throw is, and when it is released.
+
+Throw n of a seed is the same whatever happened before it: its generator is keyed by (seed, n).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from petrobot.sim.catching.ball import BallModel, BallState
+from petrobot.sim.catching.truth import Truth
+
+_STREAM = 0x7468  # keeps the thrower's draws apart from other draws of the same seed
+
+
+@dataclass(frozen=True, slots=True)
+class Throw:
+    """One throw: `speed` (m/s) and `start` at release, where it is aimed at (`exit_y`, m) and what
+    the ball meets."""
+
+    n: int
+    delay: float
+    """s from "ready" to the release."""
+    speed: float
+    start: BallState
+    exit_y: float
+    spin_share: float
+    """Spin at release as a share of pure rolling."""
+    rolling_resistance: float
+
+
+def draw_throw(seed: int, n: int, cell: Mapping[str, Any], truth: Truth) -> Throw:
+    """Throw `n` (1, 2, ...) of `seed`: from 0.1 m before the far edge towards a point of the near
+    edge."""
+    rng = np.random.default_rng((seed, n, _STREAM))
+    ball, settings = cell["ball"], truth.settings
+    delay = float(rng.uniform(*settings["thrower"]["delay"]))
+    speed = float(rng.uniform(*truth.speed))
+    y, exit_y = (
+        float(v) for v in rng.uniform(-ball["exit_half_width"], ball["exit_half_width"], 2)
+    )
+    share = float(rng.uniform(*settings["ball"]["spin"]))
+    spread = settings["ball"]["rolling_resistance_spread"]
+    resistance = float(ball["rolling_resistance"] * (1.0 + rng.uniform(-spread, spread)))
+    x = truth.table.far_edge - ball["release"]
+    way_x, way_y = truth.table.near_edge - x, exit_y - y
+    way = math.hypot(way_x, way_y)
+    vx, vy = speed * way_x / way, speed * way_y / way
+    model = BallModel.of(ball, settings["ball"]["friction"])
+    start = BallState(
+        (x, y, truth.table.top + model.radius), (vx, vy, 0.0), model.spin_of_rolling(vx, vy, share)
+    )
+    return Throw(n, delay, speed, start, exit_y, share, resistance)
+
+
+class Thrower:
+    """Releases one throw after the other, each a seeded delay after all was ready for it without a
+    break."""
+
+    def __init__(
+        self, cell: Mapping[str, Any], truth: Truth, seed: int, throws: int | None = None
+    ) -> None:
+        """`throws` limits their number; None: no limit."""
+        self._cell = cell
+        self._truth = truth
+        self._seed = seed
+        self._throws = throws
+        self._ready_since: float | None = None
+        self._next: Throw | None = self._draw(1)
+
+    def _draw(self, n: int) -> Throw | None:
+        if self._throws is not None and n > self._throws:
+            return None
+        return draw_throw(self._seed, n, self._cell, self._truth)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the last throw has been released."""
+        return self._next is None
+
+    def advance(self, now: float, ready: bool) -> Throw | None:
+        """The throw to release at `now` (s), None while there is none. `ready`: images are taken,
+        the last ball is gone, the cup is empty and the arm stands still at home."""
+        if not ready or self._next is None:
+            self._ready_since = None
+            return None
+        if self._ready_since is None:
+            self._ready_since = now
+        if now < self._ready_since + self._next.delay:
+            return None
+        released = self._next
+        self._ready_since = None
+        self._next = self._draw(released.n + 1)
+        return released

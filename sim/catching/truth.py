@@ -1,0 +1,244 @@
+"""What the simulated cell really is: the nominal cell, one installation's seeded errors, and a
+regime's disturbances.
+
+Only the laboratory reads this. A regime name is a regime and any number of disturbances of
+`sim/catching/laboratory.toml`, joined by `+` (or a comma): `A`, `B+latency200`, `A+dim+arm50`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+LABORATORY_FILE = Path(__file__).with_name("laboratory.toml")
+
+
+class LaboratoryError(ValueError):
+    """A laboratory or cell file, or a regime name, that cannot be used; the text names file, key
+    and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTruth:
+    """The camera as it really hangs: a point p (base frame, m) has camera coordinates `rotation @
+    (p - position)`."""
+
+    position: Vector
+    """(3,) optical centre in the base frame, m."""
+    rotation: Vector
+    """(3, 3), rows are the camera's x (right), y (down) and z (forward) axes in the base frame."""
+    focal_px: float
+    principal_px: tuple[float, float]
+    distortion: tuple[float, float, float, float]
+    """k1 k2 p1 p2 in OpenCV's order and sense."""
+
+
+@dataclass(frozen=True, slots=True)
+class CupTruth:
+    """The cup as it really is mounted: in the flange frame (frame 6 of the arm)."""
+
+    mouth: Vector
+    """(3,) centre of the mouth, m."""
+    axis: Vector
+    """(3,) unit vector out of the mouth."""
+    radius: float
+    depth: float
+    restitution: float
+
+
+@dataclass(frozen=True, slots=True)
+class TableTruth:
+    """The table as it really stands: top at height `top`, x from `near_edge` to `far_edge`, |y| <=
+    `half_width` (m)."""
+
+    top: float
+    near_edge: float
+    far_edge: float
+    half_width: float
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The simulated truth of one regime: everything that services must not know."""
+
+    regime: str
+    """As given, for reports."""
+    speed: tuple[float, float]
+    """Range of the ball's speed at release, m/s."""
+    camera: CameraTruth
+    cup: CupTruth
+    table: TableTruth
+    joint_zero: Vector
+    """(6,) rad; the arm's true joint angle is the encoder's plus this."""
+    light_gradient: tuple[float, float]
+    """Relative change of the light from one side of the image to the other, along u and v."""
+    vignetting: float
+    """Relative loss of light in the image's corners."""
+    light_level: float
+    light_drift: float
+    light_period: float
+    image_latency: float
+    """s, beyond the camera's own readout."""
+    arm_speed: float
+    settings: Mapping[str, Any]
+    """The whole laboratory file, for what is no error: steps, thrower, friction."""
+
+    def light(self, time: float) -> float:
+        """Relative brightness at `time` (s); 1 is nominal."""
+        return self.light_level * (
+            1.0 + self.light_drift * float(np.sin(2.0 * np.pi * time / self.light_period))
+        )
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file as a dict. Raises LaboratoryError naming the file when it is missing or not
+    TOML."""
+    try:
+        with path.open("rb") as file:
+            return tomllib.load(file)
+    except OSError as fault:
+        raise LaboratoryError(
+            f"{path}: cannot be read ({fault.strerror}); give the path of an existing file"
+        ) from fault
+    except tomllib.TOMLDecodeError as fault:
+        raise LaboratoryError(f"{path}: no TOML ({fault}); mend that line") from fault
+
+
+def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, float], dict[str, Any]]:
+    """Speed range and the disturbed values of a regime name. Raises LaboratoryError for an unknown
+    or contradictory one."""
+    base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
+    regimes, disturbances = settings["regimes"], settings["disturbances"]
+    if base not in regimes:
+        raise LaboratoryError(
+            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as 'A' "
+            "or 'A+dim'"
+        )
+    values = dict(settings["nominal"])
+    set_by: dict[str, str] = {}
+    for name in names:
+        if name not in disturbances:
+            raise LaboratoryError(
+                f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}"
+            )
+        for key, value in disturbances[name].items():
+            if key not in values:
+                raise LaboratoryError(
+                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are"
+                )
+            if key in set_by:
+                raise LaboratoryError(
+                    f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them"
+                )
+            values[key], set_by[key] = value, name
+    low, high = regimes[base]["speed"]
+    return (float(low), float(high)), values
+
+
+def read_truth(
+    cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LABORATORY_FILE
+) -> Truth:
+    """The truth of a regime: nominal `cell` (services/cell.toml), this installation's errors, the
+    regime's disturbances."""
+    settings = read_toml(laboratory)
+    try:
+        speed, values = disturb(settings, regime)
+        errors = settings["installation"]
+        rng = np.random.default_rng(errors["seed"])
+        return Truth(
+            regime=regime,
+            speed=speed,
+            camera=_camera(cell["camera"], errors, values, rng),
+            cup=_cup(cell["cup"], errors, values, rng),
+            table=_table(cell["table"], errors, rng),
+            joint_zero=rng.normal(0.0, errors["joint_zero"], 6),
+            light_gradient=(float(values["light_gradient"][0]), float(values["light_gradient"][1])),
+            vignetting=float(values["vignetting"]),
+            light_level=float(values["light_level"]),
+            light_drift=float(values["light_drift"]),
+            light_period=float(values["light_period"]),
+            image_latency=float(values["image_latency"]),
+            arm_speed=float(values["arm_speed"]),
+            settings=settings,
+        )
+    except KeyError as fault:
+        raise LaboratoryError(
+            f"{laboratory} or the cell file: key {fault} is missing; the shipped files show it"
+        ) from fault
+
+
+def rotation_from_vector(vector: Vector) -> Vector:
+    """(3, 3) rotation about `vector` (3,) by its length in rad (Rodrigues' formula)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = np.asarray(vector, dtype=float) / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turned: Vector = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    return turned
+
+
+def _camera(
+    nominal: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> CameraTruth:
+    position = np.asarray(nominal["position"], dtype=float) + rng.normal(
+        0.0, errors["camera_position"], 3
+    )
+    turn = rng.normal(0.0, errors["camera_rotation"], 3)
+    focal = nominal["focal_px"] * (1.0 + rng.normal(0.0, errors["camera_focal"]))
+    centre = (nominal["width"] - 1) / 2.0, (nominal["height"] - 1) / 2.0
+    dx, dy = rng.normal(0.0, errors["camera_principal_px"], 2)
+    k1, k2, p1, p2 = np.asarray(nominal["distortion"]) * (
+        1.0 + rng.normal(0.0, errors["camera_distortion"], 4)
+    )
+    right, forward = np.asarray(nominal["image_x"], dtype=float), np.array([0.0, 0.0, -1.0])
+    looks_down = np.array([right, np.cross(forward, right), forward])
+    later = rotation_from_vector(np.asarray(values["camera_turn"], dtype=float))
+    return CameraTruth(
+        position=position + np.asarray(values["camera_shift"], dtype=float),
+        rotation=later @ rotation_from_vector(turn) @ looks_down,
+        focal_px=float(focal),
+        principal_px=(centre[0] + float(dx), centre[1] + float(dy)),
+        distortion=(float(k1), float(k2), float(p1), float(p2)),
+    )
+
+
+def _cup(
+    nominal: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> CupTruth:
+    axis = np.asarray(nominal["axis"], dtype=float)
+    mouth = np.asarray(nominal["mouth"], dtype=float) + rng.normal(0.0, errors["cup_mouth"], 3)
+    restitution = float(values["cup_restitution"])
+    return CupTruth(
+        mouth=mouth + np.asarray(values["cup_shift"], dtype=float),
+        axis=axis / np.linalg.norm(axis),
+        radius=float(nominal["radius"]),
+        depth=float(nominal["depth"]),
+        restitution=restitution if restitution >= 0.0 else float(nominal["restitution"]),
+    )
+
+
+def _table(
+    nominal: Mapping[str, Any], errors: Mapping[str, Any], rng: np.random.Generator
+) -> TableTruth:
+    near = nominal["near_edge"] + rng.normal(0.0, errors["table_edge"])
+    return TableTruth(
+        top=float(nominal["top"] + rng.normal(0.0, errors["table_top"])),
+        near_edge=float(near),
+        far_edge=float(near + nominal["length"]),
+        half_width=float(nominal["width"]) / 2.0,
+    )

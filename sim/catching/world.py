@@ -1,0 +1,399 @@
+"""The ball's world: table, flight, cup and floor, each stepped no finer than is exact there.
+
+On the flat table and in free flight the ball follows closed forms (sim/catching/ball.py), one evaluation a
+tick. Only where it may touch the cup, an edge or anything else from above does the contact space
+(sim/catching/contact.py) take over at 1 kHz; a ball that lies still in a standing cup costs nothing. The
+light barrier and the closest approach to the cup are watched here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from enum import StrEnum
+from typing import Any
+
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
+from petrobot.sim.catching.contact import ContactSpace
+from petrobot.sim.catching.course import Barrier, Course, Outcome
+from petrobot.sim.catching.puma_model import Frame3
+from petrobot.sim.catching.thrower import Throw
+from petrobot.sim.catching.truth import Truth
+
+_HAND_SPEED = 3.0
+"""m/s, faster than the arm can carry the cup."""
+_AHEAD = 0.005
+"""s, a little more than a tick: surfaces that can meet within it are near."""
+_GAIN = 1.0
+"""m/s, more than a falling ball gains until it must be looked at again."""
+_SETTLED = 0.05
+"""s that a ball must lie still in a cup that hardly moves before it is left alone."""
+_CREEP = 0.005
+"""m/s (and tenths of rad/s) up to which a cup hardly moves: an arm that settles."""
+_STIRRED, _TILTED = 1e-4, 2e-4
+"""m and rad by which a cup has moved on before its ball is no longer taken to lie still in it."""
+_FLAT_SPEED = 0.02
+"""m/s of vertical speed below which a ball on the table has stopped bouncing."""
+
+
+CupPose = Callable[[], Frame3]
+
+
+class Where(StrEnum):
+    """What moves the ball."""
+
+    ABSENT = "absent"
+    TABLE = "table"
+    FLIGHT = "flight"
+    CONTACT = "contact"
+    AT_REST = "at rest"
+    """Lying still in the cup."""
+
+
+class World:
+    """One ball at most, where it is and what became of it. Times `now` are simulated seconds.
+
+    Each tick: `begin`; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at
+    the end of that millisecond; then `end`. `begin` and `end` ask for the cup's pose only when the
+    ball may be near it: a pose costs more than they do. The same object means the same pose.
+    """
+
+    def __init__(self, cell: Mapping[str, Any], truth: Truth) -> None:
+        settings = truth.settings
+        self._truth = truth
+        self.model = BallModel.of(cell["ball"], settings["ball"]["friction"])
+        self._settings = settings
+        self._cup_wall = float(cell["cup"]["wall"])
+        self._space = ContactSpace(self.model, truth.table, truth.cup, self._cup_wall, settings)
+        self._barrier = Barrier(float(settings["cup"]["barrier_delay"]))
+        self.where = Where.ABSENT
+        self.ball: BallState | None = None
+        self.course: Course | None = None
+        self._cup: Frame3 | None = None
+        self._look_at = -math.inf
+        self._rest: tuple[Frame3, tuple[float, float, float]] | None = None
+        self._height = self._aside = math.inf
+        self._last = (0.0, 0.0)
+        self._start_at = 0.0
+        self._start: BallState | None = None
+        self._motion: TableMotion | None = None
+        self._leaves = (math.inf, 0)
+        """Seconds after `_start_at` when the ball rolls over an edge, and 0 if that is the near
+        one."""
+        self._still_since: float | None = None
+
+    # What the laboratory asks
+
+    @property
+    def barrier(self) -> bool:
+        """Output of the light barrier in the cup."""
+        return self._barrier.output
+
+    @property
+    def fine(self) -> bool:
+        """Whether this tick needs fine steps."""
+        return self.where is Where.CONTACT
+
+    @property
+    def fine_dt(self) -> float:
+        """Length of a fine step (s)."""
+        return self._space.dt
+
+    def release(self, now: float, throw: Throw) -> Course:
+        """A ball enters the world. Raises RuntimeError while another one is there."""
+        if self.ball is not None:
+            raise RuntimeError("a ball is in play: one at a time")
+        self.ball = throw.start
+        self.course = Course(throw, now)
+        self._height = self._aside = math.inf
+        self._last = (throw.start.position[0], now)
+        self._roll(now, throw.start)
+        return self.course
+
+    def take_away(self, now: float) -> None:
+        """Somebody takes the ball out of play."""
+        if self.course is not None and self.course.outcome is Outcome.ROLLING:
+            self.course.outcome = Outcome.MISSED
+        if self.course is not None:
+            self.course.ended_at = now - self.course.released_at
+        self.where, self.ball, self.course = Where.ABSENT, None, None
+        self._barrier.see(now, False)
+
+    # One tick
+
+    def begin(self, now: float, cup: CupPose) -> None:
+        """Start of a tick at `now`; `cup` gives the cup's frame (origin: mouth centre, z out of the
+        mouth)."""
+        ball = self.ball
+        if ball is None:
+            return
+        if self.where is Where.AT_REST:
+            self._ride(cup())
+        elif self.where is Where.CONTACT:
+            self._cup = cup()
+            if self._gap(ball, self._cup) > self._way_within_tick(ball):
+                self._leave_contact(now, ball)
+        elif self.where is Where.FLIGHT and self._near_table(ball):
+            self._cup = cup()
+            self._touch(ball)
+        elif now >= self._look_at:
+            self._look(now, ball, cup())
+
+    def _look(self, now: float, ball: BallState, cup: Frame3) -> None:
+        """Into the contact space if ball and cup may touch within the tick; else note when that
+        must be asked again."""
+        self._cup = cup
+        spare = self._gap(ball, cup) - self._way_within_tick(ball)
+        if spare <= 0.0:
+            self._touch(ball)
+        else:
+            self._look_at = now + spare / (_norm(ball.velocity) + _GAIN + _HAND_SPEED)
+
+    def _ride(self, cup: Frame3) -> None:
+        """A ball at rest goes along with its cup until that really moves."""
+        if self._rest is None or self.ball is None or cup is self._cup:
+            return
+        (before, local), last = self._rest, self.ball.position
+        position = cup.point(local)
+        self._cup = cup
+        self.ball = BallState(position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        if _distance(before.origin, cup.origin) > _STIRRED or _distance(before.z, cup.z) > _TILTED:
+            x, y, z = ((b - a) / TICK for a, b in zip(last, position, strict=True))
+            self._touch(BallState(position, (x, y, z), (0.0, 0.0, 0.0)))
+
+    def fine_step(self, now: float, cup: Frame3) -> None:
+        """A fine step that ends at `now` with the cup at `cup`."""
+        before = self._cup or cup
+        self._cup = cup
+        if self.where is not Where.CONTACT:
+            return
+        self.ball = self._space.step(before, cup)
+        self._watch(now, self.ball, cup)
+        self._settle(now, self.ball, before, cup)
+        self._end_of_course(now, self.ball)
+
+    def idle(self, now: float) -> None:
+        """A tick up to `now` without a ball; the cup need not be known."""
+        self._barrier.see(now, False)
+
+    def end(self, now: float, cup: CupPose) -> None:
+        """End of a tick at `now`: what follows closed forms goes on to here."""
+        course = self.course
+        if self.ball is None or course is None:
+            self.idle(now)
+            return
+        if self.where is Where.TABLE:
+            self._go_on_table(now)
+        elif self.where is Where.FLIGHT and self._start is not None:
+            self.ball = fly(self._start, now - self._start_at, self.model.gravity)
+        if self.where is Where.AT_REST:
+            self._barrier.see(now, True)
+        elif self.where is not Where.CONTACT:
+            if now >= self._look_at or course.exit_state is not None:
+                self._watch(now, self.ball, cup())
+            else:  # too far from the cup to matter
+                self._barrier.see(now, False)
+                self._height = math.inf
+        self._end_of_course(now, self.ball)
+
+    # Changes of regime
+
+    def _roll(self, now: float, start: BallState) -> None:
+        resistance = self.course.throw.rolling_resistance if self.course else 0.0
+        self._motion = motion = TableMotion(self.model, start, resistance)
+        table = self._truth.table
+        self._leaves = min(
+            (motion.first_crossing(0, table.near_edge), 0),
+            (motion.first_crossing(0, table.far_edge), 1),
+            (motion.first_crossing(1, table.half_width), 1),
+            (motion.first_crossing(1, -table.half_width), 1),
+        )
+        self._start_at, self._look_at, self.where = now, -math.inf, Where.TABLE
+
+    def _soar(self, now: float, start: BallState) -> None:
+        self._start, self._start_at, self._look_at, self.where = start, now, -math.inf, Where.FLIGHT
+
+    def _touch(self, ball: BallState) -> None:
+        self._space.put_ball(ball)
+        self._still_since = None
+        self.where = Where.CONTACT
+
+    def _leave_contact(self, now: float, ball: BallState) -> None:
+        """The cup is far: on to the closed forms if the ball rolls flat on the table or flies clear
+        of it."""
+        height = ball.position[2] - self._truth.table.top - self.model.radius
+        if self._over_table(ball) and abs(height) < 1e-3 and abs(ball.velocity[2]) < _FLAT_SPEED:
+            x, y, _ = ball.position
+            vx, vy, _ = ball.velocity
+            self._roll(
+                now,
+                BallState(
+                    (x, y, self._truth.table.top + self.model.radius), (vx, vy, 0.0), ball.spin
+                ),
+            )
+        elif not self._near_table(ball):
+            self._soar(now, ball)
+
+    def _go_on_table(self, now: float) -> None:
+        """Roll on; where the centre crosses an edge it flies from there, or tips over it when it is
+        too slow to."""
+        motion = self._motion
+        if motion is None:
+            return
+        leaves, edge = self._leaves
+        elapsed = now - self._start_at
+        if elapsed < leaves:
+            self.ball = motion.state(elapsed)
+            return
+        state = motion.state(leaves)
+        if edge == 0 and self.course is not None:
+            self.course.exit_time = self._start_at + leaves - self.course.released_at
+            self.course.exit_state = state
+        if _clears_edge(state, self.model):
+            self._soar(self._start_at + leaves, state)
+            self.ball = fly(state, elapsed - leaves, self.model.gravity)
+        else:
+            self.ball = motion.state(elapsed)
+            self._touch(self.ball)
+
+    def _settle(self, now: float, ball: BallState, before: Frame3, cup: Frame3) -> None:
+        """A ball that lies still in a cup that hardly moves is left alone."""
+        still = _norm(ball.velocity) < self._settings["ball"]["rest_speed"] and self._inside(
+            ball, cup
+        )
+        if still and before is not cup:
+            creep = _CREEP * self.fine_dt
+            still = (
+                _distance(before.origin, cup.origin) < creep
+                and _distance(before.z, cup.z) < 10.0 * creep
+            )
+        if not still:
+            self._still_since = None
+        elif self._still_since is None:
+            self._still_since = now
+        elif now - self._still_since >= _SETTLED:
+            self.where = Where.AT_REST
+            self._rest = cup, cup.local(ball.position)
+            self.ball = BallState(ball.position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+    # What is seen
+
+    def _watch(self, now: float, ball: BallState, cup: Frame3) -> None:
+        """Light barrier, crossing of the mouth's plane and closest approach."""
+        course = self.course
+        if course is None:
+            return
+        height, aside = _seen_from(cup, ball)
+        interrupted = -self._truth.cup.depth < height < 0.0 and aside < self._truth.cup.radius
+        self._barrier.see(now, interrupted)
+        self._note_exit(now, ball, course)
+        if course.outcome is Outcome.ROLLING:
+            course.approach = min(course.approach, math.hypot(height, aside))
+            if math.inf > self._height > 0.0 >= height and course.exit_state is not None:
+                share = self._height / (self._height - height)
+                course.crossing = min(course.crossing, self._aside + share * (aside - self._aside))
+            if self._barrier.output:
+                course.outcome = Outcome.CAUGHT
+                course.caught_at = now - course.released_at
+        elif course.outcome is Outcome.CAUGHT and not self._barrier.output and cup.z[2] > 0.5:
+            course.outcome = Outcome.DROPPED
+        self._height, self._aside = height, aside
+
+    def _note_exit(self, now: float, ball: BallState, course: Course) -> None:
+        """The ball went over the near edge while the contact space moved it, cup at hand."""
+        x, edge = ball.position[0], self._truth.table.near_edge
+        if course.exit_state is None and x < edge:
+            (before, at), (vx, _, _) = self._last, ball.velocity
+            back = (x - edge) / vx if vx < 0.0 and before >= edge else now - at
+            course.exit_time = now - back - course.released_at
+            course.exit_state = fly(ball, -back, 0.0)
+        self._last = (x, now)
+
+    def _end_of_course(self, now: float, ball: BallState) -> None:
+        """The floor ends it; so does lying still outside the cup, and time."""
+        course, rules = self.course, self._settings["ball"]
+        if course is None:
+            return
+        age = now - course.released_at
+        rests = (
+            self.where is Where.TABLE and self._motion is not None and _norm(ball.velocity) == 0.0
+        )
+        lies = rests and now - self._start_at > self._motion_rests() + rules["removed_after"]
+        stuck = (
+            age > rules["lost_after"]
+            and not self._barrier.output
+            and self.where is not Where.AT_REST
+        )
+        if ball.position[2] < self.model.radius or lies or stuck:
+            self.take_away(now)
+
+    def _motion_rests(self) -> float:
+        return self._motion.rests_after if self._motion is not None else math.inf
+
+    # Geometry
+
+    def _inside(self, ball: BallState, cup: Frame3) -> bool:
+        height, aside = _seen_from(cup, ball)
+        return -self._truth.cup.depth < height < 0.0 and aside < self._truth.cup.radius
+
+    def _gap(self, ball: BallState, cup: Frame3) -> float:
+        """Distance between the ball and the cup, a solid cylinder here (m)."""
+        height, aside = _seen_from(cup, ball)
+        half, wall = self._truth.cup.depth / 2.0, self._cup_wall
+        beyond = max(abs(height + half) - half - wall, 0.0)
+        return (
+            math.hypot(beyond, max(aside - self._truth.cup.radius - wall, 0.0)) - self.model.radius
+        )
+
+    def _way_within_tick(self, ball: BallState) -> float:
+        return _AHEAD * (_norm(ball.velocity) + _HAND_SPEED)
+
+    def _over_table(self, ball: BallState) -> bool:
+        x, y, _ = ball.position
+        table = self._truth.table
+        return table.near_edge < x < table.far_edge and abs(y) < table.half_width
+
+    def _near_table(self, ball: BallState) -> bool:
+        """Whether the ball may touch the table within a tick. One beside it that moves away fast
+        enough cannot."""
+        table, r = self._truth.table, self.model.radius
+        x, y, z = ball.position
+        vx, vy, _ = ball.velocity
+        gap_x, gap_y = max(table.near_edge - x, x - table.far_edge), abs(y) - table.half_width
+        for gap, away in (
+            (gap_x, -vx if x < table.near_edge else vx),
+            (gap_y, math.copysign(vy, y * vy)),
+        ):
+            if gap >= 0.0 and away > 0.0 and away * away >= self.model.gravity * r:
+                return False
+        gap = math.hypot(max(gap_x, 0.0), max(gap_y, 0.0), max(z - table.top, 0.0))
+        return gap < r + self._way_within_tick(ball)
+
+    def close(self) -> None:
+        """End the physics client."""
+        self._space.close()
+
+
+def _clears_edge(state: BallState, model: BallModel) -> bool:
+    """Whether a ball that crosses an edge at this speed flies off at once: v^2 >= g r, else it tips
+    over the edge."""
+    vx, vy, _ = state.velocity
+    return vx * vx + vy * vy >= model.gravity * model.radius
+
+
+def _seen_from(cup: Frame3, ball: BallState) -> tuple[float, float]:
+    """Height of the ball's centre over the mouth's plane and its distance from the cup's axis
+    (m)."""
+    (px, py, pz), (ox, oy, oz), (zx, zy, zz) = ball.position, cup.origin, cup.z
+    rx, ry, rz = px - ox, py - oy, pz - oz
+    height = rx * zx + ry * zy + rz * zz
+    return height, math.sqrt(max(0.0, rx * rx + ry * ry + rz * rz - height * height))
+
+
+def _distance(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+    return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+def _norm(v: tuple[float, float, float]) -> float:
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

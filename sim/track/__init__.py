@@ -1,0 +1,1 @@
+"""The laboratory of the mobile robot: track, rover, sensors and camera."""

@@ -1,0 +1,213 @@
+"""The rover's CAN bus: two CiA 402 wheel drives in cyclic synchronous velocity mode and the
+retroreflector sensor."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import SYNC_ID
+from petrobot.services.comm.canopen.cia402 import (
+    UNITS,
+    Fault,
+    Mode,
+    Object,
+    State,
+    StatusBit,
+    fault_text,
+    to_units,
+)
+from petrobot.sim.bus.canopen_node import CanopenNode
+from petrobot.sim.bus.power_drive import POWERED, PowerDrive
+from petrobot.sim.track.rover import SLOT, Rover
+from petrobot.sim.track.sensor import ReflectorSensor
+
+SYNC_PATIENCE: Final = 5
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 100 ms at 50 Hz, 5 cm
+of way at 0.5 m/s."""
+_STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
+    (int(each), 0)
+    for each in (
+        Object.STATUSWORD,
+        Object.POSITION,
+        Object.VELOCITY,
+        Object.TORQUE,
+        Object.DC_LINK_VOLTAGE,
+        Object.MAX_SPEED,
+        Object.TARGET_VELOCITY,
+    )
+)
+_LONGEST: Final = 0.1
+"""s between two set points beyond which the reference's slope is not made up for."""
+_AT_REST: Final = 0.05
+"""rad/s below which a wheel counts as having come to rest after a fault."""
+_TURN: Final = 2.0 * math.pi
+_HALF, _WHOLE = 1 << 31, 1 << 32
+
+
+class WheelDrive(PowerDrive):
+    """One wheel's drive: set points of speed, limited in slope and by what the battery gives."""
+
+    mode = Mode.CYCLIC_SYNCHRONOUS_VELOCITY
+
+    def __init__(self, side: int, rover: Rover) -> None:
+        """`side`: 0 left, 1 right; the node id is one more."""
+        super().__init__(side + 1, "wheel_drive.eds", SYNC_PATIENCE)
+        self.side = side
+        self.limited = False
+        """Whether the last set point was more than the drive gives."""
+        self._rover = rover
+        self._wheel = rover.wheels[side]
+        self._reference = 0.0
+        self._ramp: float | None = None
+        self._counted = 0
+        self._speed = 0.0
+
+    # Hooks of the CANopen node.
+    def before_sending(self) -> None:
+        """Bring status, position, speed, torque and what depends on the battery up to date."""
+        values, rover = self.values, self._rover
+        values[_STATUSWORD] = self.statusword()
+        position = round(self._count() * (_TURN * UNITS / rover.truth.encoder_counts))
+        values[_POSITION] = (position + _HALF) % _WHOLE - _HALF
+        values[_VELOCITY] = to_units(self._speed)
+        values[_TORQUE] = round(
+            1000.0 * rover.torques[self.side] / rover.truth.settings["rated_torque"]
+        )
+        values[_VOLTAGE] = round(1000.0 * rover.voltage)
+        values[_MAX_SPEED] = to_units(rover.top_speed)
+        self.changed()
+
+    def before_reading(self) -> None:
+        """Bring what only an SDO reads up to date as well."""
+        self.before_sending()
+        self.values[Object.ERROR_CODE, 0] = self.fault
+        self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
+
+    def on_sync(self, now: float) -> None:
+        """Count the encoder, take the next set point."""
+        since, self._synced = now - self._synced, now
+        counted, self._counted = self._counted, self._count()
+        if since > 0.0:
+            self._speed = (
+                (self._counted - counted) * _TURN / self._rover.truth.encoder_counts / since
+            )
+        if self.state is State.OPERATION_ENABLED:
+            self._aim(self.values[_TARGET] / UNITS, min(since, _LONGEST))
+
+    def _count(self) -> int:
+        return math.floor(self._wheel.angle * self._rover.truth.encoder_counts / _TURN)
+
+    def _aim(self, target: float, since: float) -> None:
+        most = self._rover.top_speed
+        self.limited = not -most <= target <= most
+        target = min(max(target, -most), most)
+        step = self._rover.truth.acceleration * since
+        self._reference = min(max(target, self._reference - step), self._reference + step)
+        self._wheel.target = self._reference
+
+    # Hooks of the state machine.
+    def begin(self, resumed: bool) -> None:
+        """Go on at the speed that the wheel has."""
+        self._reference = self._wheel.target = self._wheel.speed
+        self._ramp = None
+        self._wheel.braked = False
+
+    def ramp_down(self, deceleration: float) -> None:
+        """Bring the wheel to rest."""
+        self._ramp = deceleration
+
+    def cut_power(self) -> None:
+        """The brake holds."""
+        self._reference = self._wheel.target = 0.0
+        self._wheel.braked = True
+
+    def flags(self) -> int:
+        """Whether set points are cut."""
+        return StatusBit.INTERNAL_LIMIT if self.limited else 0
+
+    def step(self, now: float) -> None:
+        """Once a slot: ramp down, watch SYNC."""
+        if self.state not in POWERED:
+            return
+        if self.state is State.OPERATION_ENABLED:
+            if self.late(now):
+                self.trip(Fault.SYNC_LOST)
+            return
+        change = (self._ramp or 0.0) * SLOT
+        self._reference = math.copysign(max(abs(self._reference) - change, 0.0), self._reference)
+        self._wheel.target = self._reference
+        if (
+            self.state is State.FAULT_REACTION_ACTIVE
+            and self._reference == 0.0
+            and abs(self._wheel.speed) < _AT_REST
+        ):
+            self.ramp_ended()
+
+
+class RoverBus:
+    """Everything on the rover's bus but the master: drives 1 (left) and 2 (right), sensor 3.
+
+    In each tick: `receive` what came, then `step(now)`, then send what `drain` gives. Times are
+    seconds on the caller's clock.
+    """
+
+    def __init__(self, rover: Rover, sensor: ReflectorSensor, now: float = 0.0) -> None:
+        self.rover = rover
+        self.drives = (WheelDrive(0, rover), WheelDrive(1, rover))
+        self.sensor = sensor
+        self._nodes: tuple[CanopenNode, ...] = (*self.drives, sensor)
+        self._own = {node.node: node for node in self._nodes}
+        self._due, self._watch_due = -math.inf, now
+        for node in self._nodes:
+            node.boot(now)
+
+    def receive(self, now: float, frame: Frame) -> None:
+        """A frame of the master's."""
+        cob_id = frame.id
+        target = self._own.get(cob_id & 0x7F)
+        self.rover.move_to(now)
+        if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
+            target.take_rpdo(now, frame.data)
+        elif cob_id == SYNC_ID:
+            for node in self._nodes:
+                node.sync(now)
+        else:
+            self._due = -math.inf  # it may set any timer
+            for node in self._nodes:
+                node.receive(now, frame)
+
+    def step(self, now: float) -> None:
+        """What rover and devices do on time."""
+        if now < self._due - 1e-9:
+            return
+        self.rover.move_to(now)
+        if now >= self._watch_due - 1e-9:
+            self._watch_due = max(self._watch_due, now - SLOT) + SLOT
+            for drive in self.drives:
+                drive.step(now)
+        for node in self._nodes:
+            node.advance(now)
+        self._due = min(self._watch_due, *[node.due() for node in self._nodes])
+
+    def drain(self) -> list[Frame]:
+        """Frames to the master, oldest first."""
+        frames: list[Frame] = []
+        for node in self._nodes:
+            if node.outbox:
+                frames += node.drain()
+        return frames
+
+    def power(self, closed: bool) -> None:
+        """Close or open the power chain (emergency stop). Open: the drives lose power and the
+        brakes fall in."""
+        for drive in self.drives:
+            drive.powered = closed
+            if not closed:
+                drive.trip(Fault.UNDERVOLTAGE)
+
+    def trip(self, side: int, fault: Fault = Fault.OVERCURRENT) -> str:
+        """Make a drive (0 left, 1 right) fail; gives the fault in words."""
+        self.drives[side].trip(fault)
+        return fault_text(fault)

@@ -1,0 +1,287 @@
+"""The laboratory of the mobile robot: floor, rover, drives, sensor and camera as one party, which
+answers as hardware would.
+
+The world moves on only when something is due: a slot of the rover, a frame, an image. A tick in
+between costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.location_file import Directory
+from petrobot.services.comm.lockstep.party import TICK
+from petrobot.sim.catching.truth import LaboratoryError
+from petrobot.sim.faults import Fault, FaultKinds, FaultPlan
+from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
+from petrobot.sim.track.camera import FloorCamera, Motion
+from petrobot.sim.track.course import Track
+from petrobot.sim.track.drives import RoverBus
+from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.floor import Floor, Picture
+from petrobot.sim.track.referee import Referee
+from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
+from petrobot.sim.track.truth import LightTruth, RoverTruth, TrackSite, TrackTruth, track_site_of
+
+# Faults that the rover's laboratory can be asked for.
+
+ROVER_FAULTS: Final = FaultKinds(
+    keys={
+        "drop_images": ("share", "duration"),
+        "dead_camera": ("duration",),
+        "can_errors": ("share", "duration"),
+        "bus_off": ("duration",),
+        "drive_fault": ("joint",),
+        "dead_sensor": ("duration",),
+        "power": ("duration",),
+        "clear": (),
+    },
+    drives=2,
+)
+
+
+def read_rover_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
+    """A fault as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
+    return ROVER_FAULTS.read(now, kind, arguments)
+
+
+# Light over the floor: a slow drift, and flashes of spectators' cameras.
+
+
+class Light(NamedTuple):
+    """What falls on the floor: a factor on the nominal light, and stray light in the lens (grey
+    levels)."""
+
+    level: float
+    veil: float
+
+
+class Hall:
+    """The hall's light from `began` (s) on; asked for moments that never go back. Flashes come at
+    random, with `rng`."""
+
+    def __init__(self, truth: LightTruth, rng: np.random.Generator, began: float) -> None:
+        self._truth = truth
+        self._rng = rng
+        self._began = began
+        self._phase = float(rng.uniform(0.0, 2.0 * math.pi))
+        self._flash = began, began
+        self._next_flash(began)
+
+    def at(self, now: float) -> Light:
+        """The light at a moment (s)."""
+        truth = self._truth
+        angle = 2.0 * math.pi * (now - self._began) / truth.period + self._phase
+        level = truth.level * (1.0 + truth.drift * math.sin(angle))
+        while now >= self._flash[1]:
+            self._next_flash(self._flash[1])
+        if now >= self._flash[0]:
+            return Light(level * truth.flash_gain, truth.flash_veil)
+        return Light(level, 0.0)
+
+    def _next_flash(self, after: float) -> None:
+        if self._truth.flash_rate <= 0.0:
+            self._flash = math.inf, math.inf
+            return
+        start = after + float(self._rng.exponential(1.0 / self._truth.flash_rate))
+        self._flash = start, start + float(self._rng.uniform(*self._truth.flash_duration))
+
+
+REGIME: Final = "straight"
+"""The regime if none is asked for."""
+_SLIP, _LIGHT, _IMAGE, _ECHO, _FAULTS, _FALLEN = 0x736C, 0x6C69, 0x696D, 0x6563, 0x6661, 0x6672
+"""Keep draws of the same seed apart."""
+
+
+class TrackLaboratory(LaboratoryParty):
+    """The party of the simulated node `name`. `where` gives the party of an endpoint
+    (`Directory.party`)."""
+
+    def __init__(
+        self,
+        name: str,
+        site: TrackSite,
+        where: Callable[[str], str],
+        *,
+        seed: int = 0,
+        regime: str = REGIME,
+        boot: str = "laboratory",
+        directory: str = "",
+    ) -> None:
+        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in
+        services.comm.callee."""
+        super().__init__(name, where, boot, directory)
+        cv2.setNumThreads(1)  # cores are shared with other nodes
+        self._site = site
+        self._floor = Floor()
+        self._cameras: dict[str, FloorCamera] = {}
+        truth = site.truth(regime)
+        self.rover = Rover(truth.rover, np.random.default_rng((seed, _SLIP)))
+        self._echo_draws = np.random.default_rng((seed, _ECHO))
+        self.bus = RoverBus(self.rover, ReflectorSensor(self._measure))
+        self._prepare(seed, truth, truth.course.track(seed))
+
+    def _prepare(self, seed: int, truth: TrackTruth, track: Track) -> None:
+        """A new experiment: rover at the start, score empty, everything drawn anew. Drives and
+        counters stay as they are."""
+        self.truth, self.track = truth, track
+        self._floor.paint(track)
+        self._camera = self._camera_of(truth)
+        self._hall = Hall(truth.light, np.random.default_rng((seed, _LIGHT)), self.now)
+        self._image_draws = np.random.default_rng((seed, _IMAGE))
+        self._echo_draws = np.random.default_rng((seed, _ECHO))
+        hangs = (
+            np.random.default_rng((seed, _FALLEN)).random(len(track.gaps))
+            >= truth.reflector_missing
+        )
+        self._reflectors = [
+            (gap.x, gap.y) for gap, there in zip(track.gaps, hangs, strict=True) if there
+        ]
+        self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
+        self.bus.power(True)
+        self.bus.sensor.dead = False
+        self.rover.move_to(self.now)
+        draws = np.random.default_rng((seed, _SLIP))
+        self.rover.place(truth.rover, _put_down(track.start, truth.rover, draws), draws)
+        self.referee = Referee(track, seed, truth.regime, self.now, hangs.tolist())
+        self._watch_due = self.now
+
+    def _camera_of(self, truth: TrackTruth) -> FloorCamera:
+        """The camera as it is mounted; kept, since its noise field takes some milliseconds."""
+        key = repr(truth.camera)
+        if key not in self._cameras:
+            nominal = self._site.nominal["camera"]
+            self._cameras[key] = FloorCamera(
+                truth.camera,
+                float(nominal["exposure"]),
+                (float(nominal["black"]), float(nominal["white"])),
+                float(nominal["noise"]),
+                float(self._site.settings["camera"]["vignetting"]),
+            )
+        return self._cameras[key]
+
+    # The world, as lock step and real time drive it
+
+    def tick(self, now: float) -> None:
+        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+        if not self._faults.none:
+            self._begin_faults(now)
+        if self.exposures.due(now):
+            self._expose(now)
+        self.bus.step(now)
+        if now >= self._watch_due - 1e-9:
+            self._watch_due += _WATCH
+            self.rover.move_to(now)
+            if self.referee.watch(now, self.rover.pose, self.rover.speed):
+                self.bus.power(False)
+        self.now = now + TICK
+
+    def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
+        """Frames of the master's."""
+        for frame in self._faults.passed(frames):
+            self.bus.receive(now, frame)
+
+    def take_frames(self) -> Sequence[Frame]:
+        """Frames of drives and sensor since the last call."""
+        return self._faults.passed(self.bus.drain())
+
+    def _expose(self, now: float) -> None:
+        if self._faults.image_lost():
+            return
+        self.exposures.put(now, now + self._site.settings["camera"]["readout"], self.picture(now))
+
+    def picture(self, now: float) -> Picture:
+        """What the camera sees at a moment that the world has come to (s): (rows, width) grey
+        levels."""
+        rover = self.rover
+        rover.move_to(now)
+        light = self._hall.at(now)
+        motion = Motion(rover.x, rover.y, rover.heading, rover.speed, rover.turn)
+        return self._camera.take(
+            self._floor, motion, self._image_draws, light.level, light.veil, self.truth.light.noise
+        )
+
+    def _measure(self, now: float) -> list[Echo]:
+        self.rover.move_to(now)
+        return look(self.truth.sensor, self.rover.pose, self._reflectors, self._echo_draws)
+
+    # Faults and services
+
+    def _begin_faults(self, now: float) -> None:
+        powerless = self._faults.active("power")
+        for fault in self._faults.begin(now):
+            self._strike(fault)
+        if self._faults.active("power") is not powerless:
+            self.bus.power(powerless)
+        self.bus.sensor.dead = self._faults.active("dead_sensor")
+
+    def _strike(self, fault: Fault) -> None:
+        if fault.kind == "drive_fault":
+            self.bus.trip(int(fault.value) - 1)
+
+    def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Answer one of `services`. Raises ValueError (LaboratoryError, TrackError among them) for
+        arguments that cannot be.
+
+        laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None,
+        speed=None): a new experiment, gives nothing; `speed` (m/s) is refused if no wheel goes so
+        fast; other parameters of the task are not the laboratory's business; laboratory_score():
+        see sim.track_referee; laboratory_fault(kind, after=0, ...): see sim.track_faults.
+        """
+        if service == SCORE:
+            return self.referee.score(self.now)
+        if service == FAULT:
+            rest = {key: value for key, value in arguments.items() if key != "kind"}
+            self._faults.add(read_rover_fault(self.now, str(arguments.get("kind", "")), rest))
+            return {}
+        seed = whole_number(arguments, "seed", 0) or 0
+        truth = self._site.truth(str(arguments.get("regime", REGIME)))
+        _check_speed(arguments.get("speed"), truth.rover)
+        elements, interruptions = (
+            whole_number(arguments, key, None) for key in ("elements", "interruptions")
+        )
+        self._prepare(seed, truth, truth.course.track(seed, elements, interruptions))
+        return {}
+
+    def make_ready(self, arguments: Mapping[str, Any]) -> None:
+        """Have the camera of a regime ready. Raises LaboratoryError."""
+        self._camera_of(self._site.truth(str(arguments.get("regime", REGIME))))
+
+    def close(self) -> None:
+        """Nothing is held outside of memory."""
+
+
+def _put_down(start: Pose, rover: RoverTruth, draws: np.random.Generator) -> Pose:
+    """Where a hand puts the rover that is to stand at `start`."""
+    dx, dy, turn = draws.standard_normal(3).tolist()
+    aside, heading = rover.settings["placed"], rover.settings["placed_heading"]
+    return Pose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
+
+
+def _check_speed(speed: object, rover: RoverTruth) -> None:
+    """Raise LaboratoryError for a speed (m/s) that the rover cannot have."""
+    most = round(rover.top_speed * min(wheel.radius for wheel in rover.wheels), 1)
+    if speed is not None and not (isinstance(speed, int | float) and 0.0 < speed <= most):
+        raise LaboratoryError(
+            f"speed = {speed!r}: give one above 0 and up to {most} m/s, which is what the "
+            "wheels can do"
+        )
+
+
+_WATCH: Final = 0.02
+"""s between two looks of the referee: 1 cm of way at 0.5 m/s."""
+
+
+def make_laboratory(directory: Directory, name: str) -> TrackLaboratory:
+    """The laboratory of the simulated node `name` of the location file. Raises LaboratoryError."""
+    boot = f"{name} in lock step"
+    return TrackLaboratory(
+        name, track_site_of(directory), directory.party, boot=boot, directory=directory.hash
+    )

@@ -1,0 +1,262 @@
+"""Keeps the score of a run on the track: how far off the centre line, interruptions recovered,
+where and when it stopped.
+
+The rules (docs/decisions/mobile-contract.md): what counts is the body's origin. It is *on* the
+track until it is more than `LEFT` off; over an interruption it is in a *gap* until it is within
+`REGAINED` of the centre line behind it; *lost* after it has left the track, until it is back on a
+painted element no farther back than it was; and at the *end* once it has come to the T.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Final
+
+from petrobot.sim.track.course import BOARD, Gap, Near, Track
+from petrobot.sim.track.elements import SQUARE, Pose
+
+LEFT: Final = 0.30
+"""m off the centre line at which the track counts as left."""
+REGAINED: Final = 0.10
+"""m off the centre line within which it counts as regained."""
+IN_TIME: Final = 1.0
+"""m behind an interruption within which the track must be regained."""
+BEFORE_END, BEYOND_END, ASIDE_END = 0.10, 0.30, 0.30
+"""m before and beyond the T's far side, and aside of it, where the rover must stop."""
+STANDING: Final = 0.01
+"""m/s below which the rover counts as standing ..."""
+STANDING_FOR: Final = 0.5
+"""... for so many seconds."""
+DEPARTED: Final = 0.01
+"""m from where it was put down at which the clock starts."""
+OFF_BOARD: Final = 1.0
+"""m beyond the board's edge at which somebody stops the rover."""
+ROW_PERIOD: Final = 0.2
+"""s between two rows of the path."""
+_BEHIND, _AHEAD = 0.6, 1.2
+"""m along the track by which the nearest point may have moved since the last look: farther is
+another part of the track."""
+
+
+class Phase(StrEnum):
+    """Where a run stands."""
+
+    ON = "on"
+    GAP = "gap"
+    LOST = "lost"
+    END = "end"
+
+
+@dataclass(slots=True)
+class _Crossing:
+    """What became of one interruption. `aside` is the greatest distance from the line that would
+    have been there (m)."""
+
+    gap: Gap
+    kind: str
+    reflector: bool
+    entered: float | None = None
+    ended: float | None = None
+    recovered: bool = False
+    aside: float = 0.0
+
+
+@dataclass(slots=True)
+class Referee:
+    """Watches one run. `watch` it often; `score` gives plain data at any time."""
+
+    track: Track
+    seed: int
+    regime: str
+    began: float
+    reflectors: Sequence[bool] = ()
+    """Whether the reflector of each interruption hangs; all do if nothing is said."""
+    phase: Phase = Phase.ON
+    s: float = 0.0
+    """Arc length reached (m)."""
+    penalties: list[dict[str, Any]] = field(default_factory=list)
+    departed: float | None = None
+    """When the rover first moved (s)."""
+    stopped: float | None = None
+    """When it came to stand at the T (s)."""
+    finished: bool = False
+    _path: list[tuple[float, float, float, float]] = field(default_factory=list)
+    _way: float = 0.0
+    _off: float = 0.0
+    _squares: float = 0.0
+    _most: float = 0.0
+    _removed: bool = False
+    _first: Pose | None = None
+    _last: Pose | None = None
+    _still_since: float | None = None
+    _crossings: list[_Crossing] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        kinds = [element.kind for element in self.track.elements if not element.painted]
+        hang = self.reflectors or [True] * len(kinds)
+        self._crossings = [
+            _Crossing(gap, kind.name.lower(), there)
+            for gap, kind, there in zip(self.track.gaps, kinds, hang, strict=True)
+        ]
+
+    def watch(self, now: float, pose: Pose, speed: float) -> bool:
+        """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover
+        has just left the board, where somebody presses its emergency stop."""
+        if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
+            self._path.append((now - self.began, *pose))
+        if self.stopped is not None or self._removed:
+            return False
+        if self._first is None:
+            self._first = pose
+        last, self._last = self._last, pose
+        step = 0.0 if last is None else math.hypot(pose.x - last.x, pose.y - last.y)
+        if self.departed is None:
+            if math.hypot(pose.x - self._first.x, pose.y - self._first.y) < DEPARTED:
+                return False
+            self.departed = now
+        self._way += step
+        if step > 0.0 and self.phase is not Phase.END:
+            self._locate(now, pose, step)
+        if self.phase is Phase.END:
+            self._await_stop(now, pose, speed)
+        if not all(-OFF_BOARD <= at <= BOARD * SQUARE + OFF_BOARD for at in (pose.x, pose.y)):
+            self._removed = True
+            self._penalize(now, "left_board", pose)
+        return self._removed
+
+    def _locate(self, now: float, pose: Pose, step: float) -> None:
+        near = self.track.nearest(pose.x, pose.y)
+        if self.phase is Phase.ON:
+            self._follow(now, pose, near, step)
+        elif self.phase is Phase.GAP:
+            self._cross(now, pose, near)
+        elif self._painted(near) and near.distance <= REGAINED and near.s >= self.s - _BEHIND:
+            self._go_on(now, pose, near)
+        if self.phase is Phase.ON and self.s >= self.track.length - BEFORE_END:
+            self.phase, self.finished = Phase.END, True
+
+    def _follow(self, now: float, pose: Pose, near: Near, step: float) -> None:
+        if near.distance > LEFT or not -_BEHIND <= near.s - self.s <= _AHEAD:
+            self.phase = Phase.LOST
+            self._penalize(now, "track_left", pose)
+            return
+        self.s = max(self.s, near.s)
+        if self._painted(near):
+            self._off += step
+            self._squares += step * near.distance * near.distance
+            self._most = max(self._most, near.distance)
+            return
+        self.phase = Phase.GAP
+        for crossing in self._crossings:
+            if crossing.gap.start <= near.s <= crossing.gap.end and crossing.entered is None:
+                crossing.entered = now
+
+    def _cross(self, now: float, pose: Pose, near: Near) -> None:
+        open_gaps = [
+            each for each in self._crossings if each.entered is not None and each.ended is None
+        ]
+        for crossing in open_gaps:
+            crossing.aside = max(crossing.aside, near.distance)
+        if self._painted(near) and near.distance <= REGAINED and near.s >= self.s:
+            self._go_on(now, pose, near)
+
+    def _go_on(self, now: float, pose: Pose, near: Near) -> None:
+        """The track is regained: every interruption before it is recovered or missed."""
+        for crossing in self._crossings:
+            if crossing.ended is None and crossing.gap.end <= near.s + 1e-9:
+                crossing.ended = now
+                crossing.recovered = (
+                    crossing.entered is not None and near.s <= crossing.gap.end + IN_TIME
+                )
+                if not crossing.recovered:
+                    self._penalize(now, "interruption_missed", pose, crossing.gap.end)
+        self.phase, self.s = Phase.ON, max(self.s, near.s)
+
+    def _painted(self, near: Near) -> bool:
+        return self.track.elements[near.element].painted
+
+    def _await_stop(self, now: float, pose: Pose, speed: float) -> None:
+        end = self.track.end
+        c, s = math.cos(end.heading), math.sin(end.heading)
+        ahead = (pose.x - end.x) * c + (pose.y - end.y) * s
+        aside = (pose.y - end.y) * c - (pose.x - end.x) * s
+        if abs(speed) >= STANDING:
+            self._still_since = None
+        elif self._still_since is None:
+            self._still_since = now
+        beyond = ahead > BEYOND_END or abs(aside) > ASIDE_END
+        if beyond and not any(each["kind"] == "not_stopped" for each in self.penalties):
+            self._penalize(now, "not_stopped", pose, self.track.length)
+        still = self._still_since is not None and now - self._still_since >= STANDING_FOR - 1e-9
+        if still and not beyond and ahead >= -BEFORE_END:
+            self.stopped = self._still_since
+
+    def _penalize(self, now: float, kind: str, pose: Pose, s: float | None = None) -> None:
+        begun = self.began if self.departed is None else self.departed
+        row = {"s": self.s if s is None else s, "x": pose.x, "y": pose.y, "after": now - begun}
+        self.penalties.append(
+            {"kind": kind, **{key: round(value, 3) for key, value in row.items()}}
+        )
+
+    # The score
+
+    def score(self, now: float) -> dict[str, Any]:
+        """How the run went, as plain data (docs/decisions/mobile-contract.md); the keys without a
+        unit are counts or flags."""
+        begun = now if self.departed is None else self.departed
+        overrun = any(each["kind"] == "not_stopped" for each in self.penalties)
+        stopped_at_t = self.stopped is not None and not overrun
+        duration = (now if self.stopped is None else self.stopped) - begun
+        penalties = self._all_penalties(now, stopped_at_t, overrun)
+        return {
+            "seed": self.seed,
+            "regime": self.regime,
+            "finished": self.finished,
+            "stopped_at_T": stopped_at_t,
+            "time_s": round(duration, 3),
+            "penalties": penalties,
+            "penalty_count": len(penalties),
+            "rms_mm": round(1000.0 * math.sqrt(self._squares / self._off), 3)
+            if self._off
+            else None,
+            "max_mm": round(1000.0 * self._most, 3) if self._off else None,
+            "interruptions": len(self._crossings),
+            "recovered": sum(crossing.recovered for crossing in self._crossings),
+            "crossings": [self._crossing(crossing, begun) for crossing in self._crossings],
+            "reached_m": round(self.s, 3),
+            "length_m": round(self.track.length, 3),
+            "way_m": round(self._way, 3),
+            "mean_speed": round(self._way / duration, 4) if duration > 0.0 else 0.0,
+            "track": self.track.plain(),
+            "path": [
+                [round(t, 3), round(x, 3), round(y, 3), round(heading, 3)]
+                for t, x, y, heading in self._path
+            ],
+        }
+
+    def _all_penalties(self, now: float, stopped_at_t: bool, overrun: bool) -> list[dict[str, Any]]:
+        """Those given, and those that a run that is over now has earned besides."""
+        given, last = list(self.penalties), self._last or self.track.start
+        for crossing in self._crossings:
+            if crossing.entered is not None and crossing.ended is None:
+                self._penalize(now, "interruption_missed", last, crossing.gap.end)
+        if self.finished and not stopped_at_t and not overrun:
+            self._penalize(now, "not_stopped", last, self.track.length)
+        found, self.penalties = self.penalties, given
+        return found
+
+    @staticmethod
+    def _crossing(crossing: _Crossing, begun: float) -> dict[str, Any]:
+        entered, ended = crossing.entered, crossing.ended
+        return {
+            "kind": crossing.kind,
+            "s": round(crossing.gap.start, 3),
+            "reflector": crossing.reflector,
+            "recovered": crossing.recovered,
+            "entered_after": None if entered is None else round(entered - begun, 3),
+            "took_s": None if entered is None or ended is None else round(ended - entered, 3),
+            "aside_m": round(crossing.aside, 3),
+        }

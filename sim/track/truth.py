@@ -1,0 +1,297 @@
+"""What the rover's cell really is: the nominal numbers, one rover's seeded errors, and a regime's
+track and disturbances.
+
+Only the laboratory reads this. A regime name is a kind of track and any number of disturbances of
+`sim/track/track.toml`, joined by `+` (or a comma): `straight`, `arcs+drift`, `mixed+flash+slip`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from petrobot.services.comm.location_file import Directory
+from petrobot.sim.catching.truth import LaboratoryError, read_toml
+from petrobot.sim.track.camera import Mount
+from petrobot.sim.track.course import Track
+
+LABORATORY_FILE = Path(__file__).with_name("track.toml")
+
+
+@dataclass(frozen=True, slots=True)
+class WheelTruth:
+    """One wheel and its motor as they are."""
+
+    radius: float
+    lag: float
+
+
+@dataclass(frozen=True, slots=True)
+class RoverTruth:
+    """The rover as it is; the numbers' meanings stand in sim/track/track.toml and rover.toml."""
+
+    wheels: tuple[WheelTruth, WheelTruth]
+    """Left and right."""
+    track_width: float
+    top_speed: float
+    """rad/s of a wheel at `nominal_voltage`."""
+    nominal_voltage: float
+    acceleration: float
+    encoder_counts: int
+    slip: float
+    slip_time: float
+    slip_aside: float
+    slip_turn: float
+    battery: tuple[float, float, float]
+    """Voltage at the start (V), its fall (V/s), resistance (ohm)."""
+    settings: Mapping[str, float]
+    """How it is put down, friction, inertia, brakes, torque, electronics."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTruth:
+    """The retroreflector sensor as it is (m, rad)."""
+
+    forward: float
+    below: float
+    """Of the reflectors' centres."""
+    half_angle: float
+    range: float
+    fan: float
+    bearing_offset: float
+    range_offset: float
+    bearing_noise: float
+    range_noise: float
+    step: float
+    miss: float
+    false: float
+    false_range: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LightTruth:
+    """Light over the floor, flashes, and the camera's noise as a factor on the nominal one."""
+
+    level: float
+    drift: float
+    period: float
+    flash_rate: float
+    flash_duration: tuple[float, float]
+    flash_gain: float
+    flash_veil: float
+    noise: float
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Which track a regime lays."""
+
+    kinds: str
+    elements: int
+    interruptions: int
+
+    def track(
+        self, seed: int, elements: int | None = None, interruptions: int | None = None
+    ) -> Track:
+        """The track of a seed; numbers given go before the regime's. Raises
+        sim.track.TrackError."""
+        if self.kinds == "contest":
+            return Track.contest()
+        return Track.by_seed(
+            seed,
+            self.elements if elements is None else elements,
+            self.interruptions if interruptions is None else interruptions,
+            self.kinds,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TrackTruth:
+    """The simulated truth of one regime."""
+
+    regime: str
+    course: Course
+    rover: RoverTruth
+    camera: Mount
+    sensor: SensorTruth
+    light: LightTruth
+    reflector_missing: float
+    """Probability that a reflector has fallen down."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackSite:
+    """The cell's two files."""
+
+    nominal: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    source: str = "rover.toml"
+
+    def truth(self, regime: str) -> TrackTruth:
+        """The truth of a regime. Raises LaboratoryError."""
+        base, values = _disturbed(self.settings, regime)
+        errors, nominal = self.settings["installation"], self.nominal
+        rng = np.random.default_rng(errors["seed"])
+        try:
+            return TrackTruth(
+                regime,
+                Course(str(base["kinds"]), int(base["elements"]), int(base["interruptions"])),
+                _rover(nominal, self.settings["rover"], errors, values, rng),
+                _camera(nominal["camera"], errors, values, rng),
+                _sensor(nominal, self.settings["sensor"], errors, values, rng),
+                _light(values),
+                float(values["reflector_missing"]),
+            )
+        except KeyError as fault:
+            raise LaboratoryError(
+                f"{LABORATORY_FILE.name} or {self.source}: key {fault} is missing; the "
+                "shipped files show it"
+            ) from fault
+
+
+def read_track_site(rover: Path, laboratory: Path = LABORATORY_FILE) -> TrackSite:
+    """The site of a rover file. Raises LaboratoryError."""
+    return TrackSite(read_toml(rover), read_toml(laboratory), str(rover))
+
+
+def track_site_of(directory: Directory) -> TrackSite:
+    """The site that the location file names: `[parameters] rover`, and `laboratory` if it is not
+    the shipped one."""
+    if "rover" not in directory.parameters:
+        raise LaboratoryError(
+            f'{directory.source}: [parameters] rover is missing; write rover = "rover.toml"'
+        )
+    laboratory = directory.parameters.get("laboratory")
+    return read_track_site(
+        directory.file(directory.parameters["rover"]),
+        directory.file(laboratory) if laboratory else LABORATORY_FILE,
+    )
+
+
+def _disturbed(
+    settings: Mapping[str, Any], regime: str
+) -> tuple[Mapping[str, Any], dict[str, Any]]:
+    base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
+    regimes, disturbances = settings["regimes"], settings["disturbances"]
+    if base not in regimes:
+        raise LaboratoryError(
+            f"regime {regime!r}: it must begin with one of {', '.join(regimes)}, such as "
+            "'arcs' or 'arcs+slip'"
+        )
+    values, set_by = dict(settings["nominal"]), dict[str, str]()
+    for name in names:
+        if name not in disturbances:
+            raise LaboratoryError(
+                f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}"
+            )
+        for key, value in disturbances[name].items():
+            if key not in values:
+                raise LaboratoryError(
+                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are"
+                )
+            if key in set_by:
+                raise LaboratoryError(
+                    f"regime {regime!r}: {set_by[key]} and {name} both set {key}; keep one of them"
+                )
+            values[key], set_by[key] = value, name
+    return regimes[base], values
+
+
+def _rover(
+    nominal: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> RoverTruth:
+    rover = nominal["rover"]
+    radii = rover["wheel_radius"] * (1.0 + rng.normal(0.0, errors["wheel_radius"], 2))
+    radii[0] *= 1.0 + values["wheel_radius_left"]
+    lags = rover["wheel_lag"] * (1.0 + rng.normal(0.0, errors["wheel_lag"], 2))
+    return RoverTruth(
+        wheels=(
+            WheelTruth(float(radii[0]), float(lags[0])),
+            WheelTruth(float(radii[1]), float(lags[1])),
+        ),
+        track_width=float(rover["track_width"] * (1.0 + rng.normal(0.0, errors["track_width"]))),
+        top_speed=float(rover["top_speed"]),
+        nominal_voltage=float(rover["battery_voltage"]),
+        acceleration=float(rover["acceleration"]),
+        encoder_counts=int(rover["encoder_counts"]),
+        slip=float(values["slip"]),
+        slip_time=float(settings["slip_time"]),
+        slip_aside=float(values["slip_aside"]),
+        slip_turn=float(values["slip_turn"]),
+        battery=(
+            float(values["battery_voltage"]),
+            float(values["battery_fall"]),
+            float(values["battery_resistance"]),
+        ),
+        settings=settings,
+    )
+
+
+def _camera(
+    nominal: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> Mount:
+    pitch, yaw, roll = rng.normal(0.0, errors["camera_angle"], 3)
+    du, dv = rng.normal(0.0, errors["camera_principal_px"], 2)
+    u, v = nominal["principal_px"]
+    return Mount(
+        forward=float(nominal["forward"] + rng.normal(0.0, errors["camera_forward"])),
+        height=float(nominal["height"] + rng.normal(0.0, errors["camera_height"])),
+        pitch=float(nominal["pitch"] + pitch + values["camera_pitch"]),
+        yaw=float(yaw + values["camera_yaw"]),
+        roll=float(roll),
+        focal=float(nominal["focal_px"] * (1.0 + rng.normal(0.0, errors["camera_focal"]))),
+        principal=(float(u + du), float(v + dv)),
+        width=int(nominal["width"]),
+        rows=int(nominal["height_px"]),
+    )
+
+
+def _sensor(
+    nominal: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    errors: Mapping[str, Any],
+    values: Mapping[str, Any],
+    rng: np.random.Generator,
+) -> SensorTruth:
+    sensor = nominal["sensor"]
+    low, high = settings["false_range"]
+    return SensorTruth(
+        forward=float(sensor["forward"]),
+        below=float(nominal["track"]["reflector_height"] - sensor["height"]),
+        half_angle=float(sensor["half_angle"]),
+        range=float(sensor["range"]),
+        fan=float(sensor["fan"]),
+        bearing_offset=float(rng.normal(0.0, errors["sensor_bearing"])),
+        range_offset=float(rng.normal(0.0, errors["sensor_range"])),
+        bearing_noise=float(sensor["bearing_noise"]),
+        range_noise=float(sensor["range_noise"]),
+        step=float(settings["step"]),
+        miss=float(values["sensor_miss"]),
+        false=float(values["sensor_false"]),
+        false_range=(float(low), float(high)),
+    )
+
+
+def _light(values: Mapping[str, Any]) -> LightTruth:
+    low, high = values["flash_duration"]
+    return LightTruth(
+        level=float(values["light_level"]),
+        drift=float(values["light_drift"]),
+        period=float(values["light_period"]),
+        flash_rate=float(values["flash_rate"]),
+        flash_duration=(float(low), float(high)),
+        flash_gain=float(values["flash_gain"]),
+        flash_veil=float(values["flash_veil"]),
+        noise=float(values["noise"]),
+    )

@@ -1,0 +1,239 @@
+"""Simulated runs that set out from a point of a recorded one: from the beginning it is the run
+itself, from anywhere it ends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.engine import Engine, Phase
+from petrobot.coordinator.launch import Setting, lockstep_cell, lockstep_id
+from petrobot.coordinator.operator.start_from import (
+    ENDS,
+    DepartureError,
+    departed_store,
+    departing,
+    departure,
+)
+from petrobot.coordinator.run.folder import JOURNAL
+from petrobot.coordinator.run.journal import Journal, read_journal
+from petrobot.coordinator.run.recording import JournalStore, replay
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file import load
+from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.scripted import load as script_of
+from tests.run.test_runfolder import SCRIPT, SERVICES
+
+TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
+TICKS = 20_000
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a cell of one node, and a run of it."""
+    folder = tmp_path_factory.mktemp("departure")
+    for name, text in (("services.toml", SERVICES), ("mock.toml", SCRIPT)):
+        (folder / name).write_text(text)
+    given = [
+        "run",
+        str(TASK),
+        "--mode",
+        "lockstep",
+        "--quiet",
+        "--seed",
+        "3",
+        "--journal",
+        str(folder / "runs"),
+    ]
+    assert (
+        main(
+            [
+                *given,
+                "--services",
+                str(folder / "services.toml"),
+                "--mock",
+                str(folder / "mock.toml"),
+            ]
+        )
+        == 0
+    )
+    return folder
+
+
+def the_run(cell: Path) -> Path:
+    """The folder of the first run."""
+    return min((cell / "runs").iterdir(), key=lambda p: p.stat().st_mtime)
+
+
+def parts(cell: Path) -> tuple[Journal, Task, Directory, Engine]:
+    """What a recorded run is made of."""
+    task, directory = load(TASK), parse(SERVICES, cell / "services.toml")
+    return read_journal(the_run(cell) / JOURNAL), task, directory, Engine(task)
+
+
+def simulate(
+    cell: Path, directory: Directory, setting: Setting, store: JournalStore
+) -> dict[str, Any]:
+    """Run to the end in this process."""
+    lab, party = lockstep_cell(directory, setting, script_of(cell / "mock.toml"), None, store)
+    assert lab.run(lambda: party.over, TICKS), "it has no end"
+    store.writer.close()
+    return party.mission.result("lockstep", 0.0)
+
+
+def plain(journal: Journal) -> list[tuple[str, Any]]:
+    """The records, without the CPU time that they took."""
+    for record in journal.records:
+        if isinstance(record.data.get("stimulus"), dict):
+            record.data["stimulus"].pop("cpu_seconds", None)
+    return [(record.kind, record.data) for record in journal.records]
+
+
+@settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(seed=st.integers(0, 2**31))
+def test_from_the_beginning_with_the_same_seed_it_is_the_run_itself(cell: Path, seed: int) -> None:
+    """Record by record, for any seed."""
+    _, task, directory, engine = parts(cell)
+    then, number = the_run(cell), len(list((cell / "runs").iterdir()))
+    first = departure(read_journal(then / JOURNAL), engine, "then", 0)
+    made = []
+    for turn in range(2):
+        journal = read_journal(then / JOURNAL)
+        setting = departing(journal, task, engine, first, seed)
+        folder = cell / "runs" / f"same-{seed}-{number}-{turn}"
+        simulate(cell, directory, setting, departed_store(journal, setting, first, folder))
+        then = folder
+        made.append(plain(read_journal(folder / JOURNAL)))
+    assert made[0] == made[1]
+    assert lockstep_id(setting).endswith(f"/{seed}")
+
+
+def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
+    """`petrobot run --from RUN` makes the recorded run again, in a folder of its own that says
+    where it comes from."""
+    then = the_run(cell)
+    out = cell / "again.json"
+    given = [
+        "run",
+        "--from",
+        str(then),
+        "--quiet",
+        "--journal",
+        str(cell / "again"),
+        "--json",
+        str(out),
+    ]
+    assert main(given) == 0
+    [folder] = (cell / "again").iterdir()
+    again = read_journal(folder / JOURNAL)
+    assert plain(again) == plain(read_journal(then / JOURNAL))
+    assert again.header["from"] == {"run": then.name, "record": 0, "time": 0.0, "going": {}}
+    before, now = json.loads((then / "result.json").read_text()), json.loads(out.read_text())
+    assert now.pop("from") == {"run": then.name, "record": 0, "going": {}}
+    assert {k: v for k, v in now.items() if k != "wall_s"} == {
+        k: v for k, v in before.items() if k != "wall_s"
+    }
+    assert main(["replay", str(folder)]) == 0
+
+
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> None:
+    """Whatever becomes of the runs that went on; the first marking is that of the record, and
+    replay derives it all again."""
+    journal, task, directory, engine = parts(cell)
+    last = journal.records[-1].number
+    record = data.draw(st.integers(0, last - 1), label="record")
+    steps = [step for step in replay(journal, engine) if step.number <= record]
+    live = (
+        sorted({r.place for r in steps[-1].state.runs() if r.phase is not Phase.DONE})
+        if steps
+        else []
+    )
+    going = {place: data.draw(st.sampled_from(ENDS), label=place) for place in live}
+    seed = data.draw(st.integers(0, 99), label="seed")
+    try:
+        point = departure(journal, engine, "then", record, going)
+    except DepartureError:
+        assert record > max(r.number for r in journal.records if r.kind == "stimulus")
+        return
+    setting = departing(journal, task, engine, point, seed)
+    number = len(list((cell / "runs").iterdir()))
+    folder = cell / "runs" / f"any-{number}"
+    result = simulate(cell, directory, setting, departed_store(journal, setting, point, folder))
+    assert result["status"] == "success"
+    made = read_journal(folder / JOURNAL)
+    assert made.header["from"]["record"] == record
+    derived = list(replay(made, Engine(task)))
+    begun = next(step for step in derived if step.stimulus.__class__.__name__ == "Begin")
+    if steps and going == dict.fromkeys(live, "again"):
+        assert begun.state.marking == steps[-1].state.marking
+
+
+@pytest.mark.parametrize(
+    ("more", "word"),
+    [
+        (["--from", "{run}:99999"], "records 0"),
+        (["--from", "{run}:one"], "as a number"),
+        (["--from", "{run}:-1"], "as a number"),
+        (["--from", "nowhere:1"], "no run"),
+        (["--from", "{run}:1", "--runs", "3"], "runs are left"),
+        (["--from", "{run}:1", "--learn", "x.db"], "teaches nothing"),
+        (["--from", "{run}:1", "--mode", "realtime"], "does not stand where"),
+        (["--from", "{run}:1", "--processes", "0"], "one process"),
+        (["--from", "{run}:1", "--going", "later"], "begins again"),
+        (["--from", "{run}:1", "--going", "moon=error"], "no run went on"),
+        (["--from", "{run}:1", "--going", "error", "--going", "success"], "one END for all"),
+        (["--from", "{run}:1", "--set", "speed=3"], "no parameter"),
+        (["shuttle", "--from", "{run}:1"], "comes from the run"),
+        (["--going", "again"], "give a task"),
+        (["shuttle", "--going", "again"], "goes with --from"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    cell: Path, more: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 2 and one clear word, and no folder is left behind."""
+    folder = cell / "refused"
+    given = [text.format(run=the_run(cell)) for text in more]
+    assert main(["run", *given, "--quiet", "--journal", str(folder)]) == 2
+    assert word in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_a_killed_departed_run_is_made_again(cell: Path) -> None:
+    """`petrobot resume` knows where it had set out."""
+    then, kept = the_run(cell), cell / "killed"
+    record = next(
+        r.number for r in read_journal(then / JOURNAL).records if "RunEnded" in str(r.data)
+    )
+    assert main(["run", "--from", f"{then}:{record}", "--quiet", "--journal", str(kept)]) == 0
+    [folder] = kept.iterdir()
+    before = plain(read_journal(folder / JOURNAL))
+    (folder / "result.json").unlink()
+    whole = read_journal(folder / JOURNAL)
+    (folder / JOURNAL).unlink()
+    _write(folder / JOURNAL, whole, 5)
+    assert main(["resume", str(folder), "--quiet", "--no-page"]) == 0
+    assert plain(read_journal(folder / JOURNAL)) == before
+
+
+def _write(path: Path, whole: Journal, records: int) -> None:
+    from petrobot.coordinator.run.journal import JournalWriter
+
+    given: Mapping[str, Any] = dict(whole.header)
+    writer = JournalWriter(path, given)
+    for record in whole.records[:records]:
+        writer.append(record.kind, record.data)
+    writer.close()

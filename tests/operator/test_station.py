@@ -1,0 +1,149 @@
+"""A coordinator that stays: tasks are started again and again, and every start that cannot be is
+answered clearly."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+
+import pytest
+
+from petrobot.coordinator.operator.door_file import Door, find_door
+from petrobot.coordinator.operator.history import opened
+from petrobot.coordinator.run.folder import JOURNAL, RESULT, NoRunError
+from petrobot.coordinator.run.journal import read_journal
+from tests.operator.conftest import TASK, Cell
+
+pytestmark = pytest.mark.processes
+
+
+async def test_a_task_runs_again_and_again_over_real_nodes(cell: Cell) -> None:
+    """Each run has a journal and a result of its own; what the page knew of its operator stays."""
+    names = []
+    for _ in range(2):
+        answer = await cell.say("start", task="moving")
+        assert answer["ok"], answer
+        result = await cell.ended()
+        assert (result["status"], result["runs"]) == ("success", 2)
+        assert cell.state["mission"]["state"] == "success"
+        assert json.loads((cell.runs / answer["run"] / RESULT).read_text()) == result
+        names.append(answer["run"])
+    assert len(set(names)) == 2
+    assert cell.state["controls"]["holder"] == "ana"
+    history = opened(cell.runs / names[0] / JOURNAL, names[0])
+    assert history["fault"] == ""
+    assert [
+        f["reason"]["code"] for r in history["records"] for f in r["firings"] if f["reason"]
+    ] == ["slipped"]
+
+
+async def test_the_run_is_steered_and_its_door_is_open_while_it_goes_on(cell: Cell) -> None:
+    """Pause, step, tokens; the command line finds the run, and no longer when it has ended."""
+    cell.station.door = lambda run: Door(run, "http://127.0.0.1:1", "secret", os.getpid())
+    started = await cell.say("start", task="moving")
+    await cell.until(lambda: cell.state["mission"]["state"] == "running")
+    assert find_door(None, cell.runs).run == started["run"]
+    assert (await cell.say("pause"))["ok"]
+    fired = cell.state["mission"]["firings"]
+    assert (await cell.say("step"))["ok"]
+    await cell.until(
+        lambda: cell.state["mission"]["firings"] == fired + 1 and cell.state["paused"] is not None
+    )
+    assert (await cell.say("add_tokens", place="jobs"))["ok"]
+    assert (await cell.say("resume"))["ok"]
+    result = await cell.ended()
+    assert sum(f["transition"] == "begin" for f in cell.state["firings"]) == 3
+    assert result["status"] == "success"
+    with pytest.raises(NoRunError):
+        find_door(None, cell.runs)
+
+
+async def test_what_cannot_be_started_says_why(cell: Cell) -> None:
+    """No task chosen, no such task, a task with faults, bad parameters, a run that goes on, a
+    stranger."""
+    assert (await cell.say("start"))["text"] == "choose a task first"
+    assert "no task file nothing.toml" in (await cell.say("start", task="nothing"))["text"]
+    cell.tasks.save_text("strange", None, TASK.replace('["pick_part"]', '["pick_apart"]'))
+    answer = await cell.say("start", task="strange")
+    assert answer["code"] == "faults" and "pick_apart" in answer["text"]
+    assert [finding["key"] for finding in answer["findings"]] == [
+        "primitive_tasks.pick.alternatives"
+    ]
+    answer = await cell.say("start", task="moving", parameters={"sped": 1.0})
+    assert answer["code"] == "bad_data" and "speed" in answer["text"]
+    assert not cell.runs.exists()
+    stranger = await cell.station.command("ben", "start", {"task": "moving"})
+    assert stranger["code"] == "not_holder" and "ana" in stranger["text"]
+    assert (await cell.say("start", task="moving", parameters={"speed": 1}))["ok"]
+    again = await cell.say("start", task="moving")
+    assert again["code"] == "running" and cell.state["mission"]["id"] in again["text"]
+    await cell.ended()
+
+
+async def test_a_node_that_is_away_is_named_and_leaves_no_run(
+    cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start is refused with the node's name and address; the page says that it is lost, and a
+    later start succeeds."""
+    await cell.nodes["arm"].close()
+
+    def offered() -> dict[str, bool]:
+        return {offer["node"]: offer["up"] for offer in cell.station.offers()}
+
+    async with asyncio.timeout(60.0):
+        while offered() != {"vision": True, "arm": False}:
+            await cell.station.look()
+    assert cell.state["nodes"]["arm"]["state"] == "lost"
+    answer = await cell.say("start", task="moving")
+    assert (
+        answer["code"] == "unreachable"
+        and answer["nodes"] == ["arm"]
+        and "arm at 127.0.0.1:" in answer["text"]
+    )
+    assert list(cell.runs.iterdir()) == []
+    await cell.nodes["arm"].start()
+    assert (await cell.say("start", task="moving"))["ok"]
+    assert (await cell.ended())["status"] == "success"
+
+
+async def test_breakpoints_and_choices_before_the_start(cell: Cell) -> None:
+    """What is set on a loaded task holds for its next run; it is forgotten with another task."""
+    assert (await cell.say("pause"))["code"] == "idle"
+    assert (await cell.say("load", task="moving"))["ok"]
+    assert cell.state["marking"] == {"jobs": 2, "arm_free": 1, "look": 0, "pick": 0}
+    assert (await cell.say("breakpoint", element="transitions.nowhere"))["code"] == "refused"
+    assert (await cell.say("breakpoint", element="transitions.seen", on=True))["ok"]
+    assert (await cell.say("override_selector", primitive_task="look", action="look_thrice"))[
+        "code"
+    ] == "refused"
+    assert (await cell.say("override_selector", primitive_task="look", action="look_twice"))["ok"]
+    started = await cell.say("start")
+    await cell.until(lambda: cell.state["paused"] is not None)
+    assert [f["transition"] for f in cell.state["firings"]] == ["begin"]
+    assert cell.state["selectors"]["look"]["override"] == "look_twice"
+    assert (await cell.say("breakpoint", element="transitions.seen", on=False))["ok"]
+    assert (await cell.say("resume"))["ok"]
+    await cell.ended()
+    assert {run["action"] for run in cell.state["ended"]} == {"look_twice", "pick_part"}
+    journal = read_journal(cell.runs / started["run"] / JOURNAL)
+    assert journal.header["mission"] == started["run"]
+
+
+async def test_closing_ends_the_run_that_goes_on(cell: Cell) -> None:
+    """The station aborts it, and its journal and result are whole."""
+    cell.tasks.save_text("long", None, TASK.replace("tokens = 2", "tokens = 9"))
+    started = await cell.say("start", task="long")
+    await cell.until(lambda: bool(cell.state["runs"]))
+    await cell.station.close()
+    result = json.loads((cell.runs / started["run"] / RESULT).read_text())
+    assert result["status"] == "error" and cell.state["mission"]["state"] == "aborted"
+    assert opened(cell.runs / started["run"] / JOURNAL, started["run"])["fault"] == ""
+
+
+async def test_an_emergency_stop_needs_no_run(cell: Cell) -> None:
+    """Anybody may give it while idle; it is told, and cleared by whoever holds the controls."""
+    assert (await cell.station.command("ben", "estop", {}))["ok"]
+    assert cell.state["mission"]["state"] == "stopped" and "ben" in cell.state["mission"]["reason"]
+    assert (await cell.say("clear_estop"))["ok"]
+    assert cell.state["mission"]["state"] == "idle"

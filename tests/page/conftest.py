@@ -1,0 +1,210 @@
+"""A served page over the scripted stage, and a real browser in front of it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import socket
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import pytest_asyncio
+
+from petrobot.coordinator.operator.history import JournalHistory
+from petrobot.coordinator.page.server import Page, start_page
+from petrobot.coordinator.task import Executed, Status
+from petrobot.coordinator.task.file import load
+from tests.page.stage import Part, Stage
+from tests.waiting import beat
+
+if TYPE_CHECKING:
+    from playwright.async_api import Browser, ConsoleMessage, Locator
+    from playwright.async_api import Page as Tab
+
+HERE = Path(__file__).parent
+BROWSER = Path(os.environ.get("PETROBOT_BROWSER", "/usr/bin/chromium"))
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+PATIENCE_MS = (
+    60_000  # for a condition: a browser beside other tests on two slow cores is late now and then
+)
+SLIPPED = Part(0.3, Status.ERROR, "slipped", "the part slipped out of the gripper", Executed.YES)
+SCRIPT = {
+    "look__edges": [Part(0.3)],
+    "look__template": [Part(0.3)],
+    "pick": [SLIPPED, Part(0.3)],
+    "put": [Part(0.3)],
+    "clear": [Part(0.4)],
+}
+WHERE = {
+    "look__edges": "vision",
+    "look__template": "vision",
+    "pick": "arm",
+    "put": "arm",
+    "clear": "arm",
+}
+
+
+@pytest.fixture
+def tasks(tmp_path: Path) -> Path:
+    """A folder with the shipped test task."""
+    folder = tmp_path / "tasks"
+    shutil.copytree(HERE / "tasks", folder)
+    return folder
+
+
+@asynccontextmanager
+async def staged(tasks: Path, runs: Path) -> AsyncIterator[Stage]:
+    """A mission that stands ready to move parts; nothing has been started."""
+    made = Stage(tasks, SCRIPT, WHERE, runs)
+    path = tasks / "pick_and_place.toml"
+    made.load(load(path))
+    yield made
+    await made.close()
+
+
+@asynccontextmanager
+async def served(stage: Stage, tasks: Path, runs: Path) -> AsyncIterator[Page]:
+    """The page of a mission, on loopback."""
+    history = JournalHistory(runs)
+    made = await start_page(
+        stage, tasks_folder=tasks, token="open sesame", offers=stage.offers, history=history
+    )
+    yield made
+    await made.close()
+
+
+@pytest_asyncio.fixture
+async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
+    """A mission for one test."""
+    async with staged(tasks, tmp_path / "runs") as made:
+        yield made
+
+
+@pytest_asyncio.fixture
+async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
+    """Its page."""
+    async with served(stage, tasks, tmp_path / "runs") as made:
+        yield made
+
+
+def browser_missing() -> str:
+    """Why there is no browser to test with; empty if there is one."""
+    if not BROWSER.exists():
+        return f"no browser at {BROWSER}: install chromium or set PETROBOT_BROWSER"
+    if find_spec("playwright") is None:
+        return "Playwright for Python is not installed"
+    return ""
+
+
+@pytest.fixture
+def shots() -> Path:
+    """Where screenshots go: PETROBOT_SCREENSHOTS, else reports/screenshots here."""
+    folder = Path(os.environ.get("PETROBOT_SCREENSHOTS", "reports/screenshots"))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+@pytest.fixture
+def faults() -> Callable[[Any], list[str]]:
+    """Collect what a browser page complains about: script errors, refused content, error messages
+    on its console."""
+
+    def watch(tab: Any) -> list[str]:
+        found: list[str] = []
+        tab.on("pageerror", lambda error: found.append(f"script error: {error}"))
+        tab.on("console", lambda message: found.append(message.text) if is_fault(message) else None)
+        return found
+
+    return watch
+
+
+def is_fault(message: ConsoleMessage) -> bool:
+    """Whether the page complains; a net that cannot be analysed yet is answered so, which the
+    browser notes (422)."""
+    return message.type == "error" and "422" not in message.text
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Wait until something holds on this side of the wire."""
+    async with asyncio.timeout(PATIENCE_MS / 1000):
+        while not holds():
+            await beat()
+
+
+NOTE_TOASTS = """() => {
+  window.toasted = [...document.querySelectorAll(".toast")].map((toast) => toast.title);
+  const note = (changes) => changes.forEach(({ addedNodes }) => addedNodes.forEach((toast) => window.toasted.push(toast.title)));
+  new MutationObserver(note).observe(document.querySelector(".toasts"), { childList: true });
+}"""
+
+
+async def note_toasts(tab: Tab) -> None:
+    """Keep what the page says for a few seconds only: whoever looks once a second may be too
+    late."""
+    await tab.evaluate(NOTE_TOASTS)
+
+
+async def toasted(tab: Tab, pattern: str) -> None:
+    """Wait until the page has said something like that since `note_toasts`."""
+    script = "(pattern) => window.toasted.some((said) => new RegExp(pattern).test(said))"
+    await tab.wait_for_function(script, arg=pattern)
+
+
+PRESS_TWICE = (
+    "(button) => { button.click(); const asked = button.textContent; "
+    "button.click(); return asked; }"
+)
+
+
+async def abort(toolbar: Locator) -> None:
+    """Press Abort, which asks, and press it again: in one go, as the page takes the answer for
+    three seconds only."""
+    from playwright.async_api import expect
+
+    button = toolbar.get_by_role("button", name="Abort")
+    await expect(button).to_be_enabled()
+    assert await button.evaluate(PRESS_TWICE) == "Abort the mission?"
+
+
+@contextmanager
+def nobody_listens(port: int) -> Iterator[None]:
+    """Keep a port that has just been left from being given to anybody else; it may be listened on
+    again meanwhile."""
+    with socket.socket() as placeholder:
+        placeholder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        placeholder.bind(("127.0.0.1", port))
+        yield
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def browser() -> AsyncIterator[Browser]:
+    """Chromium without a window, one for all tests of a file."""
+    if browser_missing():
+        pytest.fail(browser_missing())
+    from playwright.async_api import async_playwright
+
+    async with async_playwright() as driver:
+        launched = await driver.chromium.launch(executable_path=str(BROWSER), args=ARGUMENTS)
+        yield launched
+        await launched.close()
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def _windows_are_closed(browser: Browser) -> AsyncIterator[None]:
+    """No window of one test goes on painting during the next."""
+    yield
+    for context in browser.contexts:
+        await context.close()

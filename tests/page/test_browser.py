@@ -1,0 +1,547 @@
+"""End to end in a real browser, by role and name: draw, run, pause, step, feed tokens, and find out
+why something failed."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+from collections.abc import AsyncIterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_asyncio
+from hypothesis import Phase, given, settings
+from tools.bench.hmi import SyntheticMission, ticking
+
+from petrobot.coordinator.operator.changes import apply, empty_state
+from petrobot.coordinator.page.server import Page, start_page
+from petrobot.coordinator.page.sessions import Session
+from petrobot.coordinator.task import Executed, Status
+from tests.page.conftest import (
+    PATIENCE_MS,
+    abort,
+    browser_missing,
+    nobody_listens,
+    served,
+    staged,
+    toasted,
+    until,
+)
+from tests.page.stage import Part, Stage
+from tests.page.test_changes import changes
+
+if browser_missing() and os.environ.get("CI") != "true":
+    pytest.skip(browser_missing(), allow_module_level=True)
+
+from playwright.async_api import Browser, expect
+from playwright.async_api import Page as Tab
+
+from tests.page.steps import (
+    Watch,
+    checked,
+    designer,
+    draw_the_task,
+    element,
+    hold_controls,
+    opened,
+    pressed,
+    settled,
+    start_mission,
+    take_controls,
+)
+
+pytestmark = [
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.usefixtures("_windows_are_closed"),
+]
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def stage(tasks: Path, tmp_path: Path) -> AsyncIterator[Stage]:
+    """A mission for one test."""
+    async with staged(tasks, tmp_path / "runs") as made:
+        yield made
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def page(stage: Stage, tasks: Path, tmp_path: Path) -> AsyncIterator[Page]:
+    """Its page."""
+    async with served(stage, tasks, tmp_path / "runs") as made:
+        yield made
+
+
+async def test_a_new_user_draws_runs_and_understands(
+    browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
+) -> None:
+    """The whole way without the manual: three actions with an error branch, run, pause, step, a run
+    more, and why it failed."""
+    tab = await opened(browser, page)
+    complaints = faults(tab)
+    await tab.get_by_role("tab", name="Design").click()
+    await settled(tab)
+    await tab.get_by_role("button", name="New task").click()
+    await draw_the_task(tab)
+    await checked(tab)
+    await tab.screenshot(path=shots / "designer.png")
+
+    await take_controls(tab)
+    stage.kept.add("look__edges")
+    await tab.get_by_role("button", name="Run this task").click()
+    dialog = tab.get_by_role("dialog", name="Save the task as")
+    await dialog.get_by_label("Name").fill("drawn")
+    await dialog.get_by_role("button", name="OK").click()
+    await expect(tab.get_by_role("tab", name="Live")).to_have_attribute("aria-selected", "true")
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Running")
+    await run_it_by_hand(tab, stage, shots)
+    assert complaints == []
+
+
+async def run_it_by_hand(tab: Tab, stage: Stage, shots: Path) -> None:
+    """Pause, step, put a token in, go on, and read the reason of the provoked error."""
+    mission = tab.get_by_role("status", name="Mission state")
+    toolbar = tab.get_by_role("toolbar", name="Mission")
+    await toolbar.get_by_role("button", name="Pause").click()
+    await expect(mission).to_contain_text("Paused")
+    before = stage.state.firings
+    stage.kept.clear()
+    await toolbar.get_by_role("button", name="Step").click()
+    await expect(
+        tab.get_by_role("region", name="Last firings").get_by_role("listitem")
+    ).to_have_count(before + 1)
+    await expect(toolbar).to_contain_text("Paused after one firing")
+    await expect(mission).to_contain_text("Paused")
+    assert stage.state.firings == before + 1
+    await element(tab, "^Control place jobs", "Task net").click()
+    await tab.get_by_role("button", name="Add token").click()
+    await expect(element(tab, "^Control place jobs, 2 tokens", "Task net")).to_be_visible()
+    await tab.screenshot(path=shots / "paused.png")
+    await toolbar.get_by_role("button", name="Resume").click()
+    await expect(mission).to_contain_text("Success")
+    why = (
+        tab.get_by_role("region", name="Last firings")
+        .get_by_role("listitem")
+        .filter(has_text="slipped")
+    )
+    await expect(why).to_contain_text("pick on arm: the part slipped out of the gripper")
+    await why.get_by_role("button").click()
+    await expect(tab.get_by_role("region", name="Selected")).to_contain_text(
+        "the part slipped out of the gripper"
+    )
+    await tab.screenshot(path=shots / "why.png")
+
+
+async def test_two_operators(browser: Browser, page: Page, stage: Stage) -> None:
+    """One holds the controls, the other watches the same, asks, and is handed them; the stop key is
+    everybody's."""
+    ana, ben = await opened(browser, page), await opened(browser, page)
+    await start_mission(ana)
+    await expect(ben.get_by_role("status", name="Mission state")).to_contain_text("Running")
+    bens = ben.get_by_role("toolbar", name="Mission")
+    await expect(bens).to_contain_text("holds the controls")
+    await expect(bens.get_by_role("button", name="Pause")).to_be_disabled()
+    await ben.get_by_role("button", name="Ask for controls").click()
+    await ana.get_by_role("button", name="Hand over to").click()
+    await expect(bens).to_contain_text("You hold the controls")
+    await ben.reload()
+    await expect(bens).to_contain_text("You hold the controls")
+    await ana.get_by_role("searchbox", name="Find a place or transition").focus()
+    await ana.keyboard.press("F9")
+    for tab in (ana, ben):
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text(
+            "Emergency stop"
+        )
+
+
+async def test_operators_hand_on_the_net(browser: Browser, page: Page, stage: Stage) -> None:
+    """Raise an event, stop at a breakpoint set beforehand, choose the alternative, force a way out,
+    abort."""
+    stage.script["pick"].clear()
+    stage.script["pick"].append(Part(0.3))
+    stage.kept.update({"look__template", "pick", "put"})
+    tab = await opened(browser, page)
+    await hold_controls(tab)
+    await element(tab, "^Transition picked", "Task net").click()
+    await tab.get_by_role("button", name="Set breakpoint").click()
+    await expect(tab.get_by_role("button", name="Remove breakpoint")).to_be_visible()
+    await tab.get_by_label("Alternative for look").select_option("look__template")
+    await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
+    await element(tab, "^Transition begin", "Task net").click()
+    await expect(tab.get_by_role("region", name="Selected")).to_contain_text(
+        "waits for the event part there"
+    )
+    await tab.get_by_role("button", name="Raise part there").click()
+    running = tab.get_by_role("region", name="Running now")
+    await expect(running).to_contain_text("look template")
+    await expect(running).to_contain_text("for look: operator")
+    stage.kept.remove("look__template")
+    await expect(running).to_contain_text("pick")
+    await element(tab, "^Action place pick", "Task net").click()
+    await tab.get_by_role("button", name="Force picked").click()
+    await expect(running).to_contain_text("put")
+    await abort(tab.get_by_role("toolbar", name="Mission"))
+    await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Aborted")
+    verbs = [verb for _, verb, _ in stage.commands]
+    assert verbs == [
+        "take_controls", "breakpoint", "override_selector", "start", "raise_event", "force_exit", "abort",
+    ]  # fmt: skip
+
+
+async def test_who_chooses_an_alternative_while_a_run_learns_goes_on_choosing(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Probabilities alter under an open list; a choice that is refused does not stand there as if
+    it had been taken."""
+    tab = await opened(browser, page)
+    await hold_controls(tab)
+    choose = tab.get_by_label("Alternative for look")
+    await choose.focus()
+    held = await choose.element_handle()
+    known = stage.feed.state["selectors"]["look"]
+    for share in (0.25, 0.75):
+        alternatives = [
+            {**known["alternatives"][0], "probability": share},
+            *known["alternatives"][1:],
+        ]
+        stage.feed.emit(
+            "selector",
+            time=stage.clock,
+            name="look",
+            selector={**known, "alternatives": alternatives},
+        )
+        await expect(tab.locator(".selector", has=choose)).to_contain_text(
+            f"{round(100 * share)} %"
+        )
+    assert held is not None
+    assert await held.evaluate("(list) => list === document.activeElement")
+
+    async def refuse(who: str, data: Mapping[str, Any]) -> dict[str, Any]:
+        return {"ok": False, "code": "refused", "text": "not while it is frozen"}
+
+    stage.__dict__["_override_selector"] = refuse
+    await choose.select_option("look__template")
+    await expect(tab.get_by_text("not while it is frozen")).to_be_visible()
+    await expect(choose).to_have_value("")
+
+
+async def test_a_folded_error_branch_turns_red(
+    browser: Browser, page: Page, stage: Stage, shots: Path
+) -> None:
+    """Error branches are hidden behind a badge until a token enters one; a press shows them."""
+    stage.kept.add("clear")
+    tab = await opened(browser, page, "dark")
+    await expect(element(tab, "^Action place clear", "Task net")).to_be_hidden()
+    await start_mission(tab)
+    stage.happen("part_there")
+    badge = tab.locator(".net [data-name=pick] .mark.fold")
+    await expect(badge).to_have_class(re.compile("alarm"))
+    await tab.screenshot(path=shots / "dark.png")
+    await badge.click()
+    await expect(element(tab, "^Action place clear, 1 token", "Task net")).to_be_visible()
+    await tab.get_by_role("button", name="Error branches").click()
+    await expect(element(tab, "^Action place clear", "Task net")).to_be_hidden()
+
+
+EVIL = "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>"
+
+
+async def test_script_in_names_and_reasons_is_text(
+    browser: Browser, page: Page, stage: Stage, faults: Watch
+) -> None:
+    """Whatever a node, a task file or another operator calls things, the page shows it as text."""
+    text = (stage.tasks / "pick_and_place.toml").read_text()
+    quoted = EVIL.replace('"', '\\"')
+    (stage.tasks / "evil.toml").write_text(
+        text.replace("x = 560\ny = 180", f'label = "{quoted}"\nx = 560\ny = 180').replace(
+            "The part lies", quoted
+        )
+    )
+    stage.script["pick"] = type(stage.script["pick"])(
+        [Part(0.2, Status.ERROR, "evil", EVIL, Executed.NO), Part(0.2)]
+    )
+    stage.where["pick"] = EVIL
+    tab = await opened(browser, page)
+    complaints = faults(tab)
+    await hold_controls(tab)
+    for operator in ("ana", EVIL):
+        await stage.command(operator, "ask_controls", {})
+    holder = stage.controls.holder
+    assert holder is not None
+    assert (await stage.command(holder, "start", {"task": "evil"}))["ok"]
+    stage.happen("part_there")
+    stage.feed.emit("variable", name=EVIL, value=EVIL)
+    stage.feed.emit("notice", notice={"level": "error", "text": EVIL})
+    await expect(tab.get_by_role("region", name="Last firings")).to_contain_text(
+        "<img src=x onerror="
+    )
+    await tab.get_by_role("tab", name="Variables").click()
+    await expect(tab.get_by_role("tabpanel", name="Variables")).to_contain_text("<script>")
+    await tab.get_by_role("tab", name="Design").click()
+    await tab.get_by_label("Task", exact=True).select_option("evil")
+    await expect(tab.locator(".designer .net .label", has_text="<img src=x")).to_have_count(1)
+    await settled(tab)
+    assert await tab.title() == "petrobot"
+    assert await tab.locator("img[src=x]").count() == 0
+    assert await tab.locator("body script").count() == 0
+    assert complaints == []
+
+
+async def test_a_lost_connection_is_plain_to_see(
+    browser: Browser, stage: Stage, tasks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When the coordinator goes away without a word the page says so at once, and it catches up
+    when it is back."""
+
+    async def vanish(session: Session) -> None:
+        """Say no goodbye."""
+
+    monkeypatch.setattr(Session, "leave", vanish)
+    async with served(stage, tasks, tmp_path / "runs") as first:
+        tab = await opened(browser, first)
+        port = int(first.url.rpartition(":")[2].partition("/")[0])
+        await expect(tab.get_by_role("button", name="Take controls")).to_be_visible()
+    with nobody_listens(port):
+        await expect(tab.get_by_role("alert")).to_contain_text("Connection to the coordinator lost")
+        stage.feed.emit("marking", marking={"parts": 7})
+        again = await start_page(stage, tasks_folder=tasks, port=port, token="open sesame")
+    try:
+        await expect(tab.get_by_role("alert")).to_be_hidden()
+        await expect(element(tab, "^Control place parts, 7 tokens", "Task net")).to_be_visible()
+    finally:
+        await again.close()
+
+
+async def labels_are_clear_of_each_other(tab: Tab) -> None:
+    """Labels of detections stand inside their image, and none covers another."""
+    picture = await tab.get_by_role("img", name="Image of table").bounding_box()
+    labels = await tab.locator(".detection-label").all()
+    boxes = [box for label in labels if (box := await label.bounding_box())]
+    assert picture is not None and len(boxes) == 3
+    for box in boxes:
+        assert (
+            box["x"] >= picture["x"] - 1
+            and box["x"] + box["width"] <= picture["x"] + picture["width"] + 1
+        )
+    for i, a in enumerate(boxes):
+        for b in boxes[i + 1 :]:
+            beside = a["x"] + a["width"] <= b["x"] + 1 or b["x"] + b["width"] <= a["x"] + 1
+            above = a["y"] + a["height"] <= b["y"] + 1 or b["y"] + b["height"] <= a["y"] + 1
+            assert beside or above
+
+
+async def test_details(
+    browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
+) -> None:
+    """Camera with detections, devices, set-point latency, learning curves, events, variables; on a
+    wall screen too."""
+    tab = await opened(browser, page, "dark")
+    complaints = faults(tab)
+    await start_mission(tab)
+    pixel = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNkYPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="
+    seen = [
+        {"kind": "circle", "x": 300, "y": 200, "r": 20, "label": "part"},
+        {"kind": "path", "points": [[0, 0], [9, 9]]},
+        {"kind": "circle", "x": 628, "y": 180, "r": 10, "label": "ball"},
+        {"kind": "point", "role": "predicted", "x": 634, "y": 186, "label": "predicted exit"},
+    ]
+    image = {
+        "mime": "image/png",
+        "data": pixel,
+        "width": 640,
+        "height": 360,
+        "age": 0.02,
+        "detections": seen,
+    }
+    stage.feed.emit("image", name="table", image=image)
+    stage.feed.emit(
+        "device",
+        name="arm",
+        device={"state": "enabled", "joints": [0.1, -1.2, 0.5], "values": {"load": 0.3}},
+    )
+    stage.feed.emit(
+        "setpoint", stream="point", samples=[[i / 10, 0.01 + i / 1e4] for i in range(60)]
+    )
+    curve = {"kind": "curve", "title": "Choice", "x": "runs", "y": "p", "series": ["a", "b"]}
+    stage.feed.emit(
+        "report",
+        name="c",
+        report={**curve, "columns": [[1, 2, 3], [0.5, 0.6, 0.7], [0.5, 0.4, 0.3]]},
+    )
+    await tab.get_by_role("tab", name="Camera").click()
+    await expect(tab.get_by_role("img", name="Image of table")).to_be_visible()
+    await expect(tab.get_by_role("tabpanel", name="Camera")).to_contain_text("20 ms old")
+    await labels_are_clear_of_each_other(tab)
+    await tab.screenshot(path=shots / "camera.png")
+    await tab.get_by_role("tab", name="Devices").click()
+    await expect(tab.get_by_role("tabpanel", name="Devices")).to_contain_text("enabled")
+    await tab.get_by_role("tab", name="Set points").click()
+    await expect(
+        tab.get_by_role("figure", name="Age of the newest set point").locator("canvas")
+    ).to_be_visible()
+    await tab.get_by_role("tab", name="Learning").click()
+    await expect(tab.get_by_role("figure", name="Choice").locator("canvas")).to_be_visible()
+    await tab.get_by_role("tab", name="Events").click()
+    await expect(tab.get_by_role("tabpanel", name="Events")).to_contain_text("part there")
+    await tab.get_by_role("tab", name="Timeline").click()
+    await tab.get_by_role("button", name="Wall screen").click()
+    await tab.screenshot(path=shots / "wall.png")
+    await tab.get_by_role("button", name="Light colours").click()
+    assert await tab.evaluate("document.documentElement.dataset.theme") == "light"
+    assert complaints == []
+
+
+def mission_of(stage: Stage) -> tuple[str, str]:
+    """Which mission there is, and how it stands."""
+    mission = stage.feed.state["mission"]
+    return mission["id"], mission["state"]
+
+
+async def test_history(
+    browser: Browser, page: Page, stage: Stage, shots: Path, faults: Watch
+) -> None:
+    """Scrub a finished run forwards and backwards, jump to its error, compare it with another,
+    start one from a point."""
+    tab = await opened(browser, page)
+    complaints = faults(tab)
+    stage.on_beat.append(
+        lambda _: (
+            None
+            if stage.feed.state["events"]["part_there"]["armed"]
+            else stage.happen("part_there")
+        )
+    )
+    await hold_controls(tab)
+    for run in ("pick_and_place-2", "pick_and_place-3"):
+        await tab.get_by_role("toolbar", name="Mission").get_by_role("button", name="Start").click()
+        await until(lambda run=run: mission_of(stage) == (run, "success"))  # type: ignore[misc]
+        await expect(tab.locator("html")).to_have_attribute(
+            "data-sequence", str(stage.feed.state["sequence"])
+        )
+        await expect(tab.get_by_role("status", name="Mission state")).to_contain_text("Success")
+    await tab.get_by_role("tab", name="History").click()
+    runs = tab.get_by_role("navigation", name="Runs")
+    await runs.get_by_role("button", name="pick_and_place-2", exact=False).first.click()
+    await expect(runs.get_by_role("button", name="Compare with pick_and_place-2")).to_be_disabled()
+    scrub = tab.get_by_role("toolbar", name="Scrub")
+    await scrub.get_by_role("button", name="First record").click()
+    net = "Net at this record"
+    await expect(element(tab, "^Control place parts, 2 tokens", net)).to_be_visible()
+    await scrub.get_by_role("button", name="Next error").click()
+    current = tab.get_by_role("complementary", name="Records").locator("[aria-current=true]")
+    await expect(current).to_contain_text("slipped")
+    await scrub.get_by_role("button", name="Previous record").click()
+    await expect(current).not_to_contain_text("slipped")
+    await scrub.get_by_role("button", name="Last record").click()
+    await expect(element(tab, "^Control place parts, 0 tokens", net)).to_be_visible()
+    await runs.get_by_role("button", name="Compare with pick_and_place-3").click()
+    await expect(tab.get_by_role("status").filter(has_text="differ from firing 3")).to_contain_text(
+        "pick failed here"
+    )
+    await scrub.get_by_role("button", name="Previous error").click()
+    await tab.screenshot(path=shots / "history.png")
+    await scrub.get_by_role("button", name="Simulate from here").click()
+    dialog = tab.get_by_role("dialog", name="Simulate from here")
+    await dialog.get_by_label("Run in clear").select_option("error")
+    await dialog.get_by_role("button", name="Simulate").click()
+    await expect(tab.get_by_role("tab", name="Live")).to_have_attribute("aria-selected", "true")
+    _, verb, data = stage.commands[-1]
+    assert (verb, data["mode"], data["from"]["run"]) == ("start", "lockstep", "pick_and_place-2")
+    assert data["from"]["going"] == {"clear": "error"} and data["from"]["record"] > 0
+    assert complaints == []
+
+
+async def test_a_press_is_not_lost_to_what_comes_in_meanwhile(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Between press and release offers, findings and tokens come in: the form under the pointer
+    waits, and the press counts."""
+    tab = await designer(browser, page)
+    await element(tab, "^Transition pick_failed").click()
+    await tab.keyboard.press("Delete")
+    await checked(tab, "fault")
+    await element(tab, "^Action place pick").click()
+    async with pressed(tab, "Add error branch"), tab.expect_response("**/api/check"):
+        stage.feed.emit("node", name="scale", node={"state": "up", "round_trip": 0.001})
+    await expect(element(tab, "^Transition pick_error")).to_be_visible()
+
+    await tab.get_by_role("tab", name="Live").click()
+    await hold_controls(tab)
+    await element(tab, "^Control place parts", "Task net").click()
+    selected = tab.get_by_role("region", name="Selected")
+    async with pressed(tab, "Set breakpoint"):
+        stage.feed.emit("marking", marking={"parts": 1})
+        await expect(element(tab, "^Control place parts, 1 token", "Task net")).to_be_visible()
+        await tab.evaluate("petrobot.tabs.Live.paintText()")
+    await until(lambda: "parts" in stage.state.breakpoints)
+    await expect(selected.get_by_role("button", name="Remove breakpoint")).to_be_visible()
+    await expect(selected).to_contain_text("1 of")
+
+
+async def test_the_browser_applies_changes_as_the_server_does(browser: Browser, page: Page) -> None:
+    """The two copies of the rules, in Python and in the page, lead to one state on random runs of
+    changes."""
+    tab = await opened(browser, page)
+    script = """async ([state, changes]) => {
+      const { apply } = await import("/page/js/state.js");
+      for (const change of changes) apply(state, change);
+      return state;
+    }"""
+    for made in some_changes():
+        here = empty_state()
+        for change in made:
+            apply(here, {k: v for k, v in change.items() if k not in ("sequence", "time")})
+        assert await tab.evaluate(script, [empty_state(), made]) == here
+
+
+def some_changes() -> list[list[dict[str, Any]]]:
+    """Thirty runs of changes, the same at each run of the test."""
+    found: list[list[dict[str, Any]]] = []
+
+    @settings(max_examples=30, database=None, derandomize=True, phases=[Phase.generate])
+    @given(changes())
+    def collect(made: list[dict[str, Any]]) -> None:
+        found.append(made)
+
+    collect()
+    return found
+
+
+async def test_fifty_updates_a_second_leave_no_gap(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """A hundred nodes under steady fire: every number arrives, merged deltas only, and the page
+    ends at the newest."""
+    tab = await opened(browser, page)
+    mission = SyntheticMission(100)
+    stage.feed.replace(**{k: v for k, v in mission.snapshot().items() if k != "sequence"})
+    await expect(element(tab, "^Transition step_49", "Task net")).to_be_visible()
+    mission.feed = stage.feed
+    await ticking(mission, 2.0)
+    async with asyncio.timeout(PATIENCE_MS / 1000):
+        while (
+            await tab.evaluate("petrobot.link.deltas") <= 10
+        ):  # a starved browser gets them in few heaps
+            await ticking(mission, 0.5)
+    last = str(stage.feed.state["sequence"])
+    await expect(tab.locator("html")).to_have_attribute("data-sequence", last)
+    assert await tab.evaluate("petrobot.link.gaps") == 0
+
+
+async def test_the_stop_is_within_reach_of_every_dialog(
+    browser: Browser, page: Page, stage: Stage
+) -> None:
+    """Whatever is asked, the emergency stop can be pressed, and Escape closes the question without
+    an answer."""
+    tab = await designer(browser, page)
+    await tab.get_by_role("button", name="Keyboard").click()
+    dialog = tab.get_by_role("dialog", name="Keyboard")
+    await expect(dialog).to_be_visible()
+    await tab.get_by_role("button", name="Emergency stop").click()
+    await tab.keyboard.press("F9")
+    await toasted(tab, "Emergency stop given")
+    await dialog.get_by_role("button", name="Close").focus()
+    await tab.keyboard.press("Escape")
+    await expect(dialog).to_be_hidden()
+    await until(lambda: len(stage.commands) > 1)
+    assert [verb for _, verb, _ in stage.commands] == ["estop", "estop"]

@@ -1,0 +1,191 @@
+"""Changes applied one by one and merged lead to the same state; a client that is far behind stays
+small."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from petrobot.coordinator.operator.changes import (
+    KINDS,
+    PENDING_LIMIT,
+    SNAPSHOT_KEYS,
+    Pending,
+    apply,
+    copy_state,
+    empty_state,
+)
+from petrobot.coordinator.operator.feed import Feed
+
+NAMES = st.sampled_from(["a", "b", "c"])
+SMALL = st.integers(0, 5)
+NAMED = {
+    "node": "node",
+    "event": "event",
+    "variable": "value",
+    "device": "device",
+    "image": "image",
+    "report": "report",
+}
+
+
+@st.composite
+def changes(draw: st.DrawFn) -> list[dict[str, Any]]:
+    """A run of numbered changes as a mission would emit them: a run begins before it goes on and
+    ends."""
+    made: list[dict[str, Any]] = []
+    going: list[str] = []
+    for number in range(1, draw(st.integers(1, 40)) + 1):
+        kind = draw(st.sampled_from(sorted(KINDS - {"reset"})))
+        if kind in ("run_progress", "run_ended") and not going:
+            kind = "run_started"
+        change: dict[str, Any] = {"kind": kind, "sequence": number, "time": number / 10}
+        change |= draw(_fields(kind, number, going))
+        made.append(change)
+    return made
+
+
+@st.composite
+def _fields(draw: st.DrawFn, kind: str, number: int, going: list[str]) -> dict[str, Any]:
+    if kind == "run_started":
+        going.append(f"r{number}")
+        return {"run": {"id": f"r{number}", "place": draw(NAMES), "progress": 0.0}}
+    if kind == "run_progress":
+        return {
+            "id": draw(st.sampled_from(going)),
+            draw(st.sampled_from(["progress", "state"])): draw(SMALL),
+        }
+    if kind == "run_ended":
+        return {"id": going.pop(), "status": "success", "ended": number}
+    if kind == "run_judged":
+        return {
+            "id": f"r{draw(st.integers(1, number))}",
+            "status": draw(st.sampled_from(["success", "failure"])),
+        }
+    if kind == "marking":
+        return {"marking": draw(st.dictionaries(NAMES, SMALL))}
+    if kind == "mission":
+        return {
+            "mission": draw(st.dictionaries(st.sampled_from(["state", "reason", "firings"]), SMALL))
+        }
+    if kind == "fired":
+        return {"firing": {"number": number, "transition": draw(NAMES)}}
+    if kind == "notice":
+        return {"notice": {"level": "info", "text": draw(NAMES)}}
+    if kind == "setpoint":
+        return {
+            "stream": draw(NAMES),
+            "samples": [[number, draw(SMALL)]],
+            "setpoint": {"period": draw(SMALL)},
+        }
+    if kind == "selector":
+        return {"name": draw(NAMES), "selector": {"override": draw(NAMES)}}
+    if kind in NAMED:
+        return {"name": draw(NAMES), NAMED[kind]: draw(SMALL)}
+    return {kind: draw(SMALL)}
+
+
+@given(changes(), st.lists(st.integers(1, 40), max_size=6))
+def test_merged_deltas_lead_to_the_same_state(made: list[dict[str, Any]], cuts: list[int]) -> None:
+    """However the changes are cut into deltas, a client ends where the server is, and numbers have
+    no gap."""
+    server, client = empty_state(), empty_state()
+    pending = Pending()
+    seen = 0
+    for change in made:
+        apply(server, change)
+        pending.add(change)
+        if change["sequence"] in cuts or change is made[-1]:
+            delta = pending.take()
+            assert delta["first"] == seen + 1
+            seen = delta["last"]
+            for merged in delta["changes"]:
+                apply(client, merged)
+            client["sequence"], client["time"] = delta["last"], max(client["time"], delta["time"])
+    assert client == server
+
+
+@given(changes())
+def test_a_snapshot_is_out_of_reach_of_later_changes(made: list[dict[str, Any]]) -> None:
+    """What was handed out as a snapshot does not change under the hands of its reader."""
+    feed = Feed()
+    half = len(made) // 2
+    for change in made[:half]:
+        feed.emit(**{k: v for k, v in change.items() if k != "sequence"})
+    snapshot = feed.snapshot()
+    kept = copy_state(snapshot)
+    for change in made[half:]:
+        feed.emit(**{k: v for k, v in change.items() if k != "sequence"})
+    assert snapshot == kept
+    assert feed.state["sequence"] == len(made)
+
+
+def test_a_verdict_changes_the_run_that_had_ended_and_no_other() -> None:
+    """What the page shows of a provisional run is what it came to; one that has left the list stays
+    away."""
+    state = empty_state()
+    for change in (
+        {"kind": "run_started", "run": {"id": "a#1", "place": "a"}},
+        {"kind": "run_started", "run": {"id": "a#2", "place": "a"}},
+        {"kind": "run_ended", "id": "a#1", "status": "success", "ended": 1.0, "reason": {}},
+        {"kind": "run_ended", "id": "a#2", "status": "success", "ended": 2.0, "reason": {}},
+        {"kind": "run_judged", "id": "a#1", "status": "failure", "reason": {"code": "crooked"}},
+        {"kind": "run_judged", "id": "a#9", "status": "failure", "reason": {}},
+    ):
+        apply(state, change)
+    assert [(run["id"], run["status"], run["ended"]) for run in state["ended"]] == [
+        ("a#1", "failure", 1.0),
+        ("a#2", "success", 2.0),
+    ]
+    assert state["ended"][0]["reason"] == {"code": "crooked"} and not state["runs"]
+
+
+def test_what_waits_for_a_slow_client_is_bounded() -> None:
+    """Ten thousand firings that nobody fetches leave no backlog: the client gets a snapshot
+    instead."""
+    pending = Pending()
+    for number in range(1, 10_001):
+        pending.add({"kind": "fired", "sequence": number, "firing": {"number": number}})
+    assert pending.stale
+    delta = pending.take()
+    assert delta["changes"] == []
+    assert not pending
+
+
+def test_values_that_only_have_a_newest_take_no_room() -> None:
+    """Images and progress at any rate wait as one entry each."""
+    pending = Pending()
+    for number in range(1, 50 * PENDING_LIMIT):
+        kind = ("image", "run_progress", "variable", "marking")[number % 4]
+        pending.add(
+            {
+                "kind": kind,
+                "sequence": number,
+                "name": "x",
+                "id": "r",
+                "image": number,
+                "value": 1,
+                "marking": {},
+            }
+        )
+    assert not pending.stale
+    assert len(pending.take()["changes"]) == 4
+
+
+def test_reset_makes_every_client_start_anew() -> None:
+    """Another mission is no delta."""
+    feed = Feed()
+    pending = Pending()
+    feed.subscribe(pending.add)
+    feed.emit("variable", name="a", value=1)
+    feed.replace(mission={"id": "two", "state": "idle", "mode": "realtime"})
+    assert pending.stale
+    assert feed.snapshot()["mission"]["id"] == "two"
+    assert feed.snapshot()["sequence"] == 2
+
+
+def test_a_snapshot_has_every_part() -> None:
+    """The parts that the protocol names are those of the state."""
+    assert set(SNAPSHOT_KEYS) == empty_state().keys() - {"sequence"}

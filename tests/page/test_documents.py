@@ -1,0 +1,314 @@
+"""Task files over HTTP: revisions, conflicts with both versions, findings, other formats, offers
+and journals."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+import pytest_asyncio
+
+from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
+from petrobot.coordinator.operator import history as journals
+from petrobot.coordinator.page import edits
+from petrobot.coordinator.page import task_store as store
+from petrobot.coordinator.page import task_work as verdicts
+from petrobot.coordinator.page.access import HEADERS
+from petrobot.coordinator.page.server import Page
+from petrobot.coordinator.page.task_work import as_task_file
+from petrobot.coordinator.task.file import load, loads
+from tests.page.stage import Stage
+
+pytestmark = pytest.mark.processes
+
+TASK = "pick_and_place"
+
+FORBIDDEN = (
+    (edits, "parse"),
+    (edits, "edited"),
+    (store, "edited"),
+    (store, "parse"),
+    (verdicts, "parse"),
+    (verdicts, "loads"),
+    (verdicts, "check"),
+    (verdicts, "parse_pnml"),
+    (journals, "read_journal"),
+    (journals, "replay"),
+    (journals, "loads"),
+)
+"""What takes longer than a turn of the loop may for a large net or a long journal."""
+
+
+@pytest_asyncio.fixture
+async def http(page: Page) -> AsyncIterator[aiohttp.ClientSession]:
+    """A script with the token."""
+    address = page.url.partition("/?")[0]
+    headers = {"Authorization": f"Bearer {page.token}"}
+    async with aiohttp.ClientSession(address, headers=headers) as session:
+        yield session
+
+
+async def opened(http: aiohttp.ClientSession, name: str = TASK) -> dict[str, Any]:
+    """A task as the designer opens it."""
+    async with http.get(f"/api/tasks/{name}") as answer:
+        assert answer.status == 200
+        task: dict[str, Any] = await answer.json()
+        return task
+
+
+async def save(http: aiohttp.ClientSession, name: str, **body: Any) -> tuple[int, Any]:
+    """Save; gives status and answer."""
+    async with http.put(f"/api/tasks/{name}", json=body) as answer:
+        value = (
+            await answer.json()
+            if answer.content_type == "application/json"
+            else await answer.text()
+        )
+        return answer.status, value
+
+
+async def test_open_edit_save(http: aiohttp.ClientSession, tasks: Path) -> None:
+    """One deadline edited in the page is one line altered on disk, and the revision changes with
+    it."""
+    before = (tasks / f"{TASK}.toml").read_text()
+    task = await opened(http)
+    task["document"]["primitive_tasks"]["pick"]["deadline"] = 7.5
+    status, saved = await save(http, TASK, base=task["revision"], document=task["document"])
+    assert status == 200 and saved["revision"] != task["revision"]
+    after = (tasks / f"{TASK}.toml").read_text()
+    assert after == before.replace(
+        'alternatives = ["pick"]\ndeadline = 5.0', 'alternatives = ["pick"]\ndeadline = 7.5'
+    )
+    assert load(tasks / f"{TASK}.toml").primitive_tasks["pick"].deadline == 7.5
+
+
+async def test_a_conflict_is_refused_with_both_versions(
+    http: aiohttp.ClientSession, tasks: Path
+) -> None:
+    """Two people edit; the second save writes nothing and shows both; afterwards either may be
+    chosen."""
+    first, second = await opened(http), await opened(http)
+    first["document"]["task"]["goal"] = "theirs"
+    second["document"]["task"]["goal"] = "mine"
+    assert (await save(http, TASK, base=first["revision"], document=first["document"]))[0] == 200
+    kept = (tasks / f"{TASK}.toml").read_text()
+    status, conflict = await save(http, TASK, base=second["revision"], document=second["document"])
+    assert status == 409
+    assert (tasks / f"{TASK}.toml").read_text() == kept
+    assert 'goal = "theirs"' in conflict["theirs"]["text"] and 'goal = "mine"' in conflict["yours"]
+    status, _ = await save(http, TASK, base=conflict["theirs"]["revision"], text=conflict["yours"])
+    assert status == 200
+    assert load(tasks / f"{TASK}.toml").goal == "mine"
+
+
+async def test_a_new_file_does_not_replace_one(http: aiohttp.ClientSession) -> None:
+    """Saving under a name that exists, without having opened it, is a conflict."""
+    assert (await save(http, TASK, base=None, document={"schema": 1}))[0] == 409
+    status, made = await save(
+        http,
+        "fresh",
+        base=None,
+        document={"schema": 1, "task": {"name": "fresh", "final": "false"}},
+    )
+    assert status == 200 and made["revision"]
+
+
+async def test_faults_name_the_element(http: aiohttp.ClientSession) -> None:
+    """A document that is being drawn is checked as it would be saved, and every finding has its key
+    and remedy."""
+    task = await opened(http)
+    document = task["document"]
+    assert [f for f in task["findings"] if f["severity"] == "error"] == []
+    del document["transitions"]["pick_failed"]
+    document["primitive_tasks"]["put"]["alternatives"] = ["put", "throw"]
+    async with http.post("/api/check", json={"name": TASK, "document": document}) as answer:
+        said = await answer.json()
+    errors = {f["key"]: f for f in said["findings"] if f["severity"] == "error"}
+    assert "places.pick" in errors and errors["places.pick"]["remedy"]
+    assert any("throw" in f["text"] for f in said["findings"])
+    assert "[transitions.pick_failed]" not in said["text"]
+
+
+async def test_editing_does_not_touch_the_running_net(
+    http: aiohttp.ClientSession, stage: Stage
+) -> None:
+    """A save during a run alters the file; the mission goes on with what it was started with."""
+    await stage.command("ana", "take_controls", {})
+    assert (await stage.command("ana", "start", {}))["ok"]
+    running = stage.snapshot()["task"]
+    task = await opened(http)
+    for name in ("put", "placed", "put_failed"):
+        task["document"]["places"].pop(name, None)
+        task["document"]["transitions"].pop(name, None)
+    task["document"]["transitions"]["picked"]["out"] = ["arm_free"]
+    assert (await save(http, TASK, base=task["revision"], document=task["document"]))[0] == 200
+    assert stage.snapshot()["task"] == running
+
+
+async def test_a_broken_file_says_what_is_wrong(http: aiohttp.ClientSession, tasks: Path) -> None:
+    """A file that somebody broke by hand is named with its fault; the others can be opened."""
+    (tasks / "broken.toml").write_text("[places\n")
+    async with http.get("/api/tasks/broken") as answer:
+        assert answer.status == 422 and "broken.toml" in await answer.text()
+    assert (await opened(http))["name"] == TASK
+
+
+async def test_saving_keeps_the_files_mode_and_leaves_no_rubbish(
+    http: aiohttp.ClientSession, tasks: Path
+) -> None:
+    """Saves are atomic: no temporary file stays, and permissions are those of before."""
+    path = tasks / f"{TASK}.toml"
+    os.chmod(path, 0o640)  # noqa: PTH101
+    task = await opened(http)
+    task["document"]["task"]["goal"] = "another"
+    assert (await save(http, TASK, base=task["revision"], document=task["document"]))[0] == 200
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert sorted(p.name for p in tasks.iterdir()) == [path.name]
+
+
+async def test_offers_are_those_of_the_nodes(http: aiohttp.ClientSession) -> None:
+    """The designer sees what can be had where."""
+    async with http.get("/api/offers") as answer:
+        offers = await answer.json()
+    assert {"action": "pick", "primitive_task": "pick", "node": "arm"}.items() <= next(
+        o for o in offers if o["action"] == "pick"
+    ).items()
+
+
+async def test_pnml_goes_out_and_comes_back(http: aiohttp.ClientSession, tasks: Path) -> None:
+    """The ordinary net with marking, weights, inhibitors and positions survives the way through
+    PNML."""
+    async with http.get(f"/api/tasks/{TASK}/export/pnml") as answer:
+        text = await answer.text()
+        assert 'filename="pick_and_place.pnml"' in answer.headers["Content-Disposition"]
+    async with http.post("/api/import", json={"form": "pnml", "text": text}) as answer:
+        document = (await answer.json())["document"]
+    original = load(tasks / f"{TASK}.toml")
+    assert {n: (p["x"], p["y"], p.get("tokens", 0)) for n, p in document["places"].items()} == {
+        p.name: (p.x, p.y, p.tokens) for p in original.places.values()
+    }
+    taken = {n: sorted(t["in"]) for n, t in document["transitions"].items()}
+    assert taken["begin"] == ["arm_free", "parts"]
+
+
+BAD_PNML = (
+    "",
+    "<pnml/>",
+    "<html/>",
+    '<!DOCTYPE x [<!ENTITY a "b">]><pnml><net id="n"/></pnml>',
+    '<pnml><net id="n"><place id="p"/><place id="q"/><arc id="a" source="p" '
+    'target="q"/></net></pnml>',
+)
+
+
+@pytest.mark.parametrize("text", BAD_PNML)
+async def test_bad_pnml_is_refused(http: aiohttp.ClientSession, text: str) -> None:
+    """What is no place/transition net, or tries to define entities, is refused with a reason."""
+    async with http.post("/api/import", json={"form": "pnml", "text": text}) as answer:
+        assert answer.status == 400 and "PNML" in await answer.text()
+
+
+def test_names_from_elsewhere_become_names_of_ours() -> None:
+    """Names with spaces, twice, or beginning with a digit are made usable and stay apart."""
+    nodes = "".join(
+        f'<place id="p{i}"><name><text>{name}</text></name></place>'
+        for i, name in enumerate(["a b", "a-b", "1", ""])
+    )
+    arcs = '<arc id="a" source="p0" target="t"><inscription><text>3</text></inscription></arc>'
+    text = f'<pnml><net id="n"><page id="g">{nodes}<transition id="t"/>{arcs}</page></net></pnml>'
+    document = as_task_file(parse_pnml(text))
+    assert all(f"[places.{name}]" in document for name in ("a_b", "a_b_2", "n1", "p3"))
+    assert 'in = ["a_b*3"]' in document
+    assert loads(document.replace('final = "false"', 'final = "n1 == 0"')).places["a_b"].tokens == 0
+
+
+async def finished(stage: Stage) -> None:
+    """Run the task to its end."""
+    await stage.command("ana", "take_controls", {})
+    assert (await stage.command("ana", "start", {}))["ok"]
+    over = asyncio.Event()
+
+    def beat(_: float) -> None:
+        events = stage.feed.state["events"]
+        if not events["part_there"]["armed"] and stage.feed.state["marking"]["arm_free"]:
+            stage.happen("part_there")
+
+    stage.on_beat.append(beat)
+    stop = stage.subscribe(
+        lambda c: over.set() if c["kind"] == "mission" and "reason" in c["mission"] else None
+    )
+    await asyncio.wait_for(over.wait(), 60)
+    stop()
+
+
+async def test_a_finished_run_can_be_scrubbed(http: aiohttp.ClientSession, stage: Stage) -> None:
+    """The journal gives every marking again: stepping through its changes ends in the marking of
+    the end, with reasons."""
+    await finished(stage)
+    async with http.get("/api/runs") as answer:
+        runs = await answer.json()
+    async with http.get(f"/api/runs/{runs[0]['id']}") as answer:
+        run = await answer.json()
+    marking = dict(run["initial"])
+    for record in run["records"]:
+        marking.update(record["marking"])
+    assert marking == stage.snapshot()["marking"] and run["fault"] == ""
+    wrong = [f for record in run["records"] for f in record["firings"] if f["error"]]
+    assert [(f["transition"], f["reason"]["code"], f["action"]) for f in wrong] == [
+        ("pick_failed", "slipped", "pick")
+    ]
+    async with http.get("/api/runs/..%2f..") as answer:
+        assert answer.status == 404
+
+
+async def test_the_page_and_the_journal_tell_the_same(
+    http: aiohttp.ClientSession, stage: Stage
+) -> None:
+    """Firings that clients saw live are those that the journal gives afterwards."""
+    await finished(stage)
+    live = [(f["transition"], f["error"]) for f in stage.snapshot()["firings"]]
+    async with http.get("/api/runs") as answer:
+        run = (await answer.json())[0]["id"]
+    async with http.get(f"/api/runs/{run}") as answer:
+        records = (await answer.json())["records"]
+    assert [(f["transition"], f["error"]) for r in records for f in r["firings"]] == live
+
+
+async def test_nothing_that_takes_long_is_done_in_the_coordinator(
+    http: aiohttp.ClientSession, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither in its loop nor in a thread of it, which would share the interpreter with the mission
+    that is running."""
+    await stage.command("ana", "take_controls", {})
+    await stage.command("ana", "start", {"task": TASK})
+
+    def forbidden(*_: object, **__: object) -> None:
+        raise AssertionError("done in the coordinator's own process")
+
+    for module, name in FORBIDDEN:
+        monkeypatch.setattr(module, name, forbidden)
+    task = await opened(http)
+    document = {**task["document"], "task": {**task["document"]["task"], "text": "altered"}}
+    drawn = {"name": TASK, "document": document, "desk": "mine"}
+    status, saved = await save(http, TASK, base=task["revision"], document=document)
+    assert status == 200 and saved["document"]["task"]["text"] == "altered"
+    async with http.get(f"/api/tasks/{TASK}/export/pnml") as answer:
+        pnml = await answer.text()
+    for path, body in {
+        "/api/check": drawn,
+        "/api/analyse": drawn,
+        "/api/import": {"form": "pnml", "text": pnml},
+    }.items():
+        async with http.post(path, json=body) as answer:
+            assert answer.status == 200, (path, await answer.text())
+            assert answer.headers.keys() >= HEADERS.keys(), path
+    async with http.get("/api/runs") as answer:
+        (run,) = await answer.json()
+    async with http.get(f"/api/runs/{run['id']}") as answer:
+        assert answer.status == 200 and (await answer.json())["records"]
+        assert answer.headers.keys() >= HEADERS.keys()

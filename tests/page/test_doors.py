@@ -1,0 +1,390 @@
+"""Attacks on the page's server: each is refused or harmless, and those who may come in are still
+served."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import resource
+import socket
+from typing import Any
+
+import aiohttp
+import pytest
+
+from petrobot.coordinator.operator.port import PROTOCOL
+from petrobot.coordinator.page import requests
+from petrobot.coordinator.page.access import HEADERS, is_loopback, names_for
+from petrobot.coordinator.page.connection_limits import CONNECTIONS, Gate
+from petrobot.coordinator.page.server import CLIENTS, Page, start_page
+from petrobot.coordinator.page.sessions import LARGEST_MESSAGE
+from tests.page.stage import Stage
+from tests.waiting import beat
+
+pytestmark = pytest.mark.processes
+
+EVIL = "http://evil.example"
+
+
+def base(page: Page) -> str:
+    """The server's address without the token."""
+    return page.url.partition("/?")[0]
+
+
+def port_of(page: Page) -> int:
+    """Its port."""
+    return int(base(page).rpartition(":")[2])
+
+
+async def ask(
+    page: Page, path: str, method: str = "GET", cookie: bool = False, **kwargs: Any
+) -> aiohttp.ClientResponse:
+    """One request of a stranger, or with a browser's cookie."""
+    async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
+        if cookie:
+            await http.get(page.url)
+        async with http.request(method, base(page) + path, **kwargs) as response:
+            await response.read()
+            return response
+
+
+def bearer(page: Page) -> dict[str, str]:
+    """What a script sends."""
+    return {"Authorization": f"Bearer {page.token}"}
+
+
+PATHS = (
+    "/",
+    "/page/index.html",
+    "/page/js/main.js",
+    "/api/tasks",
+    "/api/snapshot",
+    "/api/live",
+    "/api/runs",
+    "/nowhere",
+)
+
+
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(
+    "wrong", ["", "?token=", "?token=wrong", "?token=open+sesam", "?token=%00%ff"]
+)
+async def test_without_the_token_nothing_is_given(page: Page, path: str, wrong: str) -> None:
+    """Not even which files there are."""
+    response = await ask(page, path + wrong)
+    assert response.status == 401
+    assert response.headers["Content-Security-Policy"] == HEADERS["Content-Security-Policy"]
+
+
+async def test_the_token_becomes_a_cookie_and_leaves_the_address(page: Page) -> None:
+    """The first visit is answered by a redirect with a cookie that scripts cannot read and other
+    sites do not send."""
+    first = await ask(page, "/?token=" + page.token, allow_redirects=False)
+    assert (first.status, first.headers["Location"]) == (303, "/")
+    cookie = first.headers["Set-Cookie"]
+    assert all(flag in cookie for flag in ("HttpOnly", "SameSite=Strict", "Path=/"))
+    assert page.token not in cookie
+    assert (await ask(page, "/", cookie=True)).status == 200
+
+
+async def test_a_token_elsewhere_in_an_address_is_no_key(page: Page) -> None:
+    """Only the front page takes it: addresses with secrets end up in logs."""
+    assert (await ask(page, "/api/snapshot?token=" + page.token)).status == 401
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.example",
+        "evil.example:{port}",
+        "127.0.0.1",
+        "127.0.0.1:1",
+        "",
+        "localhost.evil:{port}",
+    ],
+)
+async def test_dns_rebinding_is_refused(page: Page, host: str) -> None:
+    """A name that an attacker points at this machine gets nothing, whatever else is right."""
+    headers = {**bearer(page), "Host": host.format(port=port_of(page))}
+    response = await ask(page, "/api/snapshot", headers=headers)
+    assert response.status in (400, 421)
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
+async def test_own_names_are_let_in(page: Page, name: str) -> None:
+    """The two names of the loopback address."""
+    headers = {**bearer(page), "Host": f"{name}:{port_of(page)}"}
+    assert (await ask(page, "/api/snapshot", headers=headers)).status == 200
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [EVIL, "null", "https://127.0.0.1:{port}", "http://127.0.0.1", "http://127.0.0.1:{port}.evil"],
+)
+async def test_other_origins_are_refused(page: Page, origin: str) -> None:
+    """A page of another origin cannot use the operator's cookie, for WebSocket or POST."""
+    headers = {"Origin": origin.format(port=port_of(page))}
+    assert (
+        await ask(page, "/api/command", "POST", cookie=True, headers=headers, json={})
+    ).status == 403
+    async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
+        await http.get(page.url)
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await http.ws_connect(base(page) + "/api/live", headers=headers)
+        assert refused.value.status == 403
+
+
+async def test_a_browser_without_origin_cannot_change_anything(page: Page) -> None:
+    """A cookie alone opens no WebSocket and posts nothing: every browser says its origin there."""
+    assert (await ask(page, "/api/command", "POST", cookie=True, json={})).status == 403
+    assert (
+        await ask(page, "/api/live", cookie=True, headers={"Upgrade": "websocket"})
+    ).status == 403
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+@pytest.mark.parametrize("path", ["/", "/api/snapshot", "/page/js/main.js"])
+async def test_other_sites_get_nothing(page: Page, site: str, path: str) -> None:
+    """Neither links nor images nor scripts of another site reach anything here."""
+    assert (await ask(page, path, cookie=True, headers={"Sec-Fetch-Site": site})).status == 403
+
+
+@pytest.mark.parametrize(
+    "kind", ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"]
+)
+async def test_forms_are_refused(page: Page, stage: Stage, kind: str) -> None:
+    """What a plain form of another site could send is no JSON, so it is not even read."""
+    headers = {**bearer(page), "Content-Type": kind}
+    response = await ask(page, "/api/command", "POST", headers=headers, data=b'{"verb": "estop"}')
+    assert response.status == 415
+    assert stage.commands == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/page/../server.py", "/page/%2e%2e/server.py", "/page/..%2fserver.py", "/page//etc/passwd"],
+)
+async def test_files_beside_the_page_stay_hidden(page: Page, path: str) -> None:
+    """Paths do not climb."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
+    head = (
+        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: Bearer "
+        f"{page.token}\r\n"
+    )
+    writer.write((head + "Connection: close\r\n\r\n").encode())
+    answer = await reader.read()
+    writer.close()
+    assert answer.split()[1] in (b"403", b"404", b"400")
+
+
+@pytest.mark.parametrize(
+    "name", ["..%2f..%2fetc%2fpasswd", ".hidden", "a.b", "a" * 65, "%00", "-x"]
+)
+async def test_task_names_do_not_climb(page: Page, name: str) -> None:
+    """A task's name is a name, not a path."""
+    assert (await ask(page, f"/api/tasks/{name}", headers=bearer(page))).status in (400, 404)
+    body = {"base": None, "document": {"schema": 1}}
+    response = await ask(page, f"/api/tasks/{name}", "PUT", headers=bearer(page), json=body)
+    assert response.status in (400, 404)
+
+
+@pytest.mark.parametrize("body", ["{", "[]", "3", '"text"', "[" * 100_000, "{}" * 2_000_000])
+async def test_bad_bodies_are_refused(page: Page, body: str) -> None:
+    """What is no JSON object, too deep or too large ends in one clear refusal."""
+    headers = {**bearer(page), "Content-Type": "application/json"}
+    assert (
+        await ask(page, "/api/check", "POST", headers=headers, data=io.BytesIO(body.encode()))
+    ).status in (400, 413)
+
+
+async def test_every_answer_carries_the_headers(page: Page) -> None:
+    """Strict content policy, no sniffing, no framing, no referrer: on pages, data and refusals."""
+    for path, headers in (
+        ("/", bearer(page)),
+        ("/api/tasks", bearer(page)),
+        ("/nowhere", bearer(page)),
+        ("/", {}),
+    ):
+        response = await ask(page, path, headers=headers)
+        assert {name: response.headers.get(name) for name in HEADERS} == HEADERS
+    policy = HEADERS["Content-Security-Policy"]
+    assert (
+        "unsafe" not in policy
+        and "default-src 'none'" in policy
+        and "frame-ancestors 'none'" in policy
+    )
+
+
+async def test_a_thousand_sockets_do_not_keep_the_operator_out(page: Page) -> None:
+    """Connections beyond the bound are closed at once; those that say nothing are closed later; a
+    command gets through."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
+    crowd: list[socket.socket] = []
+    async with aiohttp.ClientSession(headers=bearer(page)) as http:
+        assert (
+            await http.get(base(page) + "/api/snapshot")
+        ).status == 200  # the operator's connection is open
+        try:
+            for _ in range(1_000):
+                crowd.append(socket.socket())
+                crowd[-1].setblocking(False)
+                crowd[-1].connect_ex(("127.0.0.1", port_of(page)))
+                await beat(0)
+            async with http.post(
+                base(page) + "/api/command", json={"verb": "estop", "name": "ana"}
+            ) as answer:
+                assert answer.status == 200
+            assert page.gate.turned_away >= 1_000 - CONNECTIONS
+            assert page.gate.open_connections <= CONNECTIONS
+        finally:
+            for one in crowd:
+                one.close()
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+async def test_silent_connections_are_closed(page: Page) -> None:
+    """Half a request head, sent slowly, does not hold a connection for ever (slow-loris)."""
+    page.gate.silent = 0.2
+    reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
+    writer.write(b"GET / HTTP/1.1\r\nHost: 127")
+    assert await asyncio.wait_for(reader.read(), 60) == b""
+    writer.close()
+    assert isinstance(page.gate, Gate)
+
+
+async def test_scripts_use_the_token(page: Page, stage: Stage) -> None:
+    """A command over plain HTTP with a Bearer token, as the command line gives it; it has a name of
+    its own."""
+    answer = await ask(
+        page,
+        "/api/command",
+        "POST",
+        headers=bearer(page),
+        json={"verb": "take_controls", "name": "cli"},
+    )
+    assert answer.status == 200
+    assert stage.controls.holder is not None and stage.controls.holder.startswith("cli ")
+    refused = await ask(
+        page, "/api/command", "POST", headers=bearer(page), json={"verb": "step", "name": "other"}
+    )
+    assert refused.status == 409
+
+
+INSIDE = ("127.0.0.1", "localhost", "::1", "127.3.4.5")
+OUTSIDE = ("0.0.0.0", "10.0.0.7", "robot.lab")
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"), [*((h, True) for h in INSIDE), *((h, False) for h in OUTSIDE)]
+)
+def test_loopback(host: str, loopback: bool) -> None:
+    """Which addresses only this machine reaches."""
+    assert is_loopback(host) is loopback
+
+
+def test_names_of_a_server_on_all_addresses_are_given() -> None:
+    """Bound to all addresses it answers to no name of the network unless told."""
+    assert names_for("0.0.0.0", ()) == {"0.0.0.0", "127.0.0.1", "localhost", "[::1]"}
+    assert "cell.lab" in names_for("0.0.0.0", ("Cell.lab",))
+
+
+async def test_each_server_draws_its_own_token(stage: Stage, tasks: Any) -> None:
+    """Two servers have two tokens, and the cookie of one is none for the other."""
+    one = await start_page(stage, tasks_folder=tasks)
+    two = await start_page(stage, tasks_folder=tasks)
+    try:
+        assert one.token != two.token and len(one.token) >= 32
+        async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
+            await http.get(one.url)
+            assert (await http.get(base(one) + "/api/tasks")).status == 200
+            assert (await http.get(base(two) + "/api/tasks")).status == 401
+    finally:
+        await one.close()
+        await two.close()
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/page/index.html", "/page/js/main.js", "/api/tasks", "/api/runs", "/api/check"]
+)
+async def test_without_the_page_only_the_protocol_is_served(
+    stage: Stage, tasks: Any, path: str
+) -> None:
+    """`--no-page` leaves no file and no document within reach, even with the token; commands go
+    on."""
+    bare = await start_page(stage, tasks_folder=tasks, page=False)
+    try:
+        assert (await ask(bare, path, headers=bearer(bare))).status == 404
+        assert (await ask(bare, "/api/snapshot", headers=bearer(bare))).status == 200
+        assert (await ask(bare, "/api/snapshot")).status == 401
+        answer = await ask(
+            bare, "/api/command", "POST", headers=bearer(bare), json={"verb": "take_controls"}
+        )
+        assert answer.status == 200
+    finally:
+        await bare.close()
+
+
+@pytest.mark.parametrize("size", [LARGEST_MESSAGE + 1, 8 * LARGEST_MESSAGE])
+async def test_an_oversized_message_ends_its_connection_alone(page: Page, size: int) -> None:
+    """It is not even taken in whole; another client goes on."""
+    hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
+    async with (
+        aiohttp.ClientSession(headers=bearer(page)) as http,
+        http.ws_connect(base(page) + "/api/live") as good,
+        http.ws_connect(base(page) + "/api/live") as bad,
+    ):
+        for socket in (good, bad):
+            await socket.send_json(hello)
+            assert (await socket.receive_json(timeout=60))["type"] == "snapshot"
+        with contextlib.suppress(ConnectionError):
+            await bad.send_str("x" * size)
+        async with asyncio.timeout(60):
+            while not bad.closed:
+                await bad.receive()
+        assert bad.close_code in (
+            aiohttp.WSCloseCode.MESSAGE_TOO_BIG,
+            aiohttp.WSCloseCode.ABNORMAL_CLOSURE,
+        )
+        await good.send_json({"type": "command", "id": 1, "verb": "take_controls"})
+        async with asyncio.timeout(60):
+            while (await good.receive_json())["type"] != "answer":
+                pass
+
+
+async def test_clients_are_bounded_and_commands_still_come_in(page: Page) -> None:
+    """One more than there is room for is told so; a script's emergency stop needs no seat."""
+    hello = {"type": "hello", "protocol": PROTOCOL, "name": "ana", "tab": "1"}
+    async with aiohttp.ClientSession(
+        headers=bearer(page), connector=aiohttp.TCPConnector(limit=0)
+    ) as http:
+        seats = [await http.ws_connect(base(page) + "/api/live") for _ in range(CLIENTS)]
+        for socket in seats:
+            await socket.send_json(hello)
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            await http.ws_connect(base(page) + "/api/live")
+        assert refused.value.status == 503
+        async with http.post(
+            base(page) + "/api/command", json={"verb": "estop", "name": "ana"}
+        ) as answer:
+            assert answer.status == 200
+        for socket in seats:
+            await socket.close()
+
+
+async def test_a_body_that_never_ends_is_given_up(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A command whose body drips in does not hold its handler for ever."""
+    monkeypatch.setattr(requests, "BODY_S", 0.2)
+    reader, writer = await asyncio.open_connection("127.0.0.1", port_of(page))
+    head = (
+        f"POST /api/command HTTP/1.1\r\nHost: 127.0.0.1:{port_of(page)}\r\nAuthorization: "
+        f"Bearer {page.token}\r\n"
+    )
+    writer.write((head + "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n{").encode())
+    answer = await asyncio.wait_for(reader.readline(), 60)
+    assert b"408" in answer
+    writer.close()
+    await writer.wait_closed()

@@ -1,0 +1,276 @@
+"""The live protocol over a real WebSocket: snapshot first, no gaps, slow clients, commands and who
+may give them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import aiohttp
+import pytest
+
+from petrobot.coordinator.operator.changes import apply
+from petrobot.coordinator.page import app_state as house
+from petrobot.coordinator.page import sessions
+from petrobot.coordinator.page.server import Page
+from tests.page.stage import Stage
+from tests.waiting import beat
+
+
+class Client:
+    """A client in Python: keeps the state as the browser does."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
+        self.socket = socket
+        self.state: dict[str, Any] = {}
+        self.deltas = 0
+        self.snapshots = 0
+        self.answers: dict[int, dict[str, Any]] = {}
+        self._number = 0
+
+    async def hear(self) -> str:
+        """Take the next message in; gives its type. Fails on a gap in the numbers."""
+        message = await self.socket.receive_json(timeout=60)
+        kind = str(message["type"])
+        if kind == "snapshot":
+            self.snapshots += 1
+            self.state = {k: v for k, v in message.items() if k not in ("type", "protocol")}
+        elif kind == "delta":
+            self.deltas += 1
+            assert message["first"] == self.state["sequence"] + 1, "a gap in the sequence"
+            for change in message["changes"]:
+                apply(self.state, change)
+            self.state["sequence"], self.state["time"] = message["last"], message["time"]
+        elif kind == "answer":
+            self.answers[message["id"]] = message
+        return kind
+
+    async def until(self, holds: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Take messages in until something holds."""
+        async with asyncio.timeout(60):
+            while not (self.state and holds(self.state)):
+                await self.hear()
+        return self.state
+
+    async def command(self, verb: str, **data: Any) -> dict[str, Any]:
+        """Give a command and wait for its answer."""
+        self._number += 1
+        await self.socket.send_json(
+            {"type": "command", "id": self._number, "verb": verb, "data": data}
+        )
+        async with asyncio.timeout(60):
+            while self._number not in self.answers:
+                await self.hear()
+        return self.answers[self._number]
+
+
+@asynccontextmanager
+async def joined(page: Page, name: str = "ana", tab: str = "1") -> AsyncIterator[Client]:
+    """A client that has said hello."""
+    address = page.url.partition("?")[0] + "api/live"
+    headers = {"Authorization": f"Bearer {page.token}"}
+    async with aiohttp.ClientSession() as http, http.ws_connect(address, headers=headers) as socket:
+        await socket.send_json({"type": "hello", "protocol": 1, "name": name, "tab": tab})
+        yield Client(socket)
+
+
+async def test_late_joiners_see_the_same(page: Page, stage: Stage) -> None:
+    """Whoever comes when ends with the state that the server has; nobody misses a number."""
+    async with joined(page) as first:
+        await first.command("take_controls")
+        assert (await first.command("start"))["ok"]
+        stage.happen("part_there")
+        await first.until(lambda s: s["marking"]["look"] == 1)
+        async with joined(page, "ben", "2") as late:
+            await late.until(lambda s: len(s["firings"]) >= 3)
+            target = stage.feed.state["sequence"]
+            await asyncio.gather(
+                *(c.until(lambda s: s["sequence"] >= target) for c in (first, late))
+            )
+            assert (await first.command("pause"))["ok"]
+            last = stage.feed.state["sequence"]
+            await asyncio.gather(*(c.until(lambda s: s["sequence"] >= last) for c in (first, late)))
+            for client in (first, late):
+                assert {k: v for k, v in client.state.items() if k != "you"} == json.loads(
+                    json.dumps(stage.snapshot())
+                )
+
+
+async def test_a_slow_client_gets_less_and_holds_nobody_up(page: Page, stage: Stage) -> None:
+    """One client that reads nothing for thousands of changes costs bounded room and is caught up by
+    one message."""
+    async with joined(page, "slow") as slow, joined(page, "quick", "2") as quick:
+        await slow.until(lambda s: True)
+        await quick.until(lambda s: True)
+        session = next(s for s in page.sessions if s.who.startswith("slow"))
+        blob = "x" * 20_000
+        for number in range(3_000):
+            stage.feed.emit("variable", name=f"v{number % 7}", value=[number, blob])
+            if number % 60 == 0:
+                await quick.hear()
+        last = stage.feed.state["sequence"]
+        await quick.until(lambda s: s["sequence"] == last)
+        await slow.until(lambda s: s["sequence"] == last)
+        assert session.deltas_sent + session.snapshots_sent < 200
+        assert slow.state["variables"] == stage.feed.state["variables"]
+
+
+async def test_firings_beyond_bounds_become_a_snapshot(page: Page, stage: Stage) -> None:
+    """A burst that cannot be merged is answered with a fresh snapshot, not with a backlog."""
+    async with joined(page) as client:
+        await client.until(lambda s: True)
+        for number in range(5_000):
+            stage.feed.emit(
+                "fired", firing={"number": number, "transition": "begin", "at": 0.0, "error": False}
+            )
+        await client.until(lambda s: s["sequence"] == stage.feed.state["sequence"])
+        assert client.snapshots == 2
+        assert client.state["firings"][-1]["number"] == 4_999
+
+
+async def test_controls_are_held_by_one_and_asked_for(page: Page, stage: Stage) -> None:
+    """A second operator is refused, asks, and is handed the controls; an emergency stop is
+    everybody's."""
+    async with joined(page) as ana, joined(page, "ben", "2") as ben:
+        await ben.until(lambda s: True)
+        assert (await ana.command("take_controls"))["ok"]
+        refused = await ben.command("start")
+        assert (refused["ok"], refused["code"]) == (False, "not_holder")
+        assert (await ben.command("take_controls"))["code"] == "held"
+        await ben.command("ask_controls")
+        await ana.until(lambda s: s["controls"]["asking"] == [ben.state["you"]])
+        await ana.command("release_controls", to=ben.state["you"])
+        await ben.until(lambda s: s["controls"]["holder"] == s["you"])
+        assert (await ben.command("start"))["ok"]
+        assert (await ana.command("estop"))["ok"]
+        await ben.until(lambda s: s["mission"]["state"] == "stopped")
+
+
+async def test_controls_go_free_when_their_holder_is_gone(
+    page: Page, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A holder whose last window was closed does not block the others for ever; one that only
+    reloads keeps them."""
+    monkeypatch.setattr(house, "ABSENT_S", 0.3)
+    async with joined(page, "ben", "2") as ben:
+        async with joined(page) as ana:
+            await ana.command("take_controls")
+        async with joined(page) as again:
+            await again.until(lambda s: s["controls"]["holder"] == s["you"])
+            await ben.command("ask_controls")
+            assert ben.state["controls"]["holder"] is not None
+        await ben.until(lambda s: s["controls"]["holder"] is None)
+
+
+async def test_commands_go_on_when_their_client_leaves(page: Page, stage: Stage) -> None:
+    """What was asked for is carried out although nobody waits for the answer any more."""
+    begun, go = asyncio.Event(), asyncio.Event()
+    done: list[str] = []
+
+    async def slow_stop(who: str, data: Any) -> dict[str, Any]:
+        begun.set()
+        await go.wait()
+        done.append(who)
+        return {"ok": True}
+
+    stage.__dict__["_estop"] = slow_stop
+    async with joined(page) as client:
+        await client.socket.send_json({"type": "command", "id": 1, "verb": "estop", "data": {}})
+        await asyncio.wait_for(begun.wait(), 60)
+    go.set()
+    await asyncio.wait_for(page.idle(), 60)
+    assert len(done) == 1
+
+
+async def test_the_command_that_ends_the_run_is_answered(page: Page, stage: Stage) -> None:
+    """The coordinator closes while it is still being carried out: whoever gave it hears that it
+    was."""
+    begun, closing = asyncio.Event(), asyncio.Event()
+
+    async def last(who: str, data: Any) -> dict[str, Any]:
+        begun.set()
+        await closing.wait()
+        return {"ok": True, "last": True}
+
+    stage.__dict__["_estop"] = last
+    async with joined(page) as client:
+        asked = asyncio.create_task(client.command("estop"))
+        await asyncio.wait_for(begun.wait(), 60)
+        ended = asyncio.create_task(page.close())
+        await beat(0)  # it has begun to close
+        closing.set()
+        assert (await asked)["last"]
+        await ended
+
+
+async def test_a_fault_in_the_mission_is_an_answer(page: Page, stage: Stage) -> None:
+    """A command whose carrying out breaks is answered with the reason, and the connection lives."""
+    async with joined(page) as client:
+        await client.command("take_controls")
+        answer = await client.command("add_tokens")
+        assert (answer["ok"], answer["code"]) == (False, "fault")
+        assert "place" in answer["text"]
+        assert (await client.command("no_such_thing"))["code"] == "unknown_command"
+
+
+NONSENSE = (
+    "no json",
+    "[1, 2]",
+    '{"type": "whatever"}',
+    '{"type": "command", "id": "one", "verb": "pause"}',
+    '{"type": "command", "id": 1, "verb": "pause", "data": 3}',
+    "[" * 50_000,
+)
+
+
+@pytest.mark.parametrize("text", NONSENSE)
+async def test_nonsense_ends_the_connection_with_a_reason(page: Page, text: str) -> None:
+    """A client that does not speak the protocol is told so and closed; the others go on."""
+    async with joined(page) as good, joined(page, "bad", "2") as bad:
+        await good.until(lambda s: True)
+        await bad.until(lambda s: True)
+        await bad.socket.send_str(text)
+        async with asyncio.timeout(60):
+            while not bad.socket.closed:
+                await bad.socket.receive()
+        assert bad.socket.close_code == aiohttp.WSCloseCode.POLICY_VIOLATION
+        assert (await good.command("take_controls"))["ok"]
+
+
+async def test_who_floods_is_closed(page: Page) -> None:
+    """More messages a second than any person gives end the connection."""
+    async with joined(page) as client:
+        await client.until(lambda s: True)
+        for _ in range(4 * sessions.MESSAGES_PER_S):
+            await client.socket.send_str('{"type": "resync"}')
+        async with asyncio.timeout(60):
+            while not client.socket.closed:
+                await client.socket.receive()
+        assert client.socket.close_code == aiohttp.WSCloseCode.POLICY_VIOLATION
+
+
+async def test_hello_comes_first(page: Page) -> None:
+    """Nobody is served before saying who they are, in the protocol that the server speaks."""
+    address = page.url.partition("?")[0] + "api/live"
+    headers = {"Authorization": f"Bearer {page.token}"}
+    for first in ({"type": "command", "id": 1, "verb": "estop"}, {"type": "hello", "protocol": 99}):
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(address, headers=headers) as socket,
+        ):
+            await socket.send_json(first)
+            message = await socket.receive(timeout=60)
+            assert message.type is aiohttp.WSMsgType.CLOSE
+
+
+async def test_strange_values_do_not_end_the_feed(page: Page, stage: Stage) -> None:
+    """Infinities, not-a-numbers and objects that JSON does not know still reach the client as
+    something readable."""
+    async with joined(page) as client:
+        await client.until(lambda s: True)
+        stage.feed.emit("variable", name="odd", value=[float("inf"), float("nan"), {1, 2}, 1 + 2j])
+        await client.until(lambda s: "odd" in s["variables"])
+        assert client.state["variables"]["odd"][3] == "(1+2j)"

@@ -1,0 +1,117 @@
+"""Makes the golden journals anew: `python -m tests.run.golden.make`. Do it only when the
+semantics are meant to change.
+
+Each is a mission run of a shipped task in lock step with scripted actions. The tests derive every
+marking and instruction of them again (tests/run/test_golden.py), so a change that no version of
+petrobot may make by accident is noticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from petrobot.coordinator.cli.loading import load_task, task_path
+from petrobot.coordinator.launch import Setting, lockstep_cell, lockstep_id, with_runs
+from petrobot.coordinator.run.folder import header
+from petrobot.coordinator.run.journal import JournalWriter
+from petrobot.coordinator.run.recording import JournalStore
+from petrobot.services.action import Status
+from petrobot.services.comm.location_file import parse
+from petrobot.services.scripted import Line
+from tests.run.scripted_cell import scripts, services_text
+
+FOLDER = Path(__file__).parent
+GOOD = Line(seconds=(0.2, 0.2))
+FAULT = Line(Status.ERROR, (0.1, 0.1), cause="drive_fault", text="drive 3: following error")
+MISSED = Line(Status.FAILURE, (0.3, 0.3), cause="missed")
+END = [4.0, 2.0, 0.0]
+GOES_ON = Line(seconds=(3.0, 3.0), values={"at_t": False, "line_end": END})
+ENDS_AT_T = Line(seconds=(3.0, 3.0), values={"at_t": True, "line_end": END})
+FOUND = Line(seconds=(2.0, 2.0), values={"recovered": True})
+NOT_FOUND = Line(Status.FAILURE, (2.5, 2.5), {"recovered": False}, "no_track")
+LOST = Line(Status.ERROR, (1.0, 1.0), cause="no_line", text="no line to follow for 0.5 s")
+UNSEEN = Line(Status.ERROR, (4.0, 4.0), cause="no_line", text="the line was lost for 0.8 s")
+STORIES: Mapping[str, tuple[str, int, Mapping[str, list[Line]]]] = {
+    "catch_ball-undisturbed": ("catch_ball", 4, {}),
+    "catch_ball-missed-and-recovered": (
+        "catch_ball",
+        4,
+        {
+            "catch_ball": [MISSED, GOOD, FAULT, GOOD],
+            "move_to_point": [GOOD, FAULT, GOOD, GOOD],
+            "recover_arm": [FAULT, GOOD],
+        },
+    ),
+    "catch_ball-given-up": ("catch_ball", 2, {"return_home": [FAULT], "recover_arm": [FAULT]}),
+    "follow_track-undisturbed": (
+        "follow_track",
+        1,
+        {
+            "follow_track": [GOES_ON, ENDS_AT_T],
+            "watch_track": [GOES_ON, ENDS_AT_T],
+            "recover_track": [FOUND],
+        },
+    ),
+    "follow_track-lost-and-found": (
+        "follow_track",
+        1,
+        {
+            "follow_track": [GOES_ON, GOES_ON, LOST, FAULT, ENDS_AT_T],
+            "watch_track": [GOES_ON, UNSEEN, GOES_ON, ENDS_AT_T],
+            "recover_track": [NOT_FOUND, FOUND],
+            "search_track": [FOUND],
+            "stop_at_t": [FAULT, GOOD],
+        },
+    ),
+    "follow_track-given-up": (
+        "follow_track",
+        1,
+        {
+            "follow_track": [LOST],
+            "watch_track": [GOES_ON],
+            "search_track": [NOT_FOUND],
+        },
+    ),
+}
+"""Name of a journal: task, runs, and what its actions do."""
+
+
+def make(name: str, folder: Path) -> Path:
+    """Run a story; gives its journal."""
+    task_name, runs, lines = STORIES[name]
+    task, path = load_task(task_name), folder / f"{name}.journal"
+    text = services_text(task)
+    setting = Setting(task, runs=runs)
+    given = {
+        "services_path": "services.toml",
+        "seed": setting.seed,
+        "runs": with_runs(task, runs)[1],
+    }
+    source = task_path(task_name).read_text(encoding="utf-8")
+    parameters = {
+        "parameters": dict(task.parameters),
+        "cell": "launched",
+        "mock": "",
+        "durable": False,
+    }
+    first = header(lockstep_id(setting), source, text, "lockstep", {**given, **parameters})
+    store = JournalStore(JournalWriter(path, first), 0.0)
+    cell, party = lockstep_cell(
+        parse(text, Path("services.toml")), setting, scripts(task, lines), store=store
+    )
+    if not cell.run(lambda: party.over, 1_000_000):
+        raise RuntimeError(f"{name} does not end")
+    store.writer.close()
+    return path
+
+
+def main() -> None:
+    """All of them."""
+    for name in STORIES:
+        (FOLDER / f"{name}.journal").unlink(missing_ok=True)
+        print(make(name, FOLDER))
+
+
+if __name__ == "__main__":
+    main()

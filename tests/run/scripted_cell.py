@@ -1,0 +1,50 @@
+"""A cell of scripted actions for tests of the coordinator: one node, no devices, every action of a
+task on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.location_file import Directory, parse
+from petrobot.services.scripted import Line, Scripted
+
+HEAD = """
+schema = 1
+[nodes.node]
+host = "127.0.0.1"
+port = 7999
+[timers.image_tick]
+node = "node"
+period = 0.04
+[services.memory]
+node = "node"
+"""
+
+
+def directory_for(task: Task, extra: str = "", every: bool = False) -> Directory:
+    """The directory of `services_text`."""
+    return parse(services_text(task, every) + extra, Path("services.toml"))
+
+
+def services_text(task: Task, every: bool = False) -> str:
+    """A services.toml that places the first alternative of each primitive task on one node; every
+    one if asked for."""
+    return HEAD + "".join(
+        f'[actions.{alternative}]\nrun = "scripted:nothing"\ntask = "{p.name}"\nnode = "node"\n'
+        for p in task.primitive_tasks.values()
+        for alternative in p.alternatives[: None if every else 1]
+    )
+
+
+def scripts(task: Task, lines: Mapping[str, list[Line]]) -> dict[str, Callable[..., Any]]:
+    """A scripted action for every alternative of each primitive task; half a second of success if
+    none is given."""
+    usual = [Line(seconds=(0.5, 0.5))]
+    return {
+        a: Scripted(lines.get(p.name, usual))
+        for p in task.primitive_tasks.values()
+        for a in p.alternatives
+    }

@@ -1,0 +1,66 @@
+"""Golden journals: runs of shipped tasks as an earlier version recorded them, derived again marking
+by marking."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.cli.recorded_runs import recorded
+from petrobot.coordinator.engine import Engine, Finished, Fired, State
+from petrobot.coordinator.run.journal import read_journal
+from petrobot.coordinator.run.recording import ReplayError, replay
+from tests.run.golden.make import STORIES, make
+
+GOLDEN = Path(__file__).parent / "golden"
+ENDS = {
+    "catch_ball-undisturbed": ("success", 4),
+    "catch_ball-missed-and-recovered": ("success", 4),
+    "catch_ball-given-up": ("error", 1),
+    "follow_track-undisturbed": ("success", 1),
+    "follow_track-lost-and-found": ("success", 1),
+    "follow_track-given-up": ("error", 1),
+}
+
+
+@pytest.mark.parametrize("name", sorted(STORIES))
+def test_every_marking_and_instruction_is_derived_again(name: str) -> None:
+    """`replay` fails on the first difference; the end is the one of then."""
+    found = recorded(str(GOLDEN / f"{name}.journal"))
+    steps = list(found.steps())
+    assert len(steps) == sum(r.kind == "stimulus" for r in found.journal.records) > 10
+    (finished,) = [i for i in steps[-1].instructions if isinstance(i, Finished)]
+    started = sum(
+        isinstance(i, Fired) and i.transition == "start"
+        for step in steps
+        for i in step.instructions
+    )
+    assert (finished.status.value, started) == ENDS[name]
+
+
+@pytest.mark.parametrize("name", sorted(STORIES))
+def test_the_story_of_a_golden_journal_is_still_the_same(name: str, tmp_path: Path) -> None:
+    """Made again now, it has the same markings in the same order: execution in lock step has not
+    changed either."""
+    golden, now = (
+        read_journal(folder / f"{name}.journal") for folder in (GOLDEN, make(name, tmp_path).parent)
+    )
+
+    def markings(journal_records: object) -> list[object]:
+        return [r.data["marking"] for r in journal_records if r.kind == "stimulus"]  # type: ignore[attr-defined]
+
+    assert markings(now.records) == markings(golden.records)
+
+
+def test_a_changed_task_is_noticed_at_the_record_where_it_matters() -> None:
+    """The golden journal of one story does not pass for a task with another priority of events."""
+    found = recorded(str(GOLDEN / "catch_ball-undisturbed.journal"))
+    changed = found.journal.header["task"].replace('out = ["return_home"]', 'out = ["recover_arm"]')
+    from petrobot.coordinator.launch import with_runs
+    from petrobot.coordinator.task.file import loads
+
+    task, _ = with_runs(loads(changed, "changed"), found.journal.header["runs"])
+    seen: list[State] = []
+    with pytest.raises(ReplayError, match=r"record \d+ \(RunEnded\): marking was"):
+        seen.extend(step.state for step in replay(found.journal, Engine(task)))

@@ -1,0 +1,167 @@
+"""A mission run over scripted actions in lock step: results, cycles, errors, repetition."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.run.executor import Executor
+from petrobot.coordinator.run.interfaces import FirstAlternative
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.timeline import Timeline
+from petrobot.coordinator.task import Status, Task
+from petrobot.coordinator.task.file import loads
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.location_file import parse
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.scripted import Line
+from tests.run.scripted_cell import directory_for, scripts
+from tests.run.toy_arm import SERVICES, TASK
+
+
+def run(task: Task, lines: dict[str, list[Line]], **given: Any) -> tuple[Mission, Timeline]:
+    """Run to the end, at most an hour of simulated time."""
+    timeline = Timeline()
+    cell, party = lockstep_cell(directory_for(task), Setting(task, **given), scripts(task, lines))
+    party.mission.executor.observers.append(timeline)
+    assert cell.run(lambda: party.over, 900_000)
+    return party.mission, timeline
+
+
+def failing(cause: str, status: ActionStatus = ActionStatus.ERROR) -> Line:
+    """A run that ends after 0.1 s with this cause."""
+    return Line(status, (0.1, 0.1), cause=cause)
+
+
+GOOD = Line(seconds=(0.2, 0.2))
+
+
+def test_four_runs_reach_final(catch_ball: Task) -> None:
+    """The initial marking of figure 1 means four runs."""
+    mission, timeline = run(catch_ball, {})
+    result = mission.result("lockstep", 1.0)
+    assert (result["status"], result["runs"], len(mission.tally.cycles)) == ("success", 4, 4)
+    assert result["firings"] == len(timeline.firings) > 4 * 5
+    assert result["sim_s"] > 4 * 2.0
+    assert [c.number for c in mission.tally.cycles] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("runs", [1, 7])
+def test_number_of_runs_is_the_users(catch_ball: Task, runs: int) -> None:
+    """--runs puts tokens into the runs place."""
+    mission, _ = run(catch_ball, {}, runs=runs)
+    assert len(mission.tally.cycles) == mission.runs == runs
+
+
+@pytest.mark.parametrize(
+    ("primitive", "cause"),
+    [
+        ("locate_ball", "no_ball"),
+        ("track_ball", "ball_lost"),
+        ("move_to_point", "unreachable"),
+        ("catch_ball", "drive_fault"),
+        ("return_home", "drive_fault"),
+    ],
+)
+def test_every_error_branch_comes_back(catch_ball: Task, primitive: str, cause: str) -> None:
+    """An error in the first run uses that run up; the others go on."""
+    good = [GOOD] * 3
+    mission, timeline = run(catch_ball, {primitive: [failing(cause), *good]})
+    assert mission.executor.finished is not None
+    assert mission.executor.finished.status is Status.SUCCESS
+    assert [c.status for c in mission.tally.cycles] == [Status.ERROR, *[Status.SUCCESS] * 3]
+    assert mission.tally.cycles[0].cause == cause
+    assert [bar.cause for bar in timeline.bars.values() if bar.status is Status.ERROR] == [cause]
+
+
+def test_an_arm_that_cannot_be_recovered_ends_the_task_in_error(catch_ball: Task) -> None:
+    """Four failed recoveries in a row: given up honestly, with runs left."""
+    mission, _ = run(
+        catch_ball,
+        {"move_to_point": [failing("drive_fault")], "recover_arm": [failing("drive_fault")]},
+    )
+    finished = mission.executor.finished
+    assert finished is not None
+    assert finished.status is Status.ERROR
+    assert len(mission.tally.cycles) == 1
+    assert sum(r.place == "recover_arm" for r in mission.tally.runs) == 4
+
+
+def test_a_run_given_up_says_which_actions_erred_where_and_why(catch_ball: Task) -> None:
+    """What led there, the last one last; a run that reached its final marking has nothing of the
+    kind."""
+    lines = {"move_to_point": [failing("bad_arguments")], "recover_arm": [failing("drive_fault")]}
+    mission, _ = run(catch_ball, lines)
+    told = mission.result("lockstep", 0.0)["last_errors"]
+    assert [(e["primitive_task"], e["cause"]) for e in told] == [
+        ("move_to_point", "bad_arguments"),
+        *[("recover_arm", "drive_fault")] * 4,
+    ]
+    where = mission.executor.directory.where
+    assert all(
+        e["node"] == where(e["action"]) and e["run"].startswith(e["primitive_task"]) for e in told
+    )
+    good, _ = run(catch_ball, {"move_to_point": [failing("bad_arguments"), GOOD, GOOD, GOOD]})
+    assert "last_errors" not in good.result("lockstep", 0.0)
+
+
+def test_failure_goes_on_along_the_normal_branch(catch_ball: Task) -> None:
+    """A ball that passes is a failure: the run was used up, nothing is recovered."""
+    mission, timeline = run(catch_ball, {"catch_ball": [failing("missed", ActionStatus.FAILURE)]})
+    assert [c.status for c in mission.tally.cycles] == [Status.FAILURE] * 4
+    assert not any(bar.place == "recover_arm" for bar in timeline.bars.values())
+
+
+def test_a_raised_deadline_is_an_error_with_a_reason(catch_ball: Task) -> None:
+    """A run that never ends is ended by its node at its deadline."""
+    mission, _ = run(catch_ball, {"locate_ball": [Line(seconds=(1e6, 1e6)), GOOD, GOOD, GOOD]})
+    first = mission.tally.runs[0]
+    assert (first.status, first.cause) == (Status.ERROR, "deadline")
+    assert 8.0 <= first.seconds < 8.2
+
+
+def test_the_same_seed_gives_the_same_run(catch_ball: Task) -> None:
+    """Durations drawn by scripts are keyed by seed and run."""
+    lines = {"track_ball": [Line(seconds=(0.1, 2.0))]}
+    one, again, other = (run(catch_ball, lines, seed=seed)[1] for seed in (5, 5, 6))
+    assert one.firings == again.firings
+    assert one.firings != other.firings
+
+
+def test_the_user_chooses_the_action(catch_ball: Task) -> None:
+    """A selector's choice is what runs, with its reason."""
+    chosen = FirstAlternative({"track_ball": "predict_kalman"})
+    mission, _ = run(catch_ball, {}, selector=chosen, runs=1)
+    track = next(r for r in mission.tally.runs if r.place == "track_ball")
+    assert track.action == "predict_kalman"
+    assert (track.status, track.cause) == (Status.ERROR, "not_offered")
+
+
+def test_a_preparation_that_may_have_been_asked_for_before_says_so() -> None:
+    """A node that has forgotten its oldest calls does not prepare the cell a second time for a
+    resumed coordinator."""
+    text = TASK.replace('name = "toy"', 'name = "toy"\nprepare = "lab_prepare"')
+    places = parse(
+        SERVICES.replace("ON_RESUME", "rejoin")
+        + '[services.lab_prepare]\nrun = "toy:prepare"\nnode = "motion"\n',
+        Path("services.toml"),
+    )
+    asked = []
+    for resumed in (False, True):
+        caller = Caller("motion", m.Hello(2, 2, "coordinator", "m", "c1", 1))
+        task = loads(text, "toy")
+        mission = Mission(Executor(task, Engine(task), places, {"motion": caller}, "m"), {}, 1)
+        caller.link_up(0.0, m.Welcome(1, "motion", "n1"))
+        if resumed:
+            mission.resume(0.0, {})
+        else:
+            mission.start(0.0)
+        asked += [
+            (call.id, call.again) for call in caller.messages(0.0) if isinstance(call, m.Call)
+        ]
+    assert asked == [("m/prepare", False), ("m/prepare", True)]

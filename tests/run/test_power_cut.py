@@ -1,0 +1,215 @@
+"""The power goes at any moment: journal, sync, effect, acknowledgement come in this order, so
+nothing runs twice or is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from petrobot.coordinator.engine import Begin, CancelRun, Engine, RunEnded, StartRun
+from petrobot.coordinator.engine.stimuli import EventOccurred
+from petrobot.coordinator.launch import make_mission, with_runs
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.recording import JournalStore, Step, replay
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file import loads
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Event
+from tests.power_cut import Disk, power_cut
+from tests.run import test_resume as resuming
+from tests.run.test_resume import CrashError, Laboratory, outcome
+from tests.run.toy_arm import TASK, TIDY, WORK, Bench, directory
+
+JOURNAL = "run/run.journal"
+
+
+def left(disk: Disk, folder: Path, engine: Engine, torn: float = 0.0) -> list[Step]:
+    """The steps that can be derived after a power cut."""
+    image = disk.left(torn)
+    if JOURNAL not in image:
+        return []
+    copy = folder / "copy.journal"
+    copy.write_bytes(image[JOURNAL])
+    return list(replay(read_journal(copy), engine))
+
+
+def ordered(steps: Iterable[Step], kind: type) -> set[str]:
+    """Runs that orders of this kind are for."""
+    return {
+        i.run
+        for step in steps
+        for i in step.instructions
+        if isinstance(i, kind) and isinstance(i, StartRun | CancelRun)
+    }
+
+
+def ended(steps: Iterable[Step]) -> set[str]:
+    """Runs whose end is kept."""
+    return {step.stimulus.run for step in steps if isinstance(step.stimulus, RunEnded)}
+
+
+def run_of(call: str) -> str:
+    """The run that a call is for."""
+    return call.rpartition("/")[2]
+
+
+def watched(caller: Caller, name: str, look: Callable[..., None]) -> None:
+    """Have `look` called with what this method of a caller is given, before it does its work."""
+    method = getattr(caller, name)
+
+    def call(now: float, *given: Any) -> None:
+        look(*given)
+        method(now, *given)
+
+    setattr(caller, name, call)
+
+
+def test_a_device_is_moved_and_a_result_acknowledged_only_when_the_cause_is_on_the_disk(
+    tmp_path: Path,
+) -> None:
+    """With the usual store: each call, cancel and acknowledgement, at the moment at which it is
+    handed to the connection."""
+    seen: list[str] = []
+    with power_cut(tmp_path) as disk:
+        store = JournalStore(JournalWriter(tmp_path / JOURNAL, {"mission": "m"}), 0.0)
+        bench = Bench(store=store)
+        places = directory()
+        engine = Engine(
+            loads(TASK, "toy"), {a.name: a.device for a in places.actions.values() if a.device}
+        )
+
+        def steps() -> list[Step]:
+            return left(disk, tmp_path, engine)
+
+        def called(call: m.Call) -> None:
+            assert run_of(call.id) in ordered(steps(), StartRun), (
+                f"{call.id} is called, its order is not on the disk"
+            )
+            seen.append(f"call {call.id}")
+
+        def cancelled(call: str, *rest: object) -> None:
+            assert run_of(call) in ordered(steps(), CancelRun), (
+                f"{call} is cancelled, the order is not on the disk"
+            )
+            seen.append(f"cancel {call}")
+
+        def acknowledged(call: str) -> None:
+            assert run_of(call) in ended(steps()), (
+                f"{call} is acknowledged, its end is not on the disk"
+            )
+            seen.append(f"acknowledge {call}")
+
+        def event(event: Event) -> None:
+            there = [s.stimulus.number for s in steps() if isinstance(s.stimulus, EventOccurred)]
+            assert event.number in there, "the bell is acknowledged and not on the disk"
+            seen.append(f"acknowledge {event.name}")
+
+        for name, look in (("call", called), ("cancel", cancelled), ("acknowledge", acknowledged)):
+            watched(bench.caller, name, look)
+        watched(bench.caller, "acknowledge_event", event)
+        bench.link(0.0)
+        bench.executor.stimulate(0.0, Begin())
+        bench.say(0.0, m.Accept(WORK))
+        bench.ring(1.0)
+        bench.go(1.0 + 0.6)
+        bench.say(2.0, m.Outcome(WORK, "error", {}, "cancelled"))
+        bench.say(2.1, m.Accept(TIDY))
+        bench.say(2.2, m.Outcome(TIDY, "success"))
+        bench.go(3.0)
+        store.writer.close()
+    assert bench.executor.finished is not None
+    expected = [
+        f"call {WORK}",
+        f"cancel {WORK}",
+        "acknowledge bell",
+        f"acknowledge {WORK}",
+        f"call {TIDY}",
+    ]
+    assert sorted(seen) == sorted([*expected, f"acknowledge {TIDY}"])
+
+
+class Cellar(Laboratory):
+    """The scripted laboratory with a coordinator on a disk that loses what was not synced; its
+    nodes have another supply."""
+
+    acknowledged: set[str]
+
+    def watch(self, mission: Mission) -> None:
+        """Note what is acknowledged."""
+        self.acknowledged = set()
+        for caller in mission.callers.values():
+            watched(caller, "acknowledge", self.acknowledged.add)
+
+
+def cut_and_resume(task: Task, folder: Path, lives: int, torn: float, expected: Any) -> None:
+    """The power goes at an operation of the journal; what is left is resumed."""
+    folder.mkdir()
+    laboratory = Cellar(task, folder / "run")
+
+    def watched_mission(*given: Any) -> Mission:
+        mission = make_mission(*given)
+        laboratory.watch(mission)
+        mission.executor.store.__dict__["durable"] = True  # the actions of this cell have no device
+        return mission
+
+    with power_cut(folder) as disk, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resuming, "make_mission", watched_mission)
+        with pytest.raises(CrashError):
+            laboratory.begin(lives)
+        image = disk.left(torn)
+    where = f"power cut at operation {lives}, {torn:g} of what was not synced"
+    journal = folder / JOURNAL
+    assert JOURNAL in image, f"{where}: the journal is gone"
+    journal.write_bytes(image[JOURNAL])
+    steps = list(replay(read_journal(journal), Engine(with_runs(task, resuming.RUNS)[0])))
+    began = {run_of(call) for call in laboratory.executed}
+    assert began <= ordered(steps, StartRun), f"{where}: executed, and the order is not on the disk"
+    assert {run_of(call) for call in laboratory.acknowledged} <= ended(steps), (
+        f"{where}: acknowledged and lost"
+    )
+    assert outcome(laboratory.resume()) == expected, where
+    assert set(laboratory.executed.values()) == {1}, (
+        f"{where}: executed twice: {laboratory.executed}"
+    )
+
+
+def places(task: Task, folder: Path) -> tuple[Any, int]:
+    """The outcome without a power cut, and how many places there are for one."""
+    laboratory = Laboratory(task, folder / "undisturbed")
+
+    def durable(*given: Any) -> Mission:
+        mission = make_mission(*given)
+        mission.executor.store.__dict__["durable"] = True
+        return mission
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resuming, "make_mission", durable)
+        mission, store = laboratory.begin(0)
+    return outcome(mission), store.operations
+
+
+TORN = (0.0, 0.5, 1.0)
+
+
+def test_a_power_cut_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
+    """Twenty places drawn from all; all of them in the proof."""
+    expected, operations = places(catch_ball, tmp_path)
+    drawn = np.random.default_rng(2).choice(np.arange(1, operations), 20, replace=False)
+    for number, lives in enumerate(sorted(drawn)):
+        cut_and_resume(catch_ball, tmp_path / str(lives), int(lives), TORN[number % 3], expected)
+
+
+@pytest.mark.proof
+def test_a_power_cut_at_every_operation_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
+    """Every append, flush and sync of the journal in turn, with nothing, half and all of what was
+    not synced."""
+    expected, operations = places(catch_ball, tmp_path)
+    for lives in range(1, operations):
+        for torn in TORN:
+            cut_and_resume(catch_ball, tmp_path / f"{lives} {torn}", lives, torn, expected)

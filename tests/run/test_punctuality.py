@@ -1,0 +1,28 @@
+"""When a host counts as too busy: a share of late looks, or one long gap; a look that is late now
+and then is not told."""
+
+from __future__ import annotations
+
+import pytest
+
+from petrobot.coordinator.run.realtime import LATE, PERIOD, WORST, Punctuality
+
+
+@pytest.mark.parametrize(
+    ("delays", "told"),
+    [
+        ([], ""),
+        ([0.001] * 500, ""),
+        ([0.001] * 499 + [2 * LATE], ""),
+        ([0.001] * 495 + [2 * LATE] * 6, "more than 20 ms late 6 of 501 times, by 40 ms at most"),
+        ([0.001] * 499 + [WORST + 0.01], "more than 20 ms late 1 of 500 times, by 70 ms at most"),
+    ],
+)
+def test_what_is_told(delays: list[float], told: str) -> None:
+    seen, due = Punctuality(), 5.0
+    for delay in delays:
+        now = due + delay
+        due = seen.look(due, now)
+        assert due == now + PERIOD, "a delay is counted once"
+    assert told in seen.remark()
+    assert bool(seen.remark()) == bool(told)

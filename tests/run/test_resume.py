@@ -1,0 +1,229 @@
+"""A coordinator that dies at any record of its journal: the resumed run ends as the undisturbed
+one, nothing runs twice."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from petrobot.coordinator.engine import Engine, Instruction, Override, State, Stimulus
+from petrobot.coordinator.launch import (
+    Setting,
+    lockstep_party,
+    make_mission,
+    resumed_mission,
+    with_runs,
+)
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.lockstep import CoordinatorParty
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.run.recording import JournalStore, ReplayError, replay
+from petrobot.coordinator.task import Status, Task
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.scripted import Line
+from tests.run.scripted_cell import directory_for, scripts
+
+LINES = {
+    "locate_ball": [Line(seconds=(0.2, 0.2), values={"ball": [1.0, 0.1]})],
+    "move_to_point": [
+        Line(seconds=(0.3, 0.3)),
+        Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="y = 0.9 m"),
+        Line(seconds=(0.3, 0.3)),
+        Line(seconds=(0.3, 0.3)),
+    ],
+    "catch_ball": [
+        Line(ActionStatus.FAILURE, (0.2, 0.2), cause="missed"),
+        Line(seconds=(0.2, 0.2)),
+    ],
+}
+
+
+RUNS = 4
+
+
+class CrashError(Exception):
+    """The coordinator is gone."""
+
+
+class MortalStore(JournalStore):
+    """Dies after so many operations (appends and syncs), as kill -9 would: what was not synced is
+    lost with the process."""
+
+    def __init__(self, writer: JournalWriter, lives: int) -> None:
+        super().__init__(writer, 0.0)
+        self._lives = lives
+        self.operations = 0
+
+    def _count(self) -> None:
+        self.operations += 1
+        if self.operations == self._lives:
+            os.close(self.writer._file)
+            raise CrashError
+
+    def append(
+        self, now: float, stimulus: Stimulus, instructions: Sequence[Instruction], state: State
+    ) -> None:
+        self._count()
+        super().append(now, stimulus, instructions, state)
+
+    def flush(self) -> None:
+        self._count()
+        super().flush()
+        self._count()
+
+    def sync(self) -> None:
+        self._count()
+        super().sync()
+        self._count()
+
+
+class Laboratory:
+    """A scripted cell whose nodes outlive their coordinator, and count how often each run was
+    executed."""
+
+    def __init__(self, task: Task, folder: Path) -> None:
+        self.task, self.folder = task, folder
+        self.directory = directory_for(task, every=True)
+        self.executed: Counter[str] = Counter()
+        counted = {name: self._counting(action) for name, action in scripts(task, LINES).items()}
+        self.node = lockstep_party(self.directory, self.directory.nodes["node"], counted)
+        self.cell: Cell | None = None
+
+    def _counting(self, action: Callable[..., Any]) -> Callable[..., Any]:
+        def counting(ctx: Any, **arguments: Any) -> Any:
+            self.executed[ctx.run] += 1
+            return action(ctx, **arguments)
+
+        return counting
+
+    def begin(self, lives: int, *first: Stimulus) -> tuple[Mission, MortalStore]:
+        """Run until the end or the crash; `first` is what the operator says before the
+        beginning."""
+        header = {
+            "mission": "m",
+            "mode": "lockstep",
+            "seed": 1,
+            "runs": RUNS,
+            "parameters": dict(self.task.parameters),
+        }
+        store = MortalStore(JournalWriter(self.folder / "run.journal", header), lives)
+        mission = make_mission(self.directory, Setting(self.task, runs=RUNS), "m", "boot-1", store)
+        mission.executor.stimulate(0.0, *first)
+        self.go(mission)
+        return mission, store
+
+    def resume(self) -> Mission:
+        """A new process takes the journal and goes on with the same nodes."""
+        task, runs = with_runs(self.task, RUNS)
+        assert runs == RUNS
+        assert self.cell is not None
+        journal = read_journal(self.folder / "run.journal")
+        mission, go_on = resumed_mission(
+            self.directory, task, Engine(task), journal, [], self.cell.now
+        )
+        self.go(mission, go_on)
+        return mission
+
+    def go(self, mission: Mission, begin: Callable[[float], None] | None = None) -> None:
+        """Run the cell with this coordinator until it is over; raises CrashError when it dies."""
+        party = CoordinatorParty(self.directory, mission, begin=begin)
+        if self.cell is None:
+            self.cell = Cell([party, self.node])
+        else:
+            self.cell.replace(party)
+        assert self.cell.run(lambda: party.over, 100_000)
+
+
+def outcome(mission: Mission) -> Mapping[str, Any]:
+    """What must not depend on a crash."""
+    finished = mission.executor.finished
+    assert finished is not None
+    return {
+        "status": finished.status,
+        "marking": mission.executor.state.marking,
+        "runs": sorted((r.run, r.status, r.cause) for r in mission.tally.runs),
+        "cycles": [(c.number, c.status, c.cause) for c in mission.tally.cycles],
+        "firings": mission.tally.firings,
+    }
+
+
+def undisturbed(task: Task, folder: Path) -> tuple[Mapping[str, Any], int]:
+    """The outcome without a crash, and how many places there are to crash at."""
+    laboratory = Laboratory(task, folder / "undisturbed")
+    mission, store = laboratory.begin(0)
+    assert set(laboratory.executed.values()) == {1}
+    return outcome(mission), store.operations
+
+
+def die_and_resume(task: Task, folder: Path, lives: int, expected: Mapping[str, Any]) -> None:
+    """Crash at an operation of the journal, resume, and compare with the undisturbed run."""
+    laboratory = Laboratory(task, folder / str(lives))
+    with pytest.raises(CrashError):
+        laboratory.begin(lives)
+    assert outcome(laboratory.resume()) == expected, f"crash at operation {lives}"
+    assert set(laboratory.executed.values()) == {1}, (
+        f"crash at operation {lives}: {laboratory.executed}"
+    )
+
+
+def test_dying_anywhere_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
+    """Twenty places drawn from all; all of them in the proof."""
+    expected, operations = undisturbed(catch_ball, tmp_path)
+    assert expected["status"] is Status.SUCCESS
+    assert operations > 60
+    for lives in sorted(
+        np.random.default_rng(1).choice(np.arange(1, operations), 20, replace=False)
+    ):
+        die_and_resume(catch_ball, tmp_path, int(lives), expected)
+
+
+@pytest.mark.proof
+def test_dying_at_every_operation_changes_nothing(catch_ball: Task, tmp_path: Path) -> None:
+    """Every append, flush and sync of the journal in turn."""
+    expected, operations = undisturbed(catch_ball, tmp_path)
+    for lives in range(1, operations):
+        die_and_resume(catch_ball, tmp_path, lives, expected)
+
+
+def test_what_the_operator_has_chosen_outlives_the_coordinator(
+    catch_ball: Task, tmp_path: Path
+) -> None:
+    """An override is a stimulus like any other: before and after the crash his alternative is run,
+    and replay says so."""
+    chosen = {"locate_ball": "locate_hough", "track_ball": "predict_kalman"}
+    laboratory = Laboratory(catch_ball, tmp_path)
+    with pytest.raises(CrashError):
+        laboratory.begin(60, *(Override(task, action) for task, action in chosen.items()))
+    before = Counter(laboratory.executed)
+    mission = laboratory.resume()
+    assert mission.executor.state.overrides == chosen
+    ran = {
+        run.partition("#")[0]: action
+        for run, action in mission.tally.chosen.items()
+        if f"m/{run}" not in before
+    }
+    assert {task: ran[task] for task in chosen} == chosen, "runs that only the second process chose"
+    steps = list(
+        replay(read_journal(tmp_path / "run.journal"), Engine(with_runs(catch_ball, RUNS)[0]))
+    )
+    assert steps[-1].state == mission.executor.state
+
+
+def test_replay_derives_everything_again(catch_ball: Task, tmp_path: Path) -> None:
+    """The journal alone gives every marking; a changed task is noticed at the first difference."""
+    laboratory = Laboratory(catch_ball, tmp_path)
+    mission, _ = laboratory.begin(0)
+    task, _ = with_runs(catch_ball, RUNS)
+    journal = read_journal(tmp_path / "run.journal")
+    steps = list(replay(journal, Engine(task)))
+    assert steps[-1].state == mission.executor.state
+    other, _ = with_runs(catch_ball, RUNS - 1)
+    with pytest.raises(ReplayError, match=r"record \d+ \(Begin\)"):
+        list(replay(journal, Engine(other)))

@@ -1,0 +1,114 @@
+"""A coordinator that dies under its operator's hands: in a pause, at a breakpoint, in the middle of
+a cancel or of an abort."""
+
+from __future__ import annotations
+
+import pytest
+
+from petrobot.coordinator.engine import (
+    Abort,
+    Hold,
+    Mode,
+    Pause,
+    Resume,
+    RunHeld,
+    SetBreakpoints,
+    Step,
+)
+from petrobot.coordinator.run.fences import STOP_MARGIN
+from petrobot.coordinator.task import Executed, Status
+from petrobot.services.comm.protocol import messages as m
+from tests.run.toy_arm import TIDY, WORK, Bench
+
+
+def held(bench: Bench, now: float) -> m.Command:
+    """The order to hold that was sent last; the node says that the arm holds."""
+    order = next(c for c in bench.sent(m.Command) if isinstance(c, m.Command) and c.verb == "hold")
+    bench.say(now, m.Answer(order.id, True, {"answers": {"arm": "held"}, "devices": {}}))
+    return order
+
+
+@pytest.mark.parametrize("answered", [True, False], ids=["held", "not answered yet"])
+def test_killed_in_a_pause_it_is_still_paused_and_the_arm_is_asked_to_hold_again(
+    answered: bool,
+) -> None:
+    """Whatever the node had answered: it may have been released since, or started again. Then it
+    goes on as if nothing had been."""
+    bench = Bench().begin()
+    bench.executor.stimulate(1.0, Pause("look"))
+    if answered:
+        held(bench, 1.1)
+    after = bench.resumed(2.0, runs=[WORK])
+    assert after.executor.state.mode is Mode.PAUSED
+    held(after, 2.1)
+    run = after.executor.state.run("work#1")
+    assert run is not None and run.phase == "held"
+    after.say(2.2, m.Outcome(WORK, "success"))
+    assert after.fired == [] and after.calls() == [], "an end is kept, and nothing fires in a pause"
+    after.executor.stimulate(3.0, Resume())
+    assert after.fired == ["worked"] and after.calls() == [TIDY]
+
+
+def test_killed_in_a_pause_of_a_node_that_cannot_hold() -> None:
+    """Its run goes on; that is said again, and nothing fires."""
+    bench = Bench().begin()
+    bench.executor.stimulate(1.0, Pause())
+    bench.executor.stimulate(1.1, RunHeld("work#1", Hold.CANNOT))
+    after = bench.resumed(2.0, runs=[WORK])
+    order = next(c for c in after.sent(m.Command) if isinstance(c, m.Command))
+    after.say(2.1, m.Answer(order.id, False, {"answers": {"arm": "cannot hold"}, "devices": {}}))
+    assert after.reports == ["not_held"] * 2 and after.executor.state.mode is Mode.PAUSED
+
+
+def test_killed_with_breakpoints_set_it_stops_at_them() -> None:
+    bench = Bench().begin()
+    bench.executor.stimulate(1.0, SetBreakpoints(("worked",)))
+    after = bench.resumed(2.0, runs=[WORK])
+    after.say(2.1, m.Outcome(WORK, "success"))
+    assert after.fired == [] and after.executor.state.mode is Mode.PAUSED
+    third = after.resumed(3.0)
+    assert (
+        third.executor.state.breakpoints == {"worked"}
+        and third.executor.state.suspended is not None
+    )
+    third.executor.stimulate(3.1, Step())
+    assert third.fired == ["worked"] and third.executor.state.mode is Mode.PAUSED
+    third.executor.stimulate(3.2, Resume())
+    assert third.calls() == [TIDY], "once, whichever of the two let it go"
+
+
+@pytest.mark.parametrize("boot", ["n1", "n2"])
+def test_killed_in_the_middle_of_a_cancel(boot: str) -> None:
+    """The cancel is given again; nothing has the arm before the run is known to have stopped, also
+    when its node is another."""
+    bench = Bench().begin()
+    bench.ring(1.0)
+    after = bench.resumed(1.5, boot=boot, runs=[WORK] if boot == "n1" else [])
+    assert TIDY not in after.calls()
+    if boot == "n1":
+        assert after.executor.state.stopping
+        after.say(1.6, m.Outcome(WORK, "error", {}, "cancelled"))
+    else:
+        after.say(1.6, m.Outcome(WORK, "error", {}, "rebooted", "", m.Executed.UNKNOWN))
+        after.go(1.6 + 0.9 * STOP_MARGIN)
+        assert after.calls() == [], (
+            "the devices of the former process may still be at their stop routines"
+        )
+        after.go(1.6 + STOP_MARGIN)
+    assert after.calls() == [TIDY]
+    (record,) = after.records
+    assert (record.run, record.cancelled) == ("work#1", True)
+    assert record.status is Status.SUCCESS, "as the preempting event says"
+
+
+def test_killed_in_an_abort_as_after_an_emergency_stop_it_ends_and_starts_nothing() -> None:
+    """The stop was journaled as an abort: the resumed run waits for what still stops, and is
+    over."""
+    bench = Bench().begin()
+    bench.executor.stimulate(1.0, Abort("emergency stop by ana"))
+    after = bench.resumed(2.0, runs=[WORK])
+    assert [type(message) for message in after.sent(m.Call, m.Cancel)] in ([], [m.Call, m.Cancel])
+    after.say(2.1, m.Outcome(WORK, "error", {}, "emergency_stop", "", m.Executed.YES))
+    finished = after.executor.finished
+    assert finished is not None and finished.status is Status.ERROR and "ana" in finished.reason
+    assert after.calls() == [] and after.records[0].executed is Executed.YES

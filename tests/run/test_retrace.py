@@ -1,0 +1,100 @@
+"""A run in lock step whose whole cell died with its coordinator: made again from its seed,
+compared, and written on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.run.folder import JOURNAL, RESULT
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.recording import ReplayError, RetracingStore
+from tests.run.test_runfolder import SCRIPT, SERVICES
+
+TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
+
+
+@pytest.fixture
+def recorded_run(tmp_path: Path) -> Path:
+    """The folder of a run that ended."""
+    for name, text in (("services.toml", SERVICES), ("mock.toml", SCRIPT)):
+        (tmp_path / name).write_text(text)
+    given = ["run", str(TASK), "--mode", "lockstep", "--quiet", "--journal", str(tmp_path / "runs")]
+    given += ["--services", str(tmp_path / "services.toml"), "--mock", str(tmp_path / "mock.toml")]
+    assert main(given) == 0
+    [folder] = (tmp_path / "runs").iterdir()
+    return folder
+
+
+def kill_at(folder: Path, records: int) -> dict[str, Any]:
+    """Leave so many records, the next one torn, and no result; gives the result of before."""
+    result: dict[str, Any] = json.loads((folder / RESULT).read_text())
+    (folder / RESULT).unlink()
+    path = folder / JOURNAL
+    whole, raw = read_journal(path), path.read_bytes()
+    path.unlink()
+    writer = JournalWriter(path, dict(whole.header))
+    for record in whole.records[:records]:
+        writer.append(record.kind, record.data)
+    writer.close()
+    with path.open("ab") as file:
+        file.write(raw[path.stat().st_size :][:5])
+    result.pop("wall_s")
+    return result
+
+
+@pytest.mark.parametrize("records", [0, 1, 2, 7, 20, 10_000])
+def test_the_resumed_run_is_the_undisturbed_one(recorded_run: Path, records: int) -> None:
+    """Result and journal are those of a run that nobody killed, record by record."""
+    path = recorded_run / JOURNAL
+    before = [(r.kind, r.data) for r in read_journal(path).records]
+    expected = kill_at(recorded_run, records)
+    assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 0
+    result = json.loads((recorded_run / RESULT).read_text())
+    result.pop("wall_s")
+    assert result == expected
+    assert len(read_journal(path).records) == len(before)
+    assert [r.data["marking"] for r in read_journal(path).records if r.kind == "stimulus"] == [
+        data["marking"] for kind, data in before if kind == "stimulus"
+    ]
+    assert main(["replay", str(recorded_run)]) == 0
+
+
+def test_files_that_changed_since_are_noticed(
+    recorded_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another script gives another run: it is not written over the one that was."""
+    kill_at(recorded_run, 20)
+    (recorded_run.parents[1] / "mock.toml").write_text(SCRIPT.replace("0.1", "0.2"))
+    assert main(["resume", str(recorded_run), "--quiet", "--no-page"]) == 2
+    said = capsys.readouterr().err
+    assert "sources or files have changed since" in said and "record " in said
+    assert len(read_journal(recorded_run / JOURNAL).records) == 20
+
+
+def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
+    path = tmp_path / "run.journal"
+    writer = JournalWriter(path, {"mode": "lockstep"})
+    writer.append("stage", {"stage": "scored", "values": {"cpu_s": 1.0}})
+    writer.append(
+        "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.25}}
+    )
+    writer.close()
+    store = RetracingStore(JournalWriter(path), read_journal(path))
+    store.stage("scored", {"cpu_s": 2.0})
+    store._write(
+        "stimulus", {"t": 1.0, "stimulus": {"kind": "RunEnded", "run": "a#1", "cpu_seconds": 0.5}}
+    )
+    compared = store.safe
+    store.stage("other", {})
+    assert (compared, store.safe) == (True, False), (
+        "what is there is compared, what comes after it is written"
+    )
+    store.writer.close()
+    again = RetracingStore(JournalWriter(path), read_journal(path))
+    with pytest.raises(ReplayError, match="record 1 was stage"):
+        again.stage("prepared", {})

@@ -1,0 +1,130 @@
+"""The keeper of node processes: ready in order, dead ones started again with a growing pause, none
+left behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.run.supervisor import LaunchError, Program, Supervisor
+from tests.waiting import beat
+
+pytestmark = pytest.mark.processes
+STEADY = "print('ready', flush=True); import signal; signal.pause()"
+BRIEF = "print('ready', flush=True)"
+STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + STEADY
+FAULTY = "import sys; print('no device at can0', file=sys.stderr); sys.exit(2)"
+
+
+def program(name: str, source: str, first: bool = False) -> Program:
+    """A program that runs this text."""
+    return Program(name, [sys.executable, "-c", source], first)
+
+
+def gone(process: int) -> bool:
+    """Whether there is no such process any more."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+async def until_said(said: list[str], count: int) -> None:
+    """Wait for so many notices."""
+    async with asyncio.timeout(60.0):
+        while len(said) < count:
+            await beat(0.01)
+
+
+async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor(
+    tmp_path: Path,
+) -> None:
+    said: list[str] = []
+    async with Supervisor(
+        [program("a", STEADY), program("b", STEADY)], tmp_path, notice=said.append
+    ) as keeper:
+        before = keeper.process_ids()
+        os.kill(before["a"], signal.SIGKILL)
+        await until_said(said, 1)
+        async with asyncio.timeout(60.0):
+            while keeper.process_ids().get("a", before["a"]) == before["a"]:
+                await beat(0.01)
+        assert (keeper.starts("a"), keeper.starts("b")) == (2, 1)
+        assert keeper.process_ids()["b"] == before["b"]
+        last = list(keeper.process_ids().values())
+    assert all(gone(process) for process in last)
+
+
+async def test_one_that_keeps_dying_is_started_more_and_more_slowly(tmp_path: Path) -> None:
+    """The pause doubles with each early death, so that a broken node does not eat the host."""
+    said: list[str] = []
+    async with Supervisor([program("a", BRIEF)], tmp_path, notice=said.append):
+        await until_said(said, 3)
+    pauses = [float(text.rpartition(" in ")[2].removesuffix(" s")) for text in said[:3]]
+    assert pauses == [0.5, 1.0, 2.0]
+
+
+async def test_without_respawn_a_dead_one_stays_dead_and_the_end_of_all_is_noticed(
+    tmp_path: Path,
+) -> None:
+    """As for the members of a lock-step cell."""
+    async with Supervisor(
+        [program("a", BRIEF), program("b", BRIEF)], tmp_path, respawn=False
+    ) as keeper:
+        async with asyncio.timeout(60.0):
+            await keeper.ended()
+        assert keeper.process_ids() == {} and keeper.starts("a") == 1
+
+
+async def test_one_that_does_not_come_up_is_named_with_the_end_of_its_log(tmp_path: Path) -> None:
+    with pytest.raises(
+        LaunchError, match=r"node a ended; its log .*a\.log ends with:\nno device at can0"
+    ):
+        await Supervisor([program("a", FAULTY), program("b", STEADY)], tmp_path).__aenter__()
+    with pytest.raises(LaunchError) as again:
+        await Supervisor([program("a", FAULTY)], tmp_path).__aenter__()
+    assert str(again.value).count("no device at can0") == 1, (
+        "what an earlier start left in the log is not its end"
+    )
+
+
+async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:
+    """The laboratory's bus must be there before the node that opens it starts."""
+    mark = tmp_path / "there"
+    first = program("sim", f"open({str(mark)!r}, 'w').close(); " + STEADY, first=True)
+    second = program("node", f"import os; assert os.path.exists({str(mark)!r}); " + STEADY)
+    async with Supervisor([second, first], tmp_path / "logs") as keeper:
+        assert set(keeper.process_ids()) == {"sim", "node"}
+
+
+async def test_one_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> None:
+    async with Supervisor([program("a", STUBBORN)], tmp_path) as keeper:
+        process = keeper.process_ids()["a"]
+    assert gone(process)
+
+
+async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(tmp_path: Path) -> None:
+    """Its child holds its output open, and goes on talking."""
+    talker = "while echo alive; do sleep 0.05; done"
+    leaver = (
+        f"import subprocess; print(subprocess.Popen(['sh', '-c', {talker!r}]).pid, "
+        f"flush=True); {STEADY}"
+    )
+    said: list[str] = []
+    try:
+        async with Supervisor([program("a", leaver)], tmp_path, notice=said.append) as keeper:
+            os.kill(keeper.process_ids()["a"], signal.SIGKILL)
+            await until_said(said, 1)
+            async with asyncio.timeout(60.0):
+                while keeper.starts("a") < 2 or not keeper.process_ids():
+                    await beat(0.01)
+    finally:
+        for line in (tmp_path / "a.log").read_text().splitlines():
+            if line.isdigit():
+                os.kill(int(line), signal.SIGKILL)

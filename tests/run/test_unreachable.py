@@ -1,0 +1,69 @@
+"""Nodes that are not reached: those that do not run are to be launched with the file in use, those
+that refuse us are not."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.launch import Setting, realtime_mission
+from petrobot.coordinator.run.realtime import RealtimeMission, UnreachableError, credentials_of
+from petrobot.coordinator.task import Task
+from petrobot.services.comm.calls.callee import Callee
+from petrobot.services.comm.calls.server import Server
+from petrobot.services.comm.location_file import parse
+from tests.ports import free_ports
+
+NAMES = ("left", "right")
+
+
+async def unreachable(task: Task, folder: Path, *refusing: str) -> str:
+    """What is said when all nodes but those `refusing` are away; these have another key."""
+    key = folder / "cell.key"
+    key.write_text(os.urandom(32).hex(), encoding="utf-8")
+    key.chmod(0o600)
+    ports = dict(zip(NAMES, free_ports(len(NAMES)), strict=True))
+    text = "schema = 1\n" + "".join(
+        f'[nodes.{n}]\nhost = "127.0.0.1"\nport = {p}\n' for n, p in ports.items()
+    )
+    directory = parse(text + '[keys]\nfile = "cell.key"\n', folder / "my services.toml")
+    servers = [Server(Callee(name, "b1", {}), key=os.urandom(32)) for name in refusing]
+    for server in servers:
+        await server.start("127.0.0.1", ports[server.callee.name])
+    shell = RealtimeMission(
+        realtime_mission(directory, Setting(task), "m1"), directory, credentials_of(directory)
+    )
+    with pytest.raises(UnreachableError) as fault:
+        await shell.connect(0.5)
+    await asyncio.gather(shell.close(), *(server.close() for server in servers))
+    assert set(fault.value.nodes) == set(NAMES)
+    return str(fault.value)
+
+
+async def test_nodes_that_do_not_run_are_to_be_launched_with_the_file_in_use(
+    catch_ball: Task, tmp_path: Path
+) -> None:
+    """A run may have another location file than the one here."""
+    said = await unreachable(catch_ball, tmp_path)
+    assert f"`petrobot up --services '{tmp_path / 'my services.toml'}'`" in said
+    assert "key" not in said.replace(str(tmp_path), "")
+
+
+async def test_a_node_with_another_key_is_not_to_be_launched(
+    catch_ball: Task, tmp_path: Path
+) -> None:
+    """It runs: the remedy is about the key; the others are to be launched all the same."""
+    launch, _, refused = (await unreachable(catch_ball, tmp_path, "left")).partition(
+        "; not let in by "
+    )
+    assert refused.startswith("left at ") and "wrong_key" in refused and "keys.file of" in refused
+    assert "petrobot up" not in refused
+    assert (
+        launch.startswith("no answer from right at ")
+        and "left at" not in launch
+        and "petrobot up" in launch
+    )
+    assert "petrobot up" not in await unreachable(catch_ball, tmp_path, *NAMES)

@@ -1,0 +1,409 @@
+"""Deferred verdicts from the action's own words to the estimates: in lock step, with processes,
+over lost links and resumes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot.coordinator.engine import Engine
+from petrobot.coordinator.engine.instructions import Corrected
+from petrobot.coordinator.engine.stimuli import RunEnded, Verdict
+from petrobot.coordinator.launch import Setting, lockstep_party, make_mission, resumed_mission
+from petrobot.coordinator.run.journal import JournalWriter, read_journal
+from petrobot.coordinator.run.lockstep import CoordinatorParty
+from petrobot.coordinator.run.mission import Mission, MissionError
+from petrobot.coordinator.run.recording import replay
+from petrobot.coordinator.run.timeline import Timeline
+from petrobot.coordinator.studies.campaign.trials import ThrowLog
+from petrobot.coordinator.task import Status
+from petrobot.services.comm.calls.callee import Callee, Offer
+from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.comm.protocol import messages as m
+from tests.run.judged_parts import (
+    FAIL,
+    LEARNED,
+    OK,
+    PARTS,
+    TRULY,
+    Heard,
+    directory,
+    learned,
+    learner,
+    sorting,
+    told,
+)
+from tests.run.test_resume import CrashError, MortalStore
+from tests.run.toy_arm import TIDY, WORK, Bench
+
+
+class Cellar:
+    """The judged cell in lock step; its nodes outlive their coordinator."""
+
+    def __init__(self, folder: Path) -> None:
+        self.task, self.directory = sorting(), directory()
+        self.journal = folder / "run.journal"
+        self.heard, self.selector = Heard(), learner(self.task)
+        self.nodes = [
+            lockstep_party(self.directory, node) for node in self.directory.nodes.values()
+        ]
+        self.cell: Cell | None = None
+
+    def begin(self, lives: int = 0, *observers: Any) -> tuple[Mission, MortalStore]:
+        header = {"mission": "m", "mode": "lockstep", "seed": 1, "runs": PARTS, "parameters": {}}
+        store = MortalStore(JournalWriter(self.journal, header), lives)
+        setting = Setting(self.task, runs=PARTS, seed=1, selector=self.selector)
+        mission = make_mission(self.directory, setting, "m", "boot-1", store)
+        mission.executor.observers += [self.heard, *observers]
+        self._go(mission)
+        return mission, store
+
+    def resume(self) -> Mission:
+        """A new process: its learner and observers begin anew, and are shown what the journal
+        holds."""
+        self.heard, self.selector = Heard(), learner(self.task)
+        assert self.cell is not None
+        mission, go_on = resumed_mission(
+            self.directory,
+            self.task,
+            Engine(self.task),
+            read_journal(self.journal),
+            [self.selector, self.heard],
+            self.cell.now,
+            self.selector,
+        )
+        self._go(mission, go_on)
+        return mission
+
+    def _go(self, mission: Mission, begin: Callable[[float], None] | None = None) -> None:
+        party = CoordinatorParty(self.directory, mission, begin=begin)
+        if self.cell is None:
+            self.cell = Cell([party, *self.nodes])
+        else:
+            self.cell.replace(party)
+        assert self.cell.run(lambda: party.over, 100_000)
+
+
+def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_path: Path) -> None:
+    """The estimates, the selector and the run's own tally hold what is true; the net went on by
+    what was said first."""
+    cellar = Cellar(tmp_path)
+    timeline, log = Timeline(), ThrowLog(cellar.task, lambda record, values: record.seconds)
+    mission, _ = cellar.begin(0, timeline, log)
+    assert told(mission) == TRULY
+    assert learned(cellar.selector) == LEARNED
+    assert [c.run for c in cellar.heard.corrected] == [
+        "pick#1",
+        "pick#2",
+        "pick#4",
+        "pick#5",
+        "pick#3",
+    ]
+    assert cellar.heard.notes["no_verdict_due"] == 2, (
+        "the second on the first pick, and the one on a run that was sure"
+    )
+    assert set(mission.executor.state.deferred) == {"pick#6"} and not mission.executor.state.early
+    assert [(c.status, c.cause) for c in mission.tally.cycles] == list(TRULY.values())
+    assert [(t.status, t.cause) for t in log.throws] == [(s.value, c) for s, c in TRULY.values()]
+    assert [t.all_success for t in log.throws] == [s is OK for s, _ in TRULY.values()]
+    assert {run: (timeline.bars[run].status, timeline.bars[run].cause) for run in TRULY} == TRULY
+    assert timeline.bars["pick#1"].text == "held by a corner"
+
+
+def test_the_score_is_told_what_nobody_has_judged_and_its_verdicts_are_no_result(
+    tmp_path: Path,
+) -> None:
+    mission, _ = Cellar(tmp_path).begin()
+    result = mission.result("lockstep", 0.0)
+    assert result["hidden"] == ["m/pick#3", "m/pick#6"] and "verdicts" not in result
+    assert [row["held"] for row in result["parts"]] == [
+        "failure",
+        "success",
+        "success",
+        "failure",
+        "success",
+        "success",
+    ]
+
+
+def test_the_journal_alone_gives_the_verdicts_again(tmp_path: Path) -> None:
+    cellar = Cellar(tmp_path)
+    mission, _ = cellar.begin()
+    steps = list(replay(read_journal(cellar.journal), Engine(cellar.task)))
+    assert steps[-1].state == mission.executor.state
+    assert [
+        i for step in steps for i in step.instructions if isinstance(i, Corrected)
+    ] == cellar.heard.corrected
+    again = learner(cellar.task)
+    for step in steps:
+        again.stimulus(step.time, step.stimulus)
+        for instruction in step.instructions:
+            again.instruction(step.time, instruction)
+        again.settled(step.time, step.state)
+    assert again.records == cellar.selector.records
+
+
+def test_a_coordinator_that_dies_anywhere_counts_each_verdict_once(tmp_path: Path) -> None:
+    """Before a verdict is written down, between that and its acknowledgement, between the score's
+    verdicts and the score."""
+    whole, store = Cellar(tmp_path / "whole").begin()
+    assert store.operations > 90
+    verdicts = places_of_verdicts(tmp_path / "whole" / "run.journal", store.operations)
+    for lives in verdicts:
+        cellar = Cellar(tmp_path / str(lives))
+        with pytest.raises(CrashError):
+            cellar.begin(lives)
+        mission = cellar.resume()
+        assert told(mission) == TRULY, f"crash at operation {lives}"
+        assert learned(cellar.selector) == LEARNED, f"crash at operation {lives}"
+        assert len(cellar.heard.corrected) == 5
+        assert mission.result("lockstep", 0.0)["hidden"] == whole.result("lockstep", 0.0)["hidden"]
+
+
+def places_of_verdicts(journal: Path, operations: int) -> Sequence[int]:
+    """Operations of a journal spread over the whole run, and all of the last twelve (the
+    score's)."""
+    assert (
+        sum(
+            isinstance(s.stimulus, Verdict)
+            for s in replay(read_journal(journal), Engine(sorting()))
+        )
+        == 7
+    )
+    return [*range(20, operations - 12, 9), *range(operations - 12, operations)]
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "says"),
+    [
+        (["pick#3"], "score: verdicts"),
+        ({"m/pick#3": "failure"}, "score: verdicts"),
+        ({"m/pick#3": {"status": "good"}}, "status is 'good'; give success, failure, error"),
+    ],
+)
+def test_a_score_whose_verdicts_are_none_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdicts: Any, says: str
+) -> None:
+    import judged_cell.actions as actions  # type: ignore[import-not-found]  # on the path of the cell alone
+
+    monkeypatch.setattr(actions, "score", lambda ctx, *, cycles: actions.success(verdicts=verdicts))
+    with pytest.raises(MissionError, match=says):
+        Cellar(tmp_path).begin()
+
+
+# --- between two machines: links that break, verdicts that come early, late, twice or for nobody
+
+
+class Judges(Bench):
+    """The toy with one arm; its node is a real callee, so that links can break."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.node = Callee(
+            "motion", "n1", {"do_work": Offer(device="arm"), "do_tidy": Offer(device="arm")}
+        )
+
+    def connect(self, now: float) -> None:
+        """The link is there (again)."""
+        welcome = self.node.link_up(now, "m", self.caller.hello)
+        assert isinstance(welcome, m.Welcome)
+        self.caller.link_up(now, welcome)
+        self.carry(now)
+
+    def cut(self, now: float) -> None:
+        """The link breaks; what was on its way is lost."""
+        self.node.messages()
+        self.node.link_down(now, "m")
+        self.caller.link_down(now, "cut")
+
+    def carry(self, now: float) -> None:
+        """All that is on its way arrives."""
+        for _ in range(4):
+            self.go(now)
+            for message in self.sent():
+                self.node.receive(now, "m", message)
+            for _, message in self.node.messages():
+                self.caller.receive(now, message)
+        self.go(now)
+
+    def end(
+        self, now: float, run: str, status: str, *, deferred: bool = False, cause: str = ""
+    ) -> None:
+        """A run has ended."""
+        self.node.finish(now, run, status, cause=cause, deferred=deferred)
+        self.carry(now)
+
+    def judge(
+        self, now: float, status: str, cause: str = "", run: str = WORK, **other: Any
+    ) -> None:
+        """Somebody on the node says what a run came to. `other`: what stands in its data in place
+        of that."""
+        data = {**VerdictSaid(run, status, cause).to_data(), **other.get("data", {})}
+        self.node.raise_event(now, verdict_event("m"), data, source="judge", latched=True)
+
+    @property
+    def corrected(self) -> list[tuple[str, Status, Status, str]]:
+        """Corrections so far."""
+        found = [i for step in self.steps for i in step.instructions if isinstance(i, Corrected)]
+        return [(c.run, c.was, c.status, c.cause) for c in found]
+
+
+def working() -> Judges:
+    """Work goes on."""
+    bench = Judges()
+    bench.begin()
+    bench.executor.subscribe(0.0)
+    bench.connect(0.1)
+    return bench
+
+
+def judged() -> Judges:
+    """Work has ended provisionally; tidying goes on."""
+    bench = working()
+    bench.end(1.0, WORK, "success", deferred=True)
+    assert list(bench.node.running()) == [TIDY] and bench.records[0].deferred
+    return bench
+
+
+CROOKED = [("work#1", OK, FAIL, "crooked")]
+
+
+def test_a_link_that_breaks_between_result_and_verdict_only_delays_it() -> None:
+    bench = judged()
+    bench.cut(1.1)
+    bench.judge(1.2, "failure", "crooked")
+    assert bench.corrected == []
+    bench.connect(1.5)
+    bench.carry(1.6)
+    assert bench.corrected == CROOKED
+    assert bench.node.events.waiting("m") == [], "acknowledged"
+
+
+def test_an_acknowledgement_that_is_lost_brings_it_again_and_it_counts_once() -> None:
+    bench = judged()
+    bench.judge(1.2, "failure", "crooked")
+    for _, message in bench.node.messages():
+        bench.say(1.2, message)
+    assert [type(message) for message in bench.sent(m.EventAck)] == [m.EventAck]
+    bench.cut(1.3)
+    bench.connect(1.5)
+    bench.carry(1.6)
+    assert bench.corrected == CROOKED and bench.reports == []
+    assert bench.node.events.waiting("m") == []
+
+
+def test_two_verdicts_on_one_run_count_as_the_first_says() -> None:
+    bench = judged()
+    bench.judge(1.2, "failure", "crooked")
+    bench.judge(1.2, "success")
+    bench.carry(1.3)
+    assert bench.corrected == CROOKED and bench.reports == ["no_verdict_due"]
+
+
+def test_a_verdict_that_overtakes_the_result_counts() -> None:
+    """The judge's node is reached, that of the run is not yet."""
+    bench = working()
+    bench.judge(0.5, "failure", "crooked")
+    bench.carry(0.5)
+    assert bench.corrected == [] and bench.executor.state.early
+    bench.end(1.0, WORK, "success", deferred=True)
+    assert bench.corrected == CROOKED and bench.fired == ["go", "worked"], (
+        "the net went on by what the run said"
+    )
+
+
+@pytest.mark.parametrize("preempted", [False, True], ids=["sure", "preempted"])
+def test_a_verdict_that_came_early_on_a_run_that_never_says_it_was_provisional(
+    preempted: bool,
+) -> None:
+    bench = working()
+    bench.judge(0.5, "failure", "crooked")
+    bench.carry(0.5)
+    if preempted:
+        bench.ring(0.6)
+        bench.carry(0.6)
+    bench.end(1.0, WORK, "error", cause="broken", deferred=preempted)
+    assert bench.records[0].cancelled is preempted
+    assert (
+        bench.corrected == []
+        and bench.reports == ["no_verdict_due"]
+        and not bench.executor.state.early
+    )
+
+
+def test_a_verdict_after_a_resume() -> None:
+    """One comes while nobody coordinates, one had been written down and not acknowledged: both
+    count once."""
+    bench = judged()
+    bench.cut(1.1)
+    bench.judge(1.2, "failure", "crooked")
+    after = bench.resumed(2.0, runs=[TIDY])
+    event = bench.node.events.subscribe("m", (verdict_event("m"),), True)
+    assert len(event) == 1
+    after.say(2.1, *event)
+    after.say(2.2, *event)
+    third = after.resumed(3.0, runs=[TIDY])
+    third.say(3.1, *event)
+    corrections = [i for step in third.steps for i in step.instructions if isinstance(i, Corrected)]
+    assert [(c.run, c.was, c.status, c.cause) for c in corrections] == CROOKED
+    assert third.reports == ["no_verdict_due"], "the new process asked for it once more"
+
+
+def test_a_verdict_that_never_comes_leaves_what_was_said() -> None:
+    bench = judged()
+    bench.end(2.0, TIDY, "success")
+    assert bench.executor.finished is not None
+    assert bench.corrected == [] and bench.records[0].deferred and bench.records[0].status is OK
+    bench.judge(2.5, "failure", "crooked")
+    bench.carry(2.5)
+    assert bench.corrected == CROOKED, (
+        "the net is at its end, the mission run is still being scored"
+    )
+
+
+@pytest.mark.parametrize(
+    ("run", "more", "reports"),
+    [
+        (WORK, {"status": "good"}, []),
+        (WORK, {"run": 7}, []),
+        (WORK, {"cause": 7}, []),
+        ("other/work#1", {}, ["no_verdict_due"]),
+        ("m/work#9", {}, ["no_verdict_due"]),
+    ],
+)
+def test_what_is_no_verdict_on_a_run_of_ours_changes_nothing(
+    run: str, more: dict[str, Any], reports: list[str]
+) -> None:
+    bench = judged()
+    bench.judge(1.2, "failure", run=run, data=more)
+    bench.carry(1.3)
+    assert bench.corrected == [] and bench.reports == reports
+    assert bench.node.events.waiting("m") == [], (
+        "acknowledged: it would not become better by being sent again"
+    )
+
+
+def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
+    for deferred, executed in (
+        (False, m.Executed.YES),
+        (True, m.Executed.NO),
+        (True, m.Executed.UNKNOWN),
+    ):
+        bench = Bench().begin()
+        status = "success" if executed is m.Executed.YES else "error"
+        bench.say(1.0, m.Outcome(WORK, status, {}, "odd", executed=executed, deferred=deferred))
+        (ended,) = [step.stimulus for step in bench.steps if isinstance(step.stimulus, RunEnded)]
+        assert not ended.deferred and not bench.executor.state.deferred
+
+
+@pytest.mark.parametrize(
+    "run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", "m" * 255 + "/a#1", None, 7]
+)
+def test_what_is_no_runs_id_is_refused_where_it_is_said(run: Any) -> None:
+    with pytest.raises(ValueError, match="give what its own context gave as ctx"):
+        mission_of(run)
+    assert mission_of("catch_ball/5/locate_ball#3") == "catch_ball/5"

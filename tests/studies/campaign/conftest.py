@@ -1,0 +1,78 @@
+"""What the tests of campaigns share: the toy cell's files, and campaigns of it in this process."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from petrobot.coordinator.studies.campaign.block import Bench
+from petrobot.coordinator.studies.campaign.conduct import Campaign
+from petrobot.coordinator.studies.campaign.plan import Plan, digest
+from petrobot.coordinator.studies.campaign.worker import answer
+
+HERE = Path(__file__).parent
+TASK, SERVICES = HERE / "toy" / "fetch.toml", HERE / "toy" / "services.toml"
+
+
+class InlinePool:
+    """Does blocks in this process, one after the other; `fails_at` blocks in it is interrupted."""
+
+    def __init__(self, plan: Plan, fails_at: int | None = None) -> None:
+        import json
+
+        self.count, self.lost, self.done = 1, 0, 0
+        self._plan, self._fails_at = json.dumps(plan.to_plain()), fails_at
+
+    async def run(self, order: Mapping[str, Any]) -> dict[str, Any]:
+        """Do a block."""
+        if self._fails_at is not None and self.done >= self._fails_at:
+            raise KeyboardInterrupt
+        self.done += 1
+        return answer(self._plan, order)
+
+
+@pytest.fixture(autouse=True)
+def _toy_actions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers and this process find the toy's actions."""
+    monkeypatch.syspath_prepend(str(HERE))
+
+
+@pytest.fixture
+def toy_plan() -> Plan:
+    """Twelve throws in two regimes, blocks of three."""
+    return Plan(
+        str(TASK),
+        str(SERVICES),
+        runs=12,
+        regimes=("easy", "rough"),
+        block=3,
+        batch=0,
+        digests={"task": digest(TASK), "services": digest(SERVICES)},
+    )
+
+
+@pytest.fixture
+def bench(toy_plan: Plan) -> Bench:
+    """The toy's files."""
+    return Bench.of(toy_plan)
+
+
+Conduct = Callable[..., Campaign]
+
+
+@pytest.fixture
+def conduct(tmp_path: Path, toy_plan: Plan) -> Iterator[Conduct]:
+    """Run a campaign of the toy in a folder of tmp_path; the plan's fields may be changed."""
+
+    def run(name: str, fails_at: int | None = None, **changes: Any) -> Campaign:
+        plan = replace(toy_plan, **changes)
+        campaign = Campaign(tmp_path / name, plan)
+        asyncio.run(campaign.run(InlinePool(plan, fails_at)))
+        return campaign
+
+    yield run

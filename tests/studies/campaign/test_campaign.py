@@ -1,0 +1,531 @@
+"""A campaign's table: the same whoever does the blocks, however many do, and however often it is
+interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import io
+import json
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from math import isfinite
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator.cli import main
+from petrobot.coordinator.cli.campaign import text_of
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.learning.estimates_file import EstimatesFile
+from petrobot.coordinator.learning.objective import Question, compare
+from petrobot.coordinator.studies.campaign.conduct import Campaign, Progress
+from petrobot.coordinator.studies.campaign.observed import regime_of
+from petrobot.coordinator.studies.campaign.plan import (
+    MANIFEST,
+    CampaignError,
+    Plan,
+    digest,
+    read_manifest,
+    write_manifest,
+)
+from petrobot.coordinator.studies.campaign.pool import LocalPool
+from petrobot.coordinator.studies.campaign.summary import Summary, comparisons, result_of
+from petrobot.coordinator.studies.campaign.table import TABLE, read_table
+from petrobot.coordinator.studies.campaign.worker import serve
+from tests.studies.campaign.conftest import SERVICES, TASK, Conduct
+from tests.waiting import beat, until
+
+
+def table(folder: Path) -> bytes:
+    """The table's bytes."""
+    return (folder / TABLE).read_bytes()
+
+
+def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
+    """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
+    for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
+        blocks = replace(toy_plan, runs=runs, block=block).blocks
+        assert [b.index for b in blocks] == list(range(len(blocks)))
+        assert sum(b.count for b in blocks) == runs
+        assert [b.first for b in blocks] == [
+            sum(a.count for a in blocks[:i]) for i in range(len(blocks))
+        ]
+        for regime in ("easy", "rough"):
+            own = [b for b in blocks if b.regime == regime]
+            assert [b.seed for b in own] == [1_000_000 + i for i in range(len(own))]
+    longer = replace(toy_plan, runs=24).blocks
+    assert [b.seed for b in longer][:4] == [b.seed for b in toy_plan.blocks][:4]
+
+
+def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
+    """One row a throw, with what the toy's own score says and what each run did."""
+    campaign = conduct("a")
+    rows = list(campaign.table.rows())
+    assert [row.n for row in rows] == list(range(1, 13))
+    assert {row.regime for row in rows} == {"easy", "rough"}
+    header = table(campaign.folder).split(b"\n")[0].decode().split(",")
+    assert {
+        "n",
+        "regime",
+        "seed",
+        "chosen.look",
+        "look.status",
+        "look.cost",
+        "parts.x",
+        "parts.gripped",
+    } <= set(header)
+    for row in rows:
+        assert row.throw is not None
+        assert row.throw.runs[0].place == "look"
+        assert row.score["parts.n"] == row.k
+        grips = [run for run in row.throw.runs if run.place == "grip"]
+        assert all(run.cost == 1.0 for run in grips)  # grip_soft costs its force
+        assert row.throw.goals == sum(run.taken == "gripped" for run in row.throw.runs)
+        assert (
+            row.throw.time is not None
+            and row.throw.time >= sum(run.took for run in row.throw.runs) - 1e-6
+        )
+
+
+def test_a_block_is_the_mission_run_that_petrobot_run_gives(conduct: Conduct) -> None:
+    """Seed and number of a row are enough to repeat it alone."""
+    campaign = conduct("a")
+    block = campaign.plan.blocks[2]
+    setting = Setting(campaign.bench.task, {"regime": block.regime}, block.count, block.seed)
+    cell, party = lockstep_cell(campaign.bench.directory, setting)
+    assert cell.run(lambda: party.over, 100_000)
+    rows = [row for row in campaign.table.rows() if row.block == block.index]
+    in_table = [run.seconds for row in rows for run in (row.throw.runs if row.throw else ())]
+    assert [run.seconds for run in party.mission.tally.runs] == pytest.approx(in_table)
+    assert rows[0].mission_s == pytest.approx(party.mission.ended - party.mission.begun)
+
+
+def test_another_seed_gives_another_table(conduct: Conduct) -> None:
+    """And the same seed the same one."""
+    assert table(conduct("a").folder) == table(conduct("b").folder)
+    assert table(conduct("a").folder) != table(conduct("c", seed=2).folder)
+
+
+@pytest.mark.parametrize("fails_at", [0, 1, 3])
+def test_interrupted_and_resumed_gives_the_same_table(conduct: Conduct, fails_at: int) -> None:
+    """Between blocks, and in the middle of writing one."""
+    whole = conduct("whole")
+    with pytest.raises(KeyboardInterrupt):
+        conduct("part", fails_at=fails_at)
+    path = whole.folder.parent / "part" / TABLE
+    if path.exists():
+        cut = path.read_bytes()
+        path.write_bytes(cut + b'99,easy,"half a r')
+    resumed = conduct("part")
+    assert table(resumed.folder) == table(whole.folder)
+    assert resumed.result()["sim_s"] == whole.result()["sim_s"]
+
+
+@pytest.mark.parametrize("kept", [1, 40, 400, 1500])
+def test_a_table_cut_anywhere_is_recovered(conduct: Conduct, kept: int) -> None:
+    """Whatever the disk kept of it."""
+    whole, other = conduct("whole"), conduct("other")
+    (other.folder / TABLE).write_bytes(table(other.folder)[:-kept])
+    assert table(conduct("other").folder) == table(whole.folder)
+
+
+def test_another_campaign_in_the_same_folder_is_refused(conduct: Conduct) -> None:
+    """With the keys that differ."""
+    conduct("a")
+    with pytest.raises(CampaignError, match="seed, selector differ"):
+        conduct("a", seed=5, selector="random")
+
+
+def plan_cut_off(folder: Path, size: int) -> Path:
+    """A manifest of which the disk kept so many bytes."""
+    path = folder / MANIFEST
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+@pytest.mark.parametrize("size", [0, 1, 100])
+def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int) -> None:
+    """Before the first block: remove it; with a table beside it: the folder. What is said helps."""
+    whole = conduct("whole")
+    with pytest.raises(KeyboardInterrupt):
+        conduct("a", fails_at=0)
+    path = plan_cut_off(whole.folder.parent / "a", size)
+    with pytest.raises(
+        CampaignError,
+        match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again",
+    ):
+        conduct("a")
+    path.unlink()
+    assert table(conduct("a").folder) == table(whole.folder)
+    plan_cut_off(path.parent, size)
+    with pytest.raises(
+        CampaignError, match=r"torn.*remove .*a to begin anew, or give another --out"
+    ):
+        conduct("a")
+
+
+@pytest.mark.parametrize("text", ["[]", "7", '{"schema": 1}', '{"schema": 1, "regimes": 3}'])
+def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> None:
+    """Though it is JSON."""
+    folder = conduct("a").folder
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    with pytest.raises(CampaignError, match="no plan"):
+        read_manifest(folder)
+
+
+def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
+    conduct: Conduct, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever had been written when the process died: before the file is on the disk it has
+    another name."""
+    folder = conduct("a").folder
+    before = (folder / MANIFEST).read_bytes()
+
+    def killed(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_manifest(folder, replace(toy_plan, seed=9))
+    assert (folder / MANIFEST).read_bytes() == before
+    monkeypatch.undo()
+    write_manifest(folder, replace(toy_plan, seed=9))
+    assert read_manifest(folder).seed == 9
+
+
+def test_files_that_changed_are_refused(conduct: Conduct, tmp_path: Path) -> None:
+    """A table is of one task file."""
+    with pytest.raises(CampaignError, match="has changed"):
+        conduct("a", digests={"task": "0" * 64})
+
+
+def test_a_bad_regime_is_the_campaigns_fault(conduct: Conduct) -> None:
+    """The cell's own words, with the seed."""
+    with pytest.raises(CampaignError, match="no regime 'steep'"):
+        conduct("a", regimes=("steep",))
+
+
+def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
+    """Three ways to look times two to grip, in each regime."""
+    rows = list(conduct("a", selector="round_robin", runs=24).table.rows())
+    easy = [row.throw for row in rows if row.regime == "easy"]
+    seen = {
+        tuple(run.action for run in t.runs if run.place in ("look", "grip"))
+        for t in easy
+        if t and len(t.runs) > 1
+    }
+    assert {combination[0] for combination in seen} == {"look_quick", "look_twice", "look_long"}
+    assert len(seen) >= 5  # one of six may have been unseen
+
+
+def test_progress_counts_throws(tmp_path: Path, toy_plan: Plan) -> None:
+    """Up to the last one; a resumed campaign says how many it found."""
+    from tests.studies.campaign.conftest import InlinePool
+
+    seen: list[Progress] = []
+    campaign = Campaign(tmp_path / "a", toy_plan, seen.append)
+    asyncio.run(campaign.run(InlinePool(toy_plan)))
+    assert [p.done for p in seen] == [3, 6, 9, 12]
+    assert all(p.of == 12 and p.already == 0 for p in seen)
+
+
+@pytest.mark.processes
+def test_workers_in_any_number_and_a_killed_one_change_nothing(
+    conduct: Conduct, tmp_path: Path, toy_plan: Plan
+) -> None:
+    """kill -9 of a busy worker: its block is done again by another one."""
+    alone = conduct("alone", selector="random")
+    plan = alone.plan
+
+    async def with_workers(name: str, count: int, kill: bool) -> LocalPool:
+        campaign = Campaign(tmp_path / name, plan)
+        async with LocalPool(plan, count, campaign.folder / "workers.log") as pool:
+            going = asyncio.create_task(campaign.run(pool))
+            if kill:
+                await until(lambda: pool.pids, "a worker of the pool")
+                os.kill(pool.pids[0], signal.SIGKILL)
+            await going
+            return pool
+
+    for count, kill in ((1, False), (3, True)):
+        pool = asyncio.run(with_workers(f"by_{count}", count, kill))
+        assert pool.lost == kill
+        assert table(tmp_path / f"by_{count}") == table(alone.folder)
+    assert len(list(read_table(tmp_path / "by_3" / TABLE))) == 12
+
+
+def test_nothing_of_a_block_is_there_when_the_next_one_begins(
+    toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker's memory stays flat although a mission refers to itself in circles and the collector
+    has its own time."""
+    left: list[int] = []
+
+    def orders() -> Iterator[str]:
+        yield json.dumps(toy_plan.to_plain())
+        for block in toy_plan.blocks:
+            yield json.dumps({"block": block.to_plain(), "weights": []})
+            left.append(gc.collect())
+
+    monkeypatch.setattr(
+        gc, "freeze", lambda: None
+    )  # for good in a worker; here it would be for all tests that follow
+    answers = io.StringIO()
+    gc.collect()
+    gc.disable()
+    try:
+        serve(orders(), answers)
+    finally:
+        gc.enable()
+    assert len(answers.getvalue().splitlines()) == len(toy_plan.blocks) == len(left)
+    assert not any(left)
+
+
+def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
+    """Interrupted in the middle of a batch and resumed, it chooses and learns the same."""
+    learning = {"selector": "nikolic_fu_fast", "runs": 60, "batch": 12, "options": {"rho": 0.1}}
+    whole = conduct("whole", **learning)
+    for fails_at in (6, 8, 11):
+        with pytest.raises(KeyboardInterrupt):
+            conduct(f"part{fails_at}", fails_at=fails_at, **learning)
+        resumed = conduct(f"part{fails_at}", **learning)
+        assert table(resumed.folder) == table(whole.folder)
+        assert resumed.policy.state() == whole.policy.state()
+    looks = [
+        row.throw.runs[0].action for row in whole.table.rows() if row.throw and row.regime == "easy"
+    ]
+    assert set(looks[:15]) == {"look_quick", "look_twice", "look_long"}  # first trials of each
+
+
+def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
+    """By regime, from the result of the campaign that learned."""
+    import json
+
+    from petrobot.coordinator.studies.campaign.policies import learned_choices
+
+    learnt = conduct("learnt", selector="thompson", runs=60, batch=12)
+    (learnt.folder / "result.json").write_text(json.dumps(learnt.result()), encoding="utf-8")
+    best = learned_choices(learnt.folder)
+    assert set(best) == {"easy", "rough"}
+    judged = conduct("judged", seed=2, options={"by_regime": best})
+    for row in judged.table.rows():
+        for run in row.throw.runs if row.throw else ():
+            if run.place in best[row.regime]:
+                assert run.action == best[row.regime][run.place]
+
+
+def test_parquet_where_pyarrow_is_there(conduct: Conduct) -> None:
+    """The same rows and columns as the CSV file; without pyarrow nothing is written."""
+    from petrobot.coordinator.studies.campaign.table import write_parquet
+
+    campaign = conduct("a")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
+    written = write_parquet(campaign.folder)
+    assert written is not None
+    table_ = parquet.read_table(written)
+    header = table(campaign.folder).split(b"\n")[0].decode().split(",")
+    assert table_.column_names == header
+    assert table_.column("n").to_pylist() == list(range(1, 13))
+
+
+def test_an_action_that_cannot_be_loaded_is_bad_input(conduct: Conduct, tmp_path: Path) -> None:
+    """Named by the location file, not by a lost worker."""
+    other = tmp_path / "services.toml"
+    other.write_text(
+        SERVICES.read_text(encoding="utf-8").replace(
+            "toy_actions:prepare", "no_such_module:prepare"
+        ),
+        encoding="utf-8",
+    )
+    with pytest.raises(CampaignError, match="no_such_module"):
+        conduct("a", services=str(other), digests={"task": digest(TASK), "services": digest(other)})
+
+
+def test_j_is_made_with_the_target_and_rho_that_were_given(conduct: Conduct) -> None:
+    """Else with the target that the task file declares: cost is that of the hardest regime which
+    still reaches it."""
+    campaign = conduct("a", selector="round_robin", runs=240)
+    task, plan = campaign.bench.task, campaign.plan
+    assert (
+        campaign.result()["judged"]["look"]["target"] == 0.9
+    )  # declared, if only by leaving it out
+    sets = []
+    for options in ({}, {"target": 0.3}, {"target": 0.6}, {"target": 0.99}, {"rho": 0.25}):
+        summary = Summary.of(task, campaign.table.rows(), options=options)
+        result = result_of(campaign.folder, plan, summary, {})
+        judged, tallies = result["judged"]["look"], summary.estimates.of("look")
+        target = options.get("target", 0.9)
+        expected = compare(tallies, Question("wall", target, options.get("rho")))
+        assert (judged["cost"], judged["target"], judged["regimes"]) == (
+            "wall",
+            target,
+            ["easy", "rough"],
+        )
+        assert judged["rho"] == pytest.approx(expected.rho)
+        assert result["J"]["look"] == {
+            f.action: round(f.j, 6) if isfinite(f.j) else None for f in expected.figures
+        }
+        inside = {
+            a: [c for c, t in by.items() if t.interval()[0] >= target] for a, by in tallies.items()
+        }
+        assert judged["meet_target"] == {
+            a: list(map(regime_of, met)) for a, met in inside.items() if met
+        }
+        for f in expected.figures:
+            assert f.reliability == min(tally.reliability for tally in tallies[f.action].values())
+            if f.scenario is not None:
+                there = tallies[f.action][f.scenario]
+                assert there.reliability == min(
+                    tallies[f.action][c].reliability for c in inside[f.action]
+                )
+                assert f.cost == there.wall.mean
+        said = text_of({**result, "chosen": {"look": result["chosen"]["look"]}})
+        assert (f"no action surely reaches R {target:g}" in said) == (not judged["meet_target"])
+        assert (f"(below R {target:g})" in said) == (0 < len(judged["meet_target"]) < 3)
+        sets.append(sorted(map(len, inside.values())))
+    assert sets[1] == [2, 2, 2]  # the targets tell regimes and actions apart
+    assert sets[2] not in (sets[1], sets[3])
+    assert sets[3] == [0, 0, 0]
+    one = comparisons(task, summary.estimates.tallies, "rough")["look"]
+    assert one.scenarios == ("regime=rough",)
+    assert all(f.admissible for f in one.figures), (
+        "in one regime the declared target rules nobody out"
+    )
+
+
+COUNTING = """
+schema = 1
+[actions.look_quick]
+values = { hard = false }
+[actions.look_twice]
+values = { hard = false, count = 2 }
+[actions.look_long]
+values = { hard = false, count = 16 }
+[actions.grip_soft]
+values = { force = 1.0 }
+[actions.grip_hard]
+values = { force = 4.0 }
+"""
+
+
+def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
+    conduct: Conduct, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Declared in the task file: how many images a run averaged, as it reports, 1 where it reports
+    nothing."""
+    monkeypatch.chdir(tmp_path)
+    text = TASK.read_text(encoding="utf-8").replace('"look_long"]', '"look_long"]\ncost = "count"')
+    (task := tmp_path / "fetch.toml").write_text(text, encoding="utf-8")
+    (mock := tmp_path / "mock.toml").write_text(COUNTING, encoding="utf-8")
+    digests = {
+        key: digest(path) for key, path in (("task", task), ("services", SERVICES), ("mock", mock))
+    }
+    counted = {"look_quick": 1.0, "look_twice": 2.0, "look_long": 16.0}
+    campaign = conduct("a", task=str(task), mock=str(mock), digests=digests, selector="round_robin")
+    for row in campaign.table.rows():
+        assert row.throw is not None
+        assert row.throw.runs[0].cost == counted[row.throw.runs[0].action]
+    result = campaign.result()
+    assert result["judged"]["look"]["cost"] == "count"
+    assert result["J"]["look"] == {action: count / 16 for action, count in counted.items()}
+    told = [
+        "run",
+        str(task),
+        "--services",
+        str(SERVICES),
+        "--mode",
+        "lockstep",
+        "--mock",
+        str(mock),
+        "--quiet",
+    ]
+    assert main([*told, "--runs", "6", "--learn", "run.db", "--selector", "round_robin"]) == 0
+    for path in (Path("run.db"), Path(result["estimates"])):
+        kept = EstimatesFile(path).read()
+        assert kept.question("look") == Question("count", 0.9)
+        for action, by_context in kept.estimates.of("look").items():
+            assert {tally.cost("count").mean for tally in by_context.values()} == {counted[action]}
+    learner = (
+        EstimatesFile(Path("run.db"))
+        .read()
+        .states("round_robin")["look"]["learners"]["regime=easy"]
+    )
+    assert learner["cost"] == [2 * count for count in counted.values()]
+
+
+@pytest.mark.parametrize("selector", ["random", "round_robin", "ucb1"])
+def test_learned_show_judges_as_the_campaign_did(
+    conduct: Conduct, selector: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the cost, the target and the rho that its estimates file holds, also if no selector
+    learned by them."""
+    monkeypatch.chdir(tmp_path)
+    options = {"target": 0.6, "rho": 0.2}
+    result = conduct("a", selector=selector, runs=120, options=options).result()
+    assert main(["learned", "show", result["estimates"], "--json", "shown.json"]) == 0
+    shown = json.loads(Path("shown.json").read_text(encoding="utf-8"))["primitive_tasks"]
+    assert shown["grip"]["cost"] == "value:force"
+    for task, actions in result["J"].items():
+        about = shown[task]
+        found = {
+            row["action"]: None if row["J"] is None else round(row["J"], 6)
+            for row in about["actions"]
+        }
+        assert found == actions
+        assert (about["target"], about["rho"]) == (0.6, 0.2)
+
+
+def test_a_damaged_estimates_file_says_that_it_can_be_made_again(conduct: Conduct) -> None:
+    """It is derived from the table; nobody's additions are wiped unasked."""
+    campaign = conduct("a")
+    path = Path(campaign.result()["estimates"])
+    whole = EstimatesFile(path).read().estimates
+    path.write_bytes(b"no database at all, but long enough to be looked at" * 9)
+    with pytest.raises(
+        CampaignError, match=r"not a database.*If it is removed, the same command makes it again"
+    ):
+        campaign.result()
+    path.unlink()
+    campaign.result()
+    assert EstimatesFile(path).read().estimates == whole
+
+
+def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> None:
+    """J is 1 - R then, which nobody would see."""
+    task = tmp_path / "fetch.toml"
+    task.write_text(
+        TASK.read_text(encoding="utf-8").replace("value:force", "value:forse"), encoding="utf-8"
+    )
+    campaign = conduct(
+        "a", task=str(task), runs=24, digests={"task": digest(task), "services": digest(SERVICES)}
+    )
+    result = campaign.result()
+    assert result["judged"]["grip"]["uncosted"] == ["grip_soft"]
+    result["chosen"]["grip"]["grip_hard"] = 1  # primitive tasks without a choice are not printed
+    assert "grip_soft: no run reported value:forse" in text_of(result)
+
+
+@pytest.mark.processes
+async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
+    tmp_path: Path, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its child holds its output and its input open; it ends with it."""
+    mark, program = tmp_path / "left", tmp_path / "worker"
+    program.write_text(
+        f"#!/bin/sh\nread plan\nsleep 3600 &\necho $! > {mark}\nread order\nkill -9 $$\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(program))
+    order = {"block": toy_plan.blocks[0].to_plain(), "weights": []}
+    async with asyncio.timeout(60.0), LocalPool(toy_plan, 1, tmp_path / "log") as pool:
+        with pytest.raises(CampaignError, match="ended 3 workers"):
+            await pool.run(order)
+        assert pool.lost == 3
+        left = int(mark.read_text())
+        while (
+            Path(f"/proc/{left}").exists() and " Z " not in Path(f"/proc/{left}/stat").read_text()
+        ):
+            await beat(0.01)

@@ -1,0 +1,215 @@
+"""What is written down of a throw: by scripted missions of the shipped task, and rows there and
+back."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from petrobot.coordinator.cli.loading import load_task
+from petrobot.coordinator.engine.instructions import Corrected
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.run.mission import Mission
+from petrobot.coordinator.studies.campaign.block import scores
+from petrobot.coordinator.studies.campaign.plan import Plan, identity
+from petrobot.coordinator.studies.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw, ThrowLog
+from petrobot.coordinator.task import Status
+from petrobot.coordinator.task.file import load
+from petrobot.services.action import Status as ActionStatus
+from petrobot.services.scripted import Line
+from tests.run.scripted_cell import directory_for, scripts
+from tests.studies.campaign.conftest import TASK
+
+TOY = load(TASK)
+
+
+def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[ThrowLog, Mission]:
+    """Throws of catch_ball with scripted actions."""
+    task = load_task("catch_ball")
+    cell, party = lockstep_cell(directory_for(task), Setting(task, runs=runs), scripts(task, lines))
+    log = ThrowLog(task, lambda record, values: record.seconds)
+    party.mission.executor.observers.append(log)
+    assert cell.run(lambda: party.over, 400_000)
+    return log, party.mission
+
+
+def test_a_throw_has_its_runs_and_what_took_them() -> None:
+    """Durations from the coming of the token; parallel runs both; the time ends when everything is
+    back."""
+    log, _ = logged(
+        {"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
+    )
+    assert len(log.throws) == 3
+    throw = log.throws[0]
+    by_place = {run.place: run for run in throw.runs}
+    assert [by_place[p].taken for p in ("locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home")] == [
+        "located", "tracked", "in_place", "missed", "homed",
+    ]  # fmt: skip
+    assert by_place["locate_ball"].seconds == pytest.approx(0.4, abs=0.01)
+    assert by_place["locate_ball"].took >= by_place["locate_ball"].seconds
+    assert by_place["locate_ball"].values == {"images": 20.0}
+    assert (
+        by_place["track_ball"].begun
+        == by_place["move_to_point"].begun
+        == pytest.approx(by_place["locate_ball"].took)
+    )
+    home = by_place["return_home"]
+    assert throw.time == pytest.approx(home.begun + home.took)
+    assert throw.waits[0][0] == "start" and 0 <= throw.waits[0][1] <= 0.05
+    assert throw.fired["located"] == 1 and throw.completed and throw.all_success
+
+
+def test_an_error_branch_belongs_to_its_throw() -> None:
+    """Recovery is part of the throw that needed it; the next one is clean."""
+    bad = Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="too far")
+    log, _ = logged({"move_to_point": [bad, Line(seconds=(0.2, 0.2)), Line(seconds=(0.2, 0.2))]})
+    first, second, _ = log.throws
+    assert (first.status, first.cause) == ("error", "unreachable")
+    assert first.fired["recovered"] == first.fired["arm_back"] == 1
+    assert first.completed and not first.all_success
+    assert second.status == "success" and "recovered" not in second.fired
+
+
+def test_giving_up_leaves_throws_unbegun() -> None:
+    """The last throw was begun and not completed; those after it never were."""
+    dead = [Line(ActionStatus.ERROR, (0.1, 0.1), cause="drive_fault")]
+    log, mission = logged({"move_to_point": dead, "recover_arm": dead}, runs=4)
+    assert len(log.throws) == 1 < mission.runs
+    assert not log.throws[0].completed and log.throws[0].time is None
+    assert log.throws[0].status == "error"
+
+
+def test_a_deferred_verdict_corrects_the_entry() -> None:
+    """Once, for the estimates."""
+    log, _ = logged({}, runs=1)
+    log.instruction(
+        9.0,
+        Corrected(
+            "locate_ball#1",
+            "locate_ball",
+            "locate_background",
+            Status.SUCCESS,
+            Status.FAILURE,
+            "late",
+        ),
+    )
+    runs = [run for run in log.throws[0].runs if run.place == "locate_ball"]
+    known = [key for key in log._entries if key.startswith("locate_ball")]
+    log.instruction(
+        9.0,
+        Corrected(known[0], "locate_ball", runs[0].action, Status.SUCCESS, Status.FAILURE, "late"),
+    )
+    assert (runs[0].status, runs[0].cause) == ("failure", "late")
+
+
+# --- rows -------------------------------------------------------------------------------------
+
+TEXT = st.text(st.characters(exclude_characters="\r", exclude_categories=["Cs"]), max_size=12)
+FINITE = st.floats(-1e6, 1e6).map(lambda x: round(x, 6))
+RUNS = st.builds(
+    RunEntry,
+    place=st.sampled_from(["look", "grip", "mend"]),
+    action=st.sampled_from(["look_quick", "grip_soft"]),
+    begun=FINITE,
+    took=FINITE,
+    status=st.sampled_from(["success", "failure", "error", ""]),
+    cause=TEXT,
+    text=TEXT,
+    seconds=FINITE,
+    cost=st.none() | FINITE,
+    values=st.dictionaries(TEXT, FINITE, max_size=2),
+)
+THROWS = st.builds(
+    Throw,
+    k=st.integers(1, 99),
+    begun=FINITE,
+    time=st.none() | FINITE,
+    completed=st.booleans(),
+    goals=st.integers(0, 3),
+    status=st.sampled_from(["success", "failure", "error"]),
+    cause=TEXT,
+    runs=st.lists(RUNS, max_size=3),
+    waits=st.lists(st.tuples(TEXT, FINITE), max_size=2),
+    fired=st.dictionaries(TEXT, st.integers(1, 3), max_size=2),
+)
+SCORES = st.dictionaries(
+    st.sampled_from(["t.x", "t.flag", "t.word"]),
+    st.booleans() | FINITE | st.integers(-5, 5) | st.sampled_from(["caught", 'a,b\n"c"']),
+)
+
+
+@given(THROWS | st.none(), SCORES, st.booleans())
+def test_rows_come_back_as_they_were(
+    throw: Throw | None, score: dict[str, Any], known: bool
+) -> None:
+    """Through CSV, whatever texts hold; results that the first block did not have travel in
+    `more`."""
+    row = Row(7, "easy", 1_000_000, throw.k if throw else 2, 1, 3.25, throw, score)
+    names = columns(TOY, [row] if known else [])
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerow(cells(TOY, row, names))
+    out.seek(0)
+    (record,) = csv.DictReader(io.StringIO(out.getvalue(), newline=""))
+    back = read_row(record)
+    assert back.throw == row.throw
+    assert back.score == row.score
+    assert (back.n, back.regime, back.seed, back.k, back.mission_s) == (
+        row.n,
+        row.regime,
+        row.seed,
+        row.k,
+        row.mission_s,
+    )
+
+
+def test_carriage_returns_do_not_break_the_table() -> None:
+    """They become newlines, which CSV quotes."""
+    row = Row(1, "", 1, 1, 0, 1.0, Throw(1, 0.0, cause="one\rtwo\r\nthree"))
+    names = columns(TOY, [])
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([names, cells(TOY, row, names)])
+    (record,) = csv.DictReader(io.StringIO(out.getvalue(), newline=""))
+    assert record["cause"] == "one\ntwo\nthree"
+
+
+@given(THROWS)
+def test_throws_travel_as_plain_data(throw: Throw) -> None:
+    """From a worker to the campaign."""
+    import json
+
+    assert Throw.from_plain(json.loads(json.dumps(throw.to_plain()))) == throw
+
+
+def test_scores_go_to_the_throw_that_they_are_of() -> None:
+    """By `run` where there is one, else by `n`; plain values serve a single throw."""
+    score = {
+        "balls": [
+            {"n": 1, "run": 2, "x": 0.5},
+            {"n": 2, "run": 3, "x": 0.7},
+            {"n": 3, "run": None, "x": 0.9},
+        ],
+        "parts": [{"n": 1, "y": 1.0}],
+        "seen": 3,
+    }
+    one, two, three = scores(score, 3)
+    assert one == {"parts.n": 1, "parts.y": 1.0}
+    assert two == {"balls.n": 1, "balls.x": 0.5}
+    assert three == {"balls.n": 2, "balls.x": 0.7}
+    assert scores({"time_s": 4.0, "track": {"a": 1}, "penalties": []}, 1) == [{"score.time_s": 4.0}]
+    assert scores({"time_s": 4.0}, 2) == [{}, {}]
+
+
+def test_identity_is_of_what_runs_not_where_it_lies(toy_plan: Plan) -> None:
+    """The same files elsewhere are the same campaign."""
+    from dataclasses import replace
+
+    assert identity(replace(toy_plan, task="/elsewhere.toml")) == identity(toy_plan)
+    assert identity(replace(toy_plan, seed=2)) != identity(toy_plan)

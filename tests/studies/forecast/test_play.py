@@ -1,0 +1,481 @@
+"""Playing a net: branches side by side, timers, conditions, loops, inhibitors and dead ends, each
+against what is known by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.forecast.choices import choices_of
+from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws
+from petrobot.coordinator.studies.forecast.history import Training
+from petrobot.coordinator.studies.forecast.net_arrays import Structure
+from petrobot.coordinator.studies.forecast.play import Play, Played
+from petrobot.coordinator.task.file import loads
+
+HEAD = """
+schema = 1
+[task]
+name = "net"
+{task}
+[primitive_tasks.a]
+goal = "a"
+alternatives = ["run_a"]
+deadline = 99.0
+[primitive_tasks.b]
+goal = "b"
+alternatives = ["run_b"]
+deadline = 99.0
+[places.jobs]
+kind = "control"
+tokens = 1
+[places.a]
+kind = "action"
+task = "a"
+[places.b]
+kind = "action"
+task = "b"
+[places.end]
+kind = "control"
+"""
+
+
+def play(
+    text: str,
+    throws: list[Throw],
+    n: int = 2000,
+    task: str = 'final = "end == 1"\nruns_place = "jobs"',
+) -> Played:
+    """Throws of a task played from what was measured."""
+    training = Training.of(loads(HEAD.replace("{task}", task) + text, "net.toml"), throws)
+    random = np.random.default_rng(1)
+    drawer = Drawer(Laws(training), training.waits, np.ones((1, len(throws))), random)
+    return Play(
+        Structure.of(training.task), drawer, choices_of(training), np.zeros(n, np.int64)
+    ).run()
+
+
+def entry(
+    place: str, took: float, status: str = "success", taken: str = "", **more: Any
+) -> RunEntry:
+    """A run that ended."""
+    return RunEntry(place, f"run_{place}", 0.0, took, status, taken=taken, **more)
+
+
+FORK = """
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.join]
+in = ["a:normal", "b:normal"]
+out = ["end"]
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+
+
+def test_side_by_side_takes_the_longer_one() -> None:
+    """Uniform on 1, 3 beside 2: the time is 2 or 3, half each."""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")])
+        for took in (1.0, 3.0)
+    ]
+    played = play(FORK, throws)
+    assert set(played.time.tolist()) == {2.0, 3.0}
+    assert np.mean(played.time == 3.0) == pytest.approx(0.5, abs=0.05)
+    assert played.completed.all() and played.all_success.all()
+
+
+def test_what_its_runs_chose_decides_between_exits_of_one_status() -> None:
+    """Two normal exits with a condition on a variable: taken as often as they were, with the
+    durations that went with each."""
+    text = """
+[variables.found]
+type = "bool"
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.yes]
+in = ["a:normal"]
+out = ["b"]
+when = "found"
+[transitions.no]
+in = ["a:normal"]
+out = ["end"]
+when = "not found"
+[transitions.lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    yes = [
+        Throw(
+            1,
+            0.0,
+            runs=[
+                entry("a", 1.0, taken="yes"),
+                RunEntry("b", "run_b", 1.0, 5.0, "failure", taken="done"),
+            ],
+        )
+    ]
+    no = [Throw(1, 0.0, runs=[entry("a", 2.0, taken="no")])]
+    played = play(text, yes + no * 3)
+    assert set(played.time.tolist()) == {2.0, 6.0}
+    assert np.mean(played.time == 6.0) == pytest.approx(0.25, abs=0.04)
+    assert (played.all_success == (played.time == 2.0)).all()
+
+
+LOOP = """
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.done]
+in = ["a:normal"]
+out = ["end"]
+[transitions.again]
+in = ["a:error"]
+out = ["a"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+
+
+def test_a_loop_is_geometric() -> None:
+    """Tried again with probability 1/2 each time: mean number of runs 2."""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
+        Throw(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
+    ]
+    played = play(LOOP, throws, 5000)
+    assert played.time.mean() == pytest.approx(2.0, abs=0.08)
+    assert np.mean(played.time == 1.0) == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
+    """Always interrupted twice, then done: the number of runs before is a context of its own."""
+    runs = [
+        RunEntry(
+            "a",
+            "run_a",
+            float(k),
+            1.0,
+            "error" if k < 2 else "success",
+            taken="again" if k < 2 else "done",
+        )
+        for k in range(3)
+    ]
+    played = play(LOOP, [Throw(1, 0.0, runs=runs)] * 60)
+    assert set(played.time.tolist()) == {3.0}
+
+
+def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
+    """Five of 65 are interrupted a third time, and then done: nobody goes round for ever."""
+
+    def rounds(n: int) -> Throw:
+        ends = [("error", "again")] * (n - 1) + [("success", "done")]
+        return Throw(
+            1,
+            0.0,
+            runs=[
+                RunEntry("a", "run_a", float(k), 1.0, s, taken=t) for k, (s, t) in enumerate(ends)
+            ],
+        )
+
+    played = play(LOOP, [rounds(3)] * 60 + [rounds(4)] * 5)
+    assert played.completed.all()
+    assert played.time.mean() == pytest.approx((60 * 3 + 5 * 4) / 65, abs=0.05)
+
+
+def test_branches_that_go_in_step_are_told_apart_by_their_own_rounds() -> None:
+    """Rounds of either branch tell those of the other in every throw that was run; where they are
+    played they drift apart."""
+    text = """
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.a_again]
+in = ["a:error"]
+out = ["a"]
+[transitions.b_again]
+in = ["b:error"]
+out = ["b"]
+[transitions.done]
+in = ["a:normal", "b:normal"]
+out = ["end"]
+"""
+    random = np.random.default_rng(1)
+    throws = []
+    for _ in range(60):
+        runs = []
+        for k, drift in enumerate(random.uniform(-0.3, 0.3, 3)):
+            for place, begun in (("a", 2.0 * k), ("b", 2.0 * k + 0.5)):
+                end = ("error", f"{place}_again") if k < 2 else ("success", "done")
+                runs.append(
+                    RunEntry(place, f"run_{place}", begun, 1.5 + drift, end[0], taken=end[1])
+                )
+        throws.append(Throw(1, 0.0, runs=runs))
+    training = Training.of(
+        loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws
+    )
+    found = {s["place"]: s["by"] for s in Laws(training).splits() if s["of"] == "outcome"}
+    assert found == {"a": "visits of a", "b": "visits of b"}
+    assert play(text, throws).completed.all()
+
+
+def test_timers_and_events_race() -> None:
+    """An event at 1 or 3 s against a timer of 2 s: half each; a timer that was never seen to fire
+    counts as it is declared."""
+    text = """
+[events.bell]
+scope = "external"
+memory = "pulse"
+[transitions.rung]
+in = ["jobs"]
+out = ["a"]
+event = "bell"
+[transitions.tired]
+in = ["jobs"]
+out = ["end"]
+after = 2.0
+[transitions.done]
+in = ["a:normal"]
+out = ["end"]
+[transitions.lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)])
+        for wait in (1.0, 3.0)
+    ]
+    played = play(text, throws, task='final = "end == 1"')
+    assert set(played.time.tolist()) == {5.0, 2.0}
+    assert np.mean(played.time == 2.0) == pytest.approx(0.5, abs=0.05)
+
+
+def test_giving_up_and_dead_ends_do_not_complete() -> None:
+    """final_error, and a marking in which nothing can happen any more."""
+    text = """
+[places.broken]
+kind = "resource"
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.done]
+in = ["a:normal", "!broken"]
+out = ["end"]
+[transitions.lost]
+in = ["a:error"]
+out = ["broken"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, "error", "lost")]),
+        *[Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")])] * 3,
+    ]
+    for ending in (
+        'final = "end == 1"\nfinal_error = "broken == 1"\nruns_place = "jobs"',
+        'final = "end == 1"\nruns_place = "jobs"',
+    ):
+        played = play(text, throws, task=ending)
+        assert np.mean(played.completed) == pytest.approx(0.75, abs=0.04)
+        assert np.isnan(played.time[~played.completed]).all()
+
+
+@pytest.mark.parametrize(("priority", "completes"), [(1, True), (0, False)])
+def test_a_preemption_of_higher_priority_takes_what_has_ended_too(
+    priority: int, completes: bool
+) -> None:
+    """a has ended and waits for b, which is lost: only a transition above the normal exits takes a
+    then, as in the engine."""
+    text = f"""
+[places.alarm]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.join]
+in = ["a:normal", "b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["alarm"]
+[transitions.drop]
+in = ["alarm", "a:preempt=none"]
+out = ["end"]
+priority = {priority}
+[transitions.a_lost]
+in = ["a:error", "alarm"]
+out = ["end"]
+"""
+    runs = [entry("a", 1.0, taken="drop"), entry("b", 2.0, "error", "b_lost")]
+    played = play(text, [Throw(1, 0.0, runs=runs)])
+    assert played.completed.all() == played.completed.any() == completes
+    assert not played.all_success.any()
+    assert played.ways.get("a", {}) == ({"drop": 2000} if completes else {})
+
+
+SERVERS = """
+[places.c]
+kind = "action"
+task = "a"
+servers = 2
+[transitions.c_done]
+in = ["c:normal"]
+out = ["end"]
+[transitions.c_lost]
+in = ["c:error"]
+out = ["end"]
+"""
+
+
+def test_several_servers_are_refused_with_a_remedy() -> None:
+    """Not silently wrong."""
+    with pytest.raises(ValueError, match="servers = 1"):
+        play(FORK + SERVERS, [Throw(1, 0.0, runs=[entry("a", 1.0), entry("b", 1.0)])])
+
+
+def test_choices_without_a_single_action_are_refused() -> None:
+    """A place that is entered although nothing was measured there."""
+    with pytest.raises(ValueError, match="no action has a probability"):
+        play(FORK, [Throw(1, 0.0, runs=[entry("a", 1.0)])])
+
+
+@pytest.mark.parametrize(
+    ("threshold", "seconds"), [("busy", 3.0), ("busy*2", 2.0), ("busy*3", 1.0)]
+)
+def test_an_inhibitor_holds_back_until_its_place_holds_less(threshold: str, seconds: float) -> None:
+    """a ends after 1 s; b empties busy in steps, after 2 and 3 s; what `!busy*k` inhibits fires
+    when fewer than k are left."""
+    text = """
+[places.busy]
+kind = "control"
+[places.half]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b", "busy*2"]
+[transitions.done]
+in = ["a:normal", "!{threshold}"]
+out = ["end"]
+[transitions.first]
+in = ["b:normal", "busy"]
+out = ["half"]
+[transitions.second]
+in = ["half", "busy"]
+out = []
+after = 1.0
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
+    played = play(text.replace("{threshold}", threshold), throws, n=20)
+    assert played.time.tolist() == [seconds] * 20
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "late"),
+    [("weight = 3.0", "weight = 1.0", 0.25), ("priority = 1", "", 0.0), ("", "priority = 1", 1.0)],
+)
+def test_priority_decides_between_two_that_can_fire_then_weight(
+    left: str, right: str, late: float
+) -> None:
+    """The left way ends at once, the right one a second later."""
+    text = """
+[places.fork]
+kind = "control"
+[places.detour]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.done]
+in = ["a:normal"]
+out = ["fork"]
+[transitions.left]
+in = ["fork"]
+out = ["end"]
+{left}
+[transitions.right]
+in = ["fork"]
+out = ["detour"]
+{right}
+[transitions.back]
+in = ["detour"]
+out = ["end"]
+after = 1.0
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")])]
+    played = play(text.replace("{left}", left).replace("{right}", right), throws)
+    assert set(played.time.tolist()) <= {1.0, 2.0}
+    assert np.mean(played.time == 2.0) == pytest.approx(late, abs=0.04)
+
+
+def test_an_arc_of_weight_two_waits_for_both_tokens() -> None:
+    """a ends after 1 s and b after 2 s; each leaves one token, and the end takes two."""
+    text = """
+[places.parts]
+kind = "control"
+[transitions.begin]
+in = ["jobs"]
+out = ["a", "b"]
+[transitions.a_done]
+in = ["a:normal"]
+out = ["parts"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["parts"]
+[transitions.both]
+in = ["parts*2"]
+out = ["end"]
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+    throws = [
+        Throw(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])
+    ]
+    assert play(text, throws, n=20).time.tolist() == [2.0] * 20

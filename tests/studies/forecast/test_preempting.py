@@ -1,0 +1,483 @@
+"""Runs that are preempted because another one has ended: the net says when, what they would have
+come to is censored.
+
+Truth is known here: two runs begin together, each draws how and when it would end, and the first
+end takes the other run.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from petrobot.coordinator.analysis.time.stochastic import is_cause, stochastic_view
+from petrobot.coordinator.learning.propagation import incidences, propagate, unended
+from petrobot.coordinator.studies.campaign.observed import estimates_of
+from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.forecast.choices import choices_of
+from petrobot.coordinator.studies.forecast.distributions import Laws, with_weights
+from petrobot.coordinator.studies.forecast.history import NONE, Training
+from petrobot.coordinator.studies.forecast.net_arrays import Structure
+from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
+from petrobot.coordinator.studies.forecast.residual import measured
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file import loads
+
+HEAD = """
+schema = 1
+[task]
+name = "scan"
+goal_transitions = ["found"]
+runs_place = "parts"
+final = "parts == 0 and idle == 1"
+[primitive_tasks.locate]
+goal = "located"
+alternatives = ["locate_a"]
+deadline = 9.0
+[primitive_tasks.watch]
+goal = "watched"
+alternatives = ["watch_a"]
+deadline = 9.0
+[events.bell]
+scope = "external"
+memory = "pulse"
+mean_wait = 1.0
+[variables.dark]
+type = "bool"
+[places.parts]
+kind = "control"
+tokens = 4
+[places.idle]
+kind = "resource"
+tokens = 1
+[places.locate]
+kind = "action"
+task = "locate"
+[places.watch]
+kind = "action"
+task = "watch"
+[transitions.next]
+in = ["parts", "idle"]
+out = ["watch", "locate"]
+"""
+
+ONE_WAY = (
+    HEAD
+    + """
+[transitions.found]
+in = ["locate:normal", "watch:preempt=none"]
+out = ["idle"]
+[transitions.lost]
+in = ["locate:error", "watch:preempt=none"]
+out = ["idle"]
+[transitions.found_late]
+in = ["locate:normal", "watch:normal"]
+out = ["idle"]
+[transitions.lost_late]
+in = ["locate:error", "watch:normal"]
+out = ["idle"]
+[transitions.found_blind]
+in = ["locate:normal", "watch:error"]
+out = ["idle"]
+[transitions.lost_blind]
+in = ["locate:error", "watch:error"]
+out = ["idle"]
+"""
+)
+"""Watching ends with locating at the latest; locating is never preempted."""
+
+BOTH_WAYS = (
+    HEAD
+    + """
+[transitions.found]
+in = ["locate:normal", "watch:preempt=none"]
+out = ["idle"]
+[transitions.lost]
+in = ["locate:error", "watch:preempt=none"]
+out = ["idle"]
+[transitions.late]
+in = ["locate:preempt=failure", "watch:normal"]
+out = ["idle"]
+[transitions.late_blind]
+in = ["locate:preempt=failure", "watch:error"]
+out = ["idle"]
+"""
+)
+"""Whichever ends first preempts the other."""
+
+
+def one_way(random: np.random.Generator, slow: float = 1.0) -> Throw:
+    """A throw of ONE_WAY: locating 0.5 to 1.5 s, watching exponential of `slow` s."""
+    locate, watch = random.uniform(0.5, 1.5), random.exponential(slow)
+    status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
+    seen = "success" if random.random() < 0.8 else "failure"
+    stem = "lost" if status == "error" else "found"
+    if watch > locate:
+        other = RunEntry(
+            "watch", "watch_a", 0.0, locate, "", taken=stem, cancelled=True, seconds=locate
+        )
+    else:
+        stem += "_late"
+        other = RunEntry("watch", "watch_a", 0.0, watch, seen, taken=stem, seconds=watch)
+    own = RunEntry("locate", "locate_a", 0.0, locate, status, taken=stem, seconds=locate)
+    return Throw(
+        1, 0.0, locate, True, int(stem == "found"), runs=[other, own], fired={"next": 1, stem: 1}
+    )
+
+
+def both_ways(random: np.random.Generator) -> Throw:
+    """A throw of BOTH_WAYS with the same laws."""
+    locate, watch = random.uniform(0.5, 1.5), random.exponential(1.0)
+    status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
+    if locate < watch:
+        taken = "lost" if status == "error" else "found"
+        runs = [
+            RunEntry("locate", "locate_a", 0.0, locate, status, taken=taken, seconds=locate),
+            RunEntry(
+                "watch", "watch_a", 0.0, locate, "", taken=taken, cancelled=True, seconds=locate
+            ),
+        ]
+    else:
+        taken, seen = "late", "success" if random.random() < 0.8 else "failure"
+        runs = [
+            RunEntry(
+                "locate",
+                "locate_a",
+                0.0,
+                watch,
+                "failure",
+                taken=taken,
+                cancelled=True,
+                seconds=watch,
+            ),
+            RunEntry("watch", "watch_a", 0.0, watch, seen, taken=taken, seconds=watch),
+        ]
+    return Throw(
+        1,
+        0.0,
+        min(locate, watch),
+        True,
+        int(taken == "found"),
+        runs=runs,
+        fired={"next": 1, taken: 1},
+    )
+
+
+def throws_of(make: object, n: int, seed: int) -> list[Throw]:
+    """n throws."""
+    random = np.random.default_rng(seed)
+    assert callable(make)
+    return [make(random) for _ in range(n)]
+
+
+FIRST = math.exp(-0.5) - math.exp(-1.5)
+"""Probability that a uniform time on 0.5, 1.5 comes before an exponential one of mean 1: the
+integral of exp(-t)."""
+
+
+@pytest.mark.parametrize(
+    ("text", "make", "goal", "conj"),
+    [
+        pytest.param(
+            ONE_WAY, one_way, 0.9 * FIRST, 0.6 * (FIRST + 0.8 * (1 - FIRST)), id="one way"
+        ),
+        pytest.param(BOTH_WAYS, both_ways, 0.9 * FIRST, 0.6 * FIRST, id="both ways"),
+    ],
+)
+def test_what_another_end_preempts_is_forecast_as_it_happens(
+    text: str, make: object, goal: float, conj: float
+) -> None:
+    """Against closed forms, within what 3,000 training throws tell; and played throws do not differ
+    from the training's."""
+    task = loads(text, "scan.toml")
+    training = Training.of(task, throws_of(make, 3000, 1))
+    made = predict(training, Request(400, choices_of(training), replicates=40, point=20_000))
+    found, own = made["figures"], figures(measured(training))
+    assert found["R_goal"]["value"] == pytest.approx(goal, abs=0.03)
+    assert found["R_conj"]["value"] == pytest.approx(conj, abs=0.03)
+    assert found["P_complete"]["value"] == 1.0
+    assert found["mean"]["value"] == pytest.approx(own["mean"], rel=0.02)
+    assert found["q90"]["value"] == pytest.approx(own["q90"], rel=0.02)
+    assert made["doubts"] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "make", "conj"),
+    [
+        pytest.param(ONE_WAY, one_way, 0.6 * (FIRST + 0.8 * (1 - FIRST)), id="one way"),
+        pytest.param(BOTH_WAYS, both_ways, 0.6 * FIRST, id="both ways"),
+    ],
+)
+def test_the_stochastic_view_preempts_when_the_other_has_ended(
+    text: str, make: object, conj: float
+) -> None:
+    """It always completes, and what is preempted has not ended as it was drawn to; phase-type
+    durations cost it some points."""
+    task = loads(text, "scan.toml")
+    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws_of(make, 1500, 2))]
+    task = replace(task, runs_place="parts")
+    found = propagate(task, estimates_of(task, rows, "t"))
+    assert found.complete == pytest.approx(1.0, abs=1e-9)
+    assert found.goal == pytest.approx(0.9 * FIRST, abs=0.06)  # 512 runs of a sample, and phases
+    assert found.conjunctive ** (1 / 4) == pytest.approx(conj, abs=0.06)  # of all four tokens
+
+
+def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
+    """All its runs were cut off: it goes on until it is preempted, whatever the other one takes."""
+    task = loads(ONE_WAY, "scan.toml")
+    throws = [one_way(np.random.default_rng(seed), 1e9) for seed in range(400)]
+    training = Training.of(task, throws)
+    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
+    assert made["figures"]["P_complete"]["value"] == 1.0
+    assert made["figures"]["R_goal"]["value"] == pytest.approx(
+        np.mean([t.goals for t in throws]), abs=0.02
+    )
+    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
+    assert propagate(task, estimates_of(task, rows, "t")).complete == pytest.approx(1.0, abs=1e-9)
+
+
+def test_what_was_never_seen_is_told() -> None:
+    """Nothing else takes the run now, so it goes on for longer than any that was seen: the forecast
+    says that it is doubtful."""
+    alone = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]')
+    text = (
+        alone
+        + """
+[transitions.stop]
+in = ["idle", "locate:normal", "watch:preempt=none"]
+out = ["idle"]
+[transitions.found]
+in = ["watch:normal"]
+out = ["idle"]
+[transitions.lost]
+in = ["watch:error"]
+out = ["idle"]
+"""
+    )
+    random = np.random.default_rng(1)
+    runs = [(min(0.5, t), t < 0.5) for t in random.exponential(1.0, 300)]
+    throws = [
+        Throw(
+            1,
+            0.0,
+            t,
+            True,
+            int(ended),
+            runs=[RunEntry("watch", "watch_a", 0.0, t, "success" if ended else "")],
+        )
+        for t, ended in runs
+    ]
+    training = Training.of(loads(text, "scan.toml"), throws)
+    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
+    assert any("watch" in doubt and "longer" in doubt for doubt in made["doubts"]), made["doubts"]
+
+
+# --- what is a cause --------------------------------------------------------------------------
+
+EVENTS = """
+[transitions.rung]
+in = ["watch:preempt=none"{more}]
+out = ["idle"]
+{how}
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "how", "cause"),
+    [
+        ("", 'event = "bell"', True),
+        ("", "after = 1.0", True),
+        (', "idle"', 'event = "bell"', True),
+        (', "idle"', "", False),
+        (', "locate:normal"', "", False),
+        (', "locate:normal"', "after = 1.0", False),
+    ],
+)
+def test_causes_are_events_and_timers_that_take_one_run(more: str, how: str, cause: bool) -> None:
+    """Everything else follows from the marking."""
+    task = loads(ONE_WAY + EVENTS.format(more=more, how=how), "scan.toml")
+    assert is_cause(task.flat.transitions["rung"]) is cause
+    move = next(m for m in Structure.of(task).moves if m.name == "rung")
+    assert move.cause is cause
+
+
+@pytest.mark.parametrize(
+    ("more", "how", "why"),
+    [
+        (
+            ', "locate:normal"',
+            'event = "bell"',
+            "transitions.rung: forecasts know an event that preempts one run",
+        ),
+        (
+            ', "locate:preempt=none"',
+            'event = "bell"',
+            "transitions.rung: forecasts know an event that preempts one run",
+        ),
+        ("", 'when = "dark"', "transitions.rung: when it preempts is decided by variables alone"),
+    ],
+)
+def test_what_cannot_be_forecast_truly_is_refused_by_name(more: str, how: str, why: str) -> None:
+    """Rather than forecast wrongly."""
+    task = loads(ONE_WAY + EVENTS.format(more=more, how=how), "scan.toml")
+    with pytest.raises(ValueError, match=why):
+        Structure.of(task)
+
+
+def test_an_event_that_preempts_and_counts_none_happens() -> None:
+    """Such runs are a way to end, not mere cut-offs: half of them ring at 1 s, half end at 2 s."""
+    text = HEAD.replace('out = ["watch", "locate"]', 'out = ["watch"]') + EVENTS.format(
+        more="", how='event = "bell"'
+    )
+    text += """
+[transitions.found]
+in = ["watch:normal"]
+out = ["idle"]
+[transitions.lost]
+in = ["watch:error"]
+out = ["idle"]
+[transitions.located]
+in = ["locate:normal"]
+out = ["idle"]
+[transitions.not_located]
+in = ["locate:error"]
+out = ["idle"]
+"""
+    ends = (("", 1.0, "rung"), ("success", 2.0, "found"))
+    throws = [
+        Throw(
+            1,
+            0.0,
+            took,
+            True,
+            int(taken == "found"),
+            runs=[RunEntry("watch", "watch_a", 0.0, took, status, taken=taken)],
+        )
+        for status, took, taken in ends
+    ] * 50
+    for throw in throws:
+        throw.runs[0].cancelled = throw.runs[0].taken == "rung"
+    training = Training.of(loads(text, "scan.toml"), throws)
+    made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))[
+        "figures"
+    ]
+    assert made["R_goal"]["value"] == pytest.approx(0.5, abs=0.03)
+    assert made["mean"]["value"] == pytest.approx(1.5, abs=0.03)
+
+
+def test_a_timer_over_two_runs_fires_once_for_both() -> None:
+    """At 1.02 s, as measured, not at the declared 1 s: whichever run goes on then, and only if both
+    do."""
+    text = (
+        BOTH_WAYS
+        + """
+[transitions.dog]
+in = ["locate:preempt=failure", "watch:preempt=none"]
+out = ["idle"]
+after = 1.0
+"""
+    )
+    random = np.random.default_rng(7)
+    throws = []
+    for throw in throws_of(both_ways, 1500, 8):
+        if throw.time is not None and throw.time > 1.02:
+            runs = [
+                RunEntry(
+                    "locate",
+                    "locate_a",
+                    0.0,
+                    1.02,
+                    "failure",
+                    taken="dog",
+                    cancelled=True,
+                    seconds=1.02,
+                ),
+                RunEntry(
+                    "watch", "watch_a", 0.0, 1.02, "", taken="dog", cancelled=True, seconds=1.02
+                ),
+            ]
+            random.shuffle(runs)
+            throw = Throw(1, 0.0, 1.02, True, 0, runs=runs, fired={"next": 1, "dog": 1})
+        throws.append(throw)
+    training = Training.of(loads(text, "scan.toml"), throws)
+    assert set(training.waits["dog"][0].round(9)) == {1.02}
+    made = predict(training, Request(400, choices_of(training), replicates=20, point=20_000))
+    own = figures(measured(training))
+    for name in ("R_goal", "R_conj"):
+        assert made["figures"][name]["value"] == pytest.approx(own[name], abs=0.02)
+    assert made["figures"]["mean"]["value"] == pytest.approx(own["mean"], rel=0.02)
+    assert made["figures"]["q90"]["value"] == pytest.approx(1.02)
+    assert made["doubts"] == []
+
+
+# --- censoring --------------------------------------------------------------------------------
+
+
+def test_weights_are_the_aalen_johansen_estimate() -> None:
+    """Against the estimator of the stochastic view, and the rest beyond the longest run against
+    Kaplan and Meier by hand."""
+    random = np.random.default_rng(3)
+    training = Training.of(loads(BOTH_WAYS, "scan.toml"), throws_of(both_ways, 200, 4))
+    for place in (0, 1):
+        runs = training.runs.of(training.runs.place == place)
+        runs = runs.of(random.permutation(len(runs)))
+        ended = with_weights(runs)
+        left = float(ended.weight[ended.outcome == NONE].sum())
+        causes = [None if c else str(o) for c, o in zip(runs.censored, runs.outcome, strict=True)]
+        for cause, law in incidences(runs.took.tolist(), causes).items():
+            own = ended.outcome == int(cause)
+            assert float(ended.weight[own].sum()) == pytest.approx(law.share * (1 - left), abs=1e-9)
+            assert float(np.average(ended.took[own], weights=ended.weight[own])) == pytest.approx(
+                law.mean, rel=1e-9
+            )
+        assert unended(runs.took.tolist(), causes) == pytest.approx((left, float(runs.took.max())))
+
+
+def test_beyond_the_longest_run_by_hand() -> None:
+    """An end at 1 s, cut off at 2 and 3 s: two thirds are left there, which a constant rate would
+    have left by 3 s."""
+    task = loads(ONE_WAY, "scan.toml")
+    runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
+    throws = [
+        Throw(
+            1,
+            0.0,
+            runs=[
+                RunEntry("watch", "watch_a", 0.0, took, status, taken=taken, cancelled=bool(taken))
+            ],
+        )
+        for status, took, taken in runs
+    ]
+    (context,) = Laws(Training.of(task, throws)).contexts.values()
+    assert context.law.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
+    assert context.law.beyond.tolist() == [False, True, True]
+    assert context.law.rate == pytest.approx(-math.log(2 / 3) / 3.0)
+
+
+def test_the_view_without_measurements_still_races(tmp_path: object) -> None:
+    """Before any run, declared estimates do: a preempting end needs no wait of its own."""
+    declared = ONE_WAY.replace(
+        "[primitive_tasks.watch]",
+        "[primitive_tasks.locate.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
+        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 "
+        "}\n[primitive_tasks.watch]",
+    ).replace(
+        "[events.bell]",
+        "[primitive_tasks.watch.estimates]\nsuccess = { share = 1.0, mean = 1.0, cv = 1.0 }\n"
+        "failure = { share = 0.0, mean = 0.0 }\nerror = { share = 0.0, mean = 0.0 }\n[events.bell]",
+    )
+    from petrobot.coordinator.analysis.time.task_forecast import forecast
+
+    found = forecast(stochastic_view(loads(declared, "scan.toml")))
+    assert found.goal_reliability == pytest.approx(0.5, abs=1e-6)
+
+
+def test_tasks_are_as_these_tests_take_them() -> None:
+    """Both are read, and neither is refused."""
+    for text in (ONE_WAY, BOTH_WAYS):
+        task: Task = loads(text, "scan.toml")
+        assert Structure.of(task).moves

@@ -1,0 +1,62 @@
+"""When a forecast counts as doubtful: by more than chance, and by more than matters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from petrobot.coordinator.studies.forecast.history import Training
+from petrobot.coordinator.studies.forecast.play import Played
+from petrobot.coordinator.studies.forecast.residual import doubts, measured, residuals, routing
+from petrobot.coordinator.task.file import loads
+from tests.studies.forecast.test_preempting import ONE_WAY, one_way, throws_of
+
+NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0))
+
+
+@pytest.mark.parametrize(
+    ("of", "p", "off", "doubtful"),
+    [
+        ("goal", 1e-9, 0.019, False),
+        ("goal", 1e-9, 0.021, True),
+        ("goal", 0.02, 0.3, False),
+        ("ways out of watch", 1e-3, 0.1, True),
+        ("time", 1e-9, 0.04, False),
+        ("time", 1e-9, 0.06, True),
+        ("mean time", 1e-9, 0.04, False),
+        ("mean time", 1e-9, 0.06, True),
+    ],
+)
+def test_doubts_need_chance_ruled_out_and_a_difference_that_matters(
+    of: str, p: float, off: float, doubtful: bool
+) -> None:
+    """With many throws any model differs somewhere by more than chance; with few, a large
+    difference may be chance."""
+    said = doubts([{"of": of, "p": p, "p_holm": p, "off": off}], NOTHING, 1000)
+    assert bool(said) == doubtful
+    assert not said or of in said[0]
+
+
+def test_how_far_off_is_the_largest_difference_of_shares_and_the_relative_one_of_means() -> None:
+    """Throws played exactly as they were run, then some that miss a goal and all that last
+    longer."""
+    training = Training.of(loads(ONE_WAY, "scan.toml"), throws_of(one_way, 1000, 3))
+    real = measured(training)
+    same = replace(real, ways=routing(training))
+    assert all(row["off"] == 0.0 and row["p_holm"] == 1.0 for row in residuals(training, same))
+    reached = np.flatnonzero(real.goals > 0)
+    goals = real.goals.copy()
+    goals[reached[:150]] = 0
+    found = {
+        row["of"]: row
+        for row in residuals(training, replace(same, goals=goals, time=real.time * 1.2))
+    }
+    assert found["goal"]["off"] == pytest.approx(0.15)
+    assert found["mean time"]["off"] == pytest.approx(0.2)
+    assert found["complete"]["off"] == 0.0
+    said = doubts(list(found.values()), same, 1000)
+    assert any("goal, off by 15.0%" in one for one in said) and any(
+        "mean time" in one for one in said
+    )

@@ -1,0 +1,164 @@
+"""The designer's analysis in a process of its own: what it says, and how it ends when it takes too
+long."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from petrobot.coordinator import background as analysing
+from petrobot.coordinator.background import Apart, RefusedError, Superseded, analyse_apart, analysed
+from tests.waiting import until
+
+CATCH_BALL = (Path(analysing.__file__).parent / "tasks" / "catch_ball.toml").read_text(
+    encoding="utf-8"
+)
+
+
+@pytest.mark.processes
+async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
+    answer = await analyse_apart(CATCH_BALL, "catch_ball.toml")
+    assert answer["complete"] is True
+    assert {"bounded", "sound", "controllable"} <= {
+        verdict["name"] for verdict in answer["verdicts"]
+    }
+    assert set(answer["heat"]) >= {"locate_ball", "track_ball"}, (
+        "the last line is the fullest: with the forecast"
+    )
+
+
+@pytest.mark.processes
+async def test_a_text_that_is_no_task_is_refused_with_its_fault() -> None:
+    with pytest.raises(ValueError, match=r"drawn\.toml"):
+        await analyse_apart("schema = 1\n[task]\n", "drawn.toml")
+
+
+def test_a_search_that_ran_out_of_time_leaves_verdicts_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(analysing, "SECONDS", 0.0)
+    monkeypatch.setattr(analysing, "STATES", 1 << 40)
+    answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml")
+    assert answer["complete"] is False
+    assert None in {verdict["holds"] for verdict in answer["verdicts"]}
+
+
+@pytest.mark.processes
+def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
+    """Not wall-clock time: a machine that is busy with a mission changes no verdict."""
+    spinning = (
+        "from itertools import repeat\n"
+        "from petrobot.coordinator import analysing\n"
+        "analysing.HARD_END = 0\n"
+        "analysing.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else "
+        "{'said': 1}\n"
+        "analysing.main()\n"
+    )
+    order = b'{"work": "analysis", "given": {"text": "", "filename": "drawn.toml"}}\n'
+    ended = subprocess.run(
+        [sys.executable, "-c", spinning],
+        input=order,
+        capture_output=True,
+        check=False,
+        timeout=240.0,
+    )
+    assert ended.returncode == -signal.SIGXCPU
+    assert ended.stdout == b'{"said": 1}\n', "what was known before is told"
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("said", ['{"said": 1}', ""])
+async def test_one_that_does_not_end_is_given_up(
+    said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It gets no processor time, or hangs: what it has said by then counts."""
+    mute = tmp_path / "mute"
+    mute.write_text(
+        f"#!/bin/sh\n{f'echo {said!r}' if said else ':'}\nexec tail -f /dev/null\n",
+        encoding="ascii",
+    )
+    mute.chmod(0o755)
+    monkeypatch.setattr("sys.executable", str(mute))
+    monkeypatch.setattr(analysing, "PATIENCE", 1.0)
+    if said:
+        assert await analyse_apart("", "drawn.toml") == {"said": 1}
+    else:
+        with pytest.raises(ValueError, match="took too long"):
+            await analyse_apart("", "drawn.toml")
+
+
+@pytest.fixture
+async def apart() -> AsyncIterator[Apart]:
+    made = Apart()
+    yield made
+    await made.close()
+
+
+FINDINGS = {"text": CATCH_BALL, "filename": "catch_ball.toml", "where": None}
+
+
+@pytest.mark.processes
+async def test_one_process_carries_out_orders_one_after_the_other(apart: Apart) -> None:
+    first = await apart.do("findings", FINDINGS)
+    process = apart.process
+    several = await asyncio.gather(*(apart.do("findings", FINDINGS) for _ in range(3)))
+    assert several == [first] * 3
+    assert apart.process == process is not None
+    with pytest.raises(RefusedError, match="no such run"):
+        await apart.do("run", {"folder": "nowhere", "run": "none"})
+    assert await apart.do("findings", FINDINGS) == first, "a refusal does not end it"
+
+
+@pytest.mark.processes
+async def test_it_stands_below_all_others_and_away_from_the_keyboard(apart: Apart) -> None:
+    await apart.do("findings", FINDINGS)
+    assert apart.process is not None
+    assert os.getpriority(os.PRIO_PROCESS, apart.process) >= 10
+    assert os.getpgid(apart.process) == apart.process, "Ctrl-C is for the coordinator"
+
+
+@pytest.mark.processes
+async def test_a_newer_drawing_takes_the_place_of_the_older_one(apart: Apart) -> None:
+    """Running or waiting, the older ones are given up at once; those of other desks and other work
+    are not."""
+    endless = {
+        "text": CATCH_BALL.replace("tokens = 4", "tokens = 4000"),
+        "filename": "catch_ball.toml",
+    }
+    first = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
+    await until(lambda: apart.process is not None, "its process to start")
+    other = asyncio.create_task(apart.do("findings", FINDINGS, "desk 2"))
+    second = asyncio.create_task(apart.do("analysis", endless, "desk 1"))
+    third = asyncio.create_task(apart.do("findings", FINDINGS, "desk 1"))
+    async with asyncio.timeout(60):
+        done = await asyncio.gather(first, other, second, third, return_exceptions=True)
+    assert [isinstance(each, Superseded) for each in done] == [True, False, True, False]
+
+
+@pytest.mark.processes
+async def test_one_that_was_killed_is_started_again(apart: Apart) -> None:
+    await apart.do("findings", FINDINGS)
+    assert apart.process is not None
+    os.kill(apart.process, signal.SIGKILL)
+    with contextlib.suppress(RefusedError):  # whoever asks first may find it dying
+        await apart.do("findings", FINDINGS)
+    assert json.loads(await apart.do("findings", FINDINGS)) is not None
+
+
+@pytest.mark.processes
+async def test_an_order_that_is_not_wanted_any_more_ends_its_process(apart: Apart) -> None:
+    order = asyncio.create_task(apart.do("findings", FINDINGS))
+    await until(lambda: apart.process is not None, "its process to start")
+    order.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await order
+    assert apart.process is None

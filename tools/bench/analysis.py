@@ -1,0 +1,440 @@
+"""Speed of the analysis beside other tools, in one run: states/s, firings/s, GSPN solve and
+completion times, with memory.
+
+    python -m tools.bench.analysis            # all of it; tools that are not installed are named
+                                              and skipped
+    python -m tools.bench.analysis --quick    # small nets only
+    python -m tools.bench.analysis --write docs/figures-analysis.md    # the table as a page, too
+
+Every measurement runs in a process of its own, so that its peak memory is its own; seconds are CPU
+seconds without imports and compilation. Only figures of one run are comparable: the ratios say how
+many times longer the other tool takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
+
+from petrobot.coordinator.task.net import Net  # noqa: E402 - the repository's root comes first
+from tests.analysis.generators import (  # noqa: E402
+    KANBAN_RATES,
+    fms,
+    kanban,
+    philosophers,
+    robot_cell,
+    shared_memory,
+)
+
+SPACES: dict[str, Callable[[], Net]] = {
+    "kanban-2": lambda: kanban(2),
+    "philosophers-10": lambda: philosophers(10),
+    "kanban-4": lambda: kanban(4),
+    "robot-cell-8": lambda: robot_cell(8, 3),
+    "shared-memory-10": lambda: shared_memory(10),
+    "fms-5": lambda: fms(5),
+    "kanban-5": lambda: kanban(5),
+    "robot-cell-8 of 5": lambda: robot_cell(8, 5),
+}
+"""Philosophers-10 and robot-cell-8 have some 50 places; the last has more than 5e6 markings."""
+OTHERS_SKIP = ("robot-cell-8 of 5",)
+"""Nets on which only our engines run: there the memory is what counts."""
+QUICK = ("kanban-2", "philosophers-10")
+SLOW_STATES = 3_000
+"""Markings after which the pure Python tools are stopped; their rate is what counts."""
+CAPACITY = 15
+"""Tokens that Storm is told a place may hold: more than any of these nets puts in one."""
+NEEDS = {"numba": "numba", "snakes": "snakes", "pm4py": "pm4py", "storm": "stormpy"}
+"""Packages behind engines and other tools."""
+
+
+def timed(work: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """CPU seconds of some work, with what it says: every tool here works in one thread, and others
+    may use the machine."""
+    start = time.process_time()
+    said = work()
+    return {"seconds": time.process_time() - start, **said}
+
+
+# State spaces.
+
+
+def space_ours(name: str, engine: str) -> dict[str, Any]:
+    """Our exploration by one engine."""
+    from petrobot.coordinator.analysis.net.space import explore
+
+    net = SPACES[name]()
+    explore(kanban(1), engine=engine)  # type: ignore[arg-type] # imports and compiles
+
+    def work() -> dict[str, Any]:
+        space = explore(net, engine=engine)  # type: ignore[arg-type]
+        return {"states": len(space), "edges": space.edges}
+
+    return timed(work)
+
+
+def space_snakes(name: str) -> dict[str, Any]:
+    """SNAKES, stopped after SLOW_STATES markings."""
+    from snakes.nets import MultiArc, PetriNet, Place, StateGraph, Transition, Value, dot  # type: ignore[import-not-found]
+
+    net, model = SPACES[name](), PetriNet("net")
+    for p, place in enumerate(net.places):
+        model.add_place(Place(place, [dot] * net.initial[p]))
+    for t, transition in enumerate(net.transitions):
+        model.add_transition(Transition(transition))
+        for arcs, add in ((net.consume[t], model.add_input), (net.produce[t], model.add_output)):
+            for p, w in arcs:
+                add(net.places[p], transition, Value(dot) if w == 1 else MultiArc([Value(dot)] * w))
+
+    def work() -> dict[str, Any]:
+        graph = StateGraph(model)
+        for _ in graph:
+            if len(graph) > SLOW_STATES:
+                break
+        return {"states": len(graph)}
+
+    return timed(work)
+
+
+def space_pm4py(name: str) -> dict[str, Any]:
+    """pm4py, by its own semantics; stopped after SLOW_STATES markings."""
+    from pm4py.objects.petri_net import semantics  # type: ignore[import-not-found]
+    from pm4py.objects.petri_net.obj import Marking, PetriNet  # type: ignore[import-not-found]
+    from pm4py.objects.petri_net.utils import petri_utils  # type: ignore[import-not-found]
+
+    net, model, first = SPACES[name](), PetriNet("net"), Marking()
+    places = [PetriNet.Place(p) for p in net.places]
+    for place, n in zip(places, net.initial, strict=True):
+        model.places.add(place)
+        if n:
+            first[place] = n
+    for t, transition in enumerate(net.transitions):
+        node = PetriNet.Transition(transition, transition)
+        model.transitions.add(node)
+        for p, w in net.consume[t]:
+            petri_utils.add_arc_from_to(places[p], node, model, weight=w)
+        for p, w in net.produce[t]:
+            petri_utils.add_arc_from_to(node, places[p], model, weight=w)
+
+    def work() -> dict[str, Any]:
+        seen, queue = {first}, [first]
+        while queue and len(seen) <= SLOW_STATES:
+            marking = queue.pop()
+            for t in semantics.enabled_transitions(model, marking):
+                after = semantics.weak_execute(t, marking)
+                if after not in seen:
+                    seen.add(after)
+                    queue.append(after)
+        return {"states": len(seen)}
+
+    return timed(work)
+
+
+def storm_model(net: Net, rates: dict[str, float]) -> Any:
+    """A GSPN in Storm."""
+    from stormpy import gspn  # type: ignore[import-not-found]
+
+    builder = getattr(gspn, "GspnBuilder", None) or gspn.GSPNBuilder  # renamed in stormpy 2
+    builder = builder()
+    places = [
+        builder.add_place(CAPACITY, n, p) for p, n in zip(net.places, net.initial, strict=True)
+    ]
+    for t, name in enumerate(net.transitions):
+        node = builder.add_timed_transition(0, rates.get(name, 1.0), 1, name)
+        for p, w in net.consume[t]:
+            builder.add_input_arc(places[p], node, w)
+        for p, w in net.produce[t]:
+            builder.add_output_arc(node, places[p], w)
+    return builder.build_gspn()
+
+
+def space_storm(name: str) -> dict[str, Any]:
+    """Storm: its explicit chain of the GSPN with unit rates."""
+    import stormpy
+
+    model = storm_jani(storm_model(SPACES[name](), {}))
+
+    def work() -> dict[str, Any]:
+        built = stormpy.build_model(model)
+        return {"states": built.nr_states, "edges": built.nr_transitions}
+
+    return timed(work)
+
+
+def storm_jani(model: Any) -> Any:
+    """Storm's symbolic description of a GSPN."""
+    from stormpy import gspn
+
+    if hasattr(gspn, "build_jani_model"):
+        return gspn.build_jani_model(model)[0]
+    return gspn.GSPNToJaniBuilder(model).build()
+
+
+# Stochastic.
+
+
+def firings_ours(name: str, engine: str) -> dict[str, Any]:
+    """Stochastic simulation of Kanban-2 by one engine."""
+    import numpy as np
+
+    from petrobot.coordinator.analysis.time.gspn import Gspn
+    from petrobot.coordinator.analysis.time.simulate import simulate
+
+    gspn, count = Gspn.of(kanban(2), KANBAN_RATES), 10_000_000 if engine == "numba" else 1_500_000
+    if engine == "numba":
+        simulate(gspn, np.random.default_rng(1), replicas=2, horizon=5.0, engine="numba")
+
+    def work() -> dict[str, Any]:
+        seen = simulate(
+            gspn, np.random.default_rng(1), replicas=2000, horizon=2500.0, firings=count, engine=engine,  # type: ignore[arg-type]
+        )  # fmt: skip
+        return {"firings": seen.firings}
+
+    return timed(work)
+
+
+def firings_snakes(name: str) -> dict[str, Any]:
+    """The token game of SNAKES on Kanban-2."""
+    from snakes.nets import PetriNet, Place, Transition, Value, dot
+
+    net, model = kanban(2), PetriNet("net")
+    for p, place in enumerate(net.places):
+        model.add_place(Place(place, [dot] * net.initial[p]))
+    for t, transition in enumerate(net.transitions):
+        model.add_transition(Transition(transition))
+        for p, _ in net.consume[t]:
+            model.add_input(net.places[p], transition, Value(dot))
+        for p, _ in net.produce[t]:
+            model.add_output(net.places[p], transition, Value(dot))
+
+    def work() -> dict[str, Any]:
+        fired = 0
+        while fired < 3000:
+            for node in model.transition():
+                modes = node.modes()
+                if modes:
+                    node.fire(modes[0])
+                    fired += 1
+        return {"firings": fired}
+
+    return timed(work)
+
+
+def long_run_ours(name: str, engine: str) -> dict[str, Any]:
+    """Build and solve the chain of a Kanban net."""
+    from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
+    from petrobot.coordinator.analysis.time.markov import long_run
+
+    gspn = Gspn.of(SPACES[name](), KANBAN_RATES)
+    import scipy.sparse.linalg  # noqa: F401 - its import is not to be measured
+
+    def work() -> dict[str, Any]:
+        run = long_run(Chain.of(gspn))
+        return {
+            "states": run.chain.n,
+            "residual": run.residual,
+            "throughput": run.throughput["tin1"],
+        }
+
+    return timed(work)
+
+
+def long_run_storm(name: str) -> dict[str, Any]:
+    """Storm: the long-run share of time that a place is marked."""
+    import stormpy
+
+    jani = storm_jani(storm_model(SPACES[name](), KANBAN_RATES))
+
+    def work() -> dict[str, Any]:
+        (formula,) = stormpy.parse_properties("LRA=? [ pkan1 > 0 ]", jani)
+        model = stormpy.build_model(jani, [formula])
+        found = stormpy.model_checking(model, formula)
+        value = getattr(found, "get_value", None) or found.at  # renamed in stormpy 2
+        return {"states": model.nr_states, "value": value(model.initial_states[0])}
+
+    return timed(work)
+
+
+def completion_ours(name: str, engine: str) -> dict[str, Any]:
+    """Mean time to completion and reliability of the shipped catching task, phases refined as in
+    `name` (stages-N)."""
+    from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
+    from petrobot.coordinator.analysis.time.completion import completion
+    from petrobot.coordinator.analysis.time.gspn import Chain
+    from petrobot.coordinator.analysis.time.stochastic import stochastic_view
+    from petrobot.coordinator.task.file import load
+
+    task = load(ROOT / "coordinator" / "tasks" / "catch_ball.toml")
+    ordinary, stages = OrdinaryView(task), int(name.split("-")[1])
+    view = stochastic_view(task, stages=stages, timer_stages=stages)
+    start = time.process_time()
+    chain = Chain.of(view.gspn)
+    goal = chain.space.where(ordinary.is_final) & ~chain.vanishing
+    _ = chain.graph.components, chain.graph.row, chain.probability
+    built = time.process_time() - start
+    said = timed(lambda: {"mean": completion(chain, goal).mean, "states": chain.n})
+    return said | {"build_seconds": built}
+
+
+MEASURES: dict[str, Callable[..., dict[str, Any]]] = {
+    "space": space_ours, "space-snakes": space_snakes, "space-pm4py": space_pm4py, "space-storm": space_storm,
+    "firings": firings_ours, "firings-snakes": firings_snakes,
+    "long-run": long_run_ours, "long-run-storm": long_run_storm, "completion": completion_ours,
+}  # fmt: skip
+
+
+def one(measure: str, name: str, engine: str) -> None:
+    """Run one measurement in this process and print it."""
+    work = MEASURES[measure]
+    said = work(name, engine) if engine else work(name)
+    print(
+        json.dumps(said | {"megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024})
+    )
+
+
+def measured(measure: str, name: str, engine: str = "") -> dict[str, Any] | None:
+    """One measurement in a process of its own; None if its tool is not installed or it failed (said
+    on the way)."""
+    tool = NEEDS.get(measure.rpartition("-")[2]) or NEEDS.get(engine)
+    if tool and find_spec(tool) is None:
+        print(f"{measure} {name}: {tool} is not installed, skipped")
+        return None
+    command = [sys.executable, str(Path(__file__)), "--one", measure, name, engine]
+    one_thread = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, check=False, env=one_thread
+    )
+    if done.returncode:
+        print(
+            f"{measure} {name}: failed: "
+            f"{done.stderr.strip().splitlines()[-1] if done.stderr else done.returncode}"
+        )
+        return None
+    said: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return said
+
+
+TOLD: list[str] = []
+"""What was printed, for --write."""
+
+
+def tell(text: str) -> None:
+    """Print a line and keep it."""
+    print(text, flush=True)
+    TOLD.append(text)
+
+
+def line(what: str, said: dict[str, Any], unit: str, reference: float | None) -> None:
+    """One line of the table; the ratio is against the reference rate."""
+    rate = said[unit] / said["seconds"]
+    ratio = f"{reference / rate:8.1f} x" if reference else " " * 10
+    tell(
+        f"  {what:22}{said[unit]:>11,} {unit:8}{said['seconds']:9.3f} s{rate:14,.0f} "
+        f"/s{ratio}{said['megabytes']:8.0f} MB"
+    )
+
+
+def bench_spaces(names: tuple[str, ...]) -> None:
+    """State spaces of all tools on all nets."""
+    for name in names:
+        net = SPACES[name]()
+        size = f"{len(net.places)} places, {len(net.transitions)} transitions"
+        tell(f"state space of {name}: {size} (ratio: how many times slower than numpy)")
+        reference = None
+        for what, measure, engine in (
+            ("numpy", "space", "numpy"), ("auto", "space", "auto"), ("integers", "space", "integers"),
+            ("numba", "space", "numba"), ("Storm", "space-storm", ""), ("SNAKES", "space-snakes", ""),
+            ("pm4py", "space-pm4py", ""),
+        ):  # fmt: skip
+            if (engine == "integers" and name not in QUICK) or (not engine and name in OTHERS_SKIP):
+                continue
+            said = measured(measure, name, engine)
+            if said:
+                reference = reference or said["states"] / said["seconds"]
+                line(what, said, "states", reference)
+
+
+def bench_stochastic(quick: bool) -> None:
+    """Firings, long runs and completion."""
+    tell("stochastic simulation of kanban-2 (ratio: how many times slower than numpy)")
+    reference = None
+    for what, measure, engine in (
+        ("numpy", "firings", "numpy"),
+        ("numba", "firings", "numba"),
+        ("SNAKES token game", "firings-snakes", ""),
+    ):
+        said = measured(measure, "kanban-2", engine)
+        if said:
+            reference = reference or said["firings"] / said["seconds"]
+            line(what, said, "firings", reference)
+    for name in ("kanban-2",) if quick else ("kanban-2", "kanban-4"):
+        tell(f"long run of {name}, build and solve")
+        ours, storm = measured("long-run", name, "auto"), measured("long-run-storm", name)
+        for what, said in (("numpy and scipy", ours), ("Storm", storm)):
+            if said:
+                line(what, said, "states", ours["states"] / ours["seconds"] if ours else None)
+    for name in ("stages-4",) if quick else ("stages-4", "stages-8", "stages-16"):
+        said = measured("completion", name, "auto")
+        if said:
+            tell(f"completion of the catching task, {name}: {said['states']:,} markings, " f"build {said['build_seconds']:.3f} s, "
+                  f"mean and probability {said['seconds']:.4f} s, {said['megabytes']:.0f} MB")  # fmt: skip
+
+
+def main() -> None:
+    """The whole table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="small nets only")
+    parser.add_argument(
+        "--write", type=Path, metavar="FILE", help="write what is printed as a page, too"
+    )
+    parser.add_argument(
+        "--one", nargs=3, metavar=("MEASURE", "NAME", "ENGINE"), help=argparse.SUPPRESS
+    )
+    options = parser.parse_args()
+    if options.one:
+        one(*options.one)
+        return
+    bench_spaces(QUICK if options.quick else tuple(SPACES))
+    bench_stochastic(options.quick)
+    if options.write:
+        options.write.write_text(page(), encoding="utf-8")
+
+
+def page() -> str:
+    """The figures as a page of docs/."""
+    versions = ", ".join(
+        f"{name} {version(name)}" for name in ("numpy", *NEEDS.values()) if find_spec(name)
+    )
+    machine = f"{os.cpu_count()} cores, Python {sys.version.split()[0]}, {versions}"
+    told = "\n".join(TOLD)
+    return (
+        "# Figures: the analysis beside other tools\n\n"
+        "Made by `python -m tools.bench.analysis --write docs/figures-analysis.md`, all "
+        "tools in one run, each measurement in a\n"
+        "process of its own: CPU seconds without imports and compilation, and the peak "
+        "memory of that process. Ratios hold\n"
+        f"elsewhere, seconds do not ({machine}). SNAKES and pm4py are stopped after "
+        f"{SLOW_STATES:,} markings: their\n"
+        "rate counts.\n\n"
+        f"```\n{told}\n```\n"
+    )
+
+
+if __name__ == "__main__":
+    main()

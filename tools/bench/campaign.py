@@ -1,0 +1,72 @@
+"""What a campaign adds to its cells: CPU seconds a throw in a block and in a bare lock-step cell of
+the same seeds, in turn.
+
+`python -m tools.bench.campaign [--throws N] [--rounds N]`; the first round of each warms caches and
+does not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from petrobot.coordinator.cli.loading import task_path
+from petrobot.coordinator.launch import Setting, lockstep_cell
+from petrobot.coordinator.studies.campaign.block import Bench, run_block
+from petrobot.coordinator.studies.campaign.plan import Plan
+
+ROOT = Path(__file__).parents[2]
+
+
+def bare(bench: Bench, seed: int, throws: int) -> float:
+    """CPU seconds of `petrobot run` without its terminal and report."""
+    begun = time.process_time()
+    cell, party = lockstep_cell(bench.directory, Setting(bench.task, {"regime": "B"}, throws, seed))
+    cell.run(lambda: party.over, 10_000_000)
+    return time.process_time() - begun
+
+
+def block(bench: Bench, seed: int, throws: int) -> float:
+    """CPU seconds of the same as a campaign's block."""
+    begun = time.process_time()
+    one = replace(bench.plan.blocks[0], seed=seed, count=throws)
+    run_block(bench, one, [{}] * throws)
+    return time.process_time() - begun
+
+
+def main() -> None:
+    """Print both and their ratio."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--throws", type=int, default=4, metavar="N", help="in each cell (%(default)s)"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=3, metavar="N", help="that count (%(default)s)"
+    )
+    options = parser.parse_args()
+    bench = Bench.of(
+        Plan(
+            str(task_path("catch_ball")),
+            str(ROOT / "services.toml"),
+            options.throws,
+            ("B",),
+            block=options.throws,
+        )
+    )
+    times: dict[str, list[float]] = {"bare cell": [], "campaign block": []}
+    for seed in range(1, options.rounds + 2):
+        times["bare cell"].append(bare(bench, seed, options.throws) / options.throws)
+        times["campaign block"].append(block(bench, seed, options.throws) / options.throws)
+    for name, spent in times.items():
+        print(f"{name:16}{statistics.mean(spent[1:]):.4f} CPU s a throw")
+    ratios = [b / a for a, b in zip(*(spent[1:] for spent in times.values()), strict=True)]
+    print(f"{'ratio':16}{statistics.mean(ratios):.3f}  ({', '.join(f'{r:.3f}' for r in ratios)})")
+
+
+if __name__ == "__main__":
+    main()

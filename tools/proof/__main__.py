@@ -1,0 +1,119 @@
+"""`make proof`: checks every promised figure in full and writes them to docs/figures.md. Resumes
+where it stopped.
+
+Each result is kept in reports/proof with the state of the sources that gave it; a proof whose
+sources have not changed since is not run again. `--only NAME ...` runs some, `--fresh` forgets what
+is kept, `--jobs K` runs K at once (speeds are always measured alone), `--page` only writes the
+page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import Any
+
+from tools.proof import catching, convergence, learning, long_tests
+from tools.proof.page import figures
+from tools.proof.proof import KEPT, ROOT, Proof
+
+FIGURES = ROOT / "docs" / "figures.md"
+
+
+def proofs() -> list[Proof]:
+    """All of them, in the order in which people wait for them."""
+    return [*catching.proofs(), *convergence.proofs(), *long_tests.proofs(), *learning.proofs()]
+
+
+def kept(proof: Proof) -> dict[str, Any] | None:
+    """What was measured last, of whatever sources."""
+    path = KEPT / f"{proof.slug}.json"
+    if not path.exists():
+        return None
+    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return data
+
+
+def prove(proof: Proof) -> dict[str, Any]:
+    """Measure, judge and keep."""
+    begun, sources = time.monotonic(), proof.fingerprint()
+    result = proof.measure()
+    minutes = round((time.monotonic() - begun) / 60, 1)
+    data = {
+        "sources": sources,
+        "holds": proof.holds(result),
+        "result": dict(result),
+        "minutes": minutes,
+    }
+    (KEPT / f"{proof.slug}.json").write_text(json.dumps(data, indent=2), encoding="utf-8")
+    return data
+
+
+def run(todo: Sequence[Proof], jobs: int) -> bool:
+    """Prove these: several at once, but those that measure speed one by one afterwards. False if
+    one does not hold."""
+    good, done, begun = True, 0, time.monotonic()
+    together, alone = [p for p in todo if not p.alone], [p for p in todo if p.alone]
+    for group, workers in ((together, jobs), (alone, 1)):
+        with ThreadPoolExecutor(workers) as pool:
+            waiting = {pool.submit(prove, proof): proof for proof in group}
+            for future in as_completed(waiting):
+                done += 1
+                data = future.result()
+                good = good and data["holds"]
+                holds = "holds" if data["holds"] else "DOES NOT HOLD"
+                togo = (time.monotonic() - begun) / done * (len(todo) - done) / 60
+                print(
+                    f"[{done}/{len(todo)}, {togo:.0f} min to go] {waiting[future].name}: "
+                    f"{holds}: {data['result']}"
+                )
+                write_page()
+    return good
+
+
+def write_page() -> None:
+    """The page with all that is kept so far."""
+    everything = proofs()
+    FIGURES.write_text(
+        figures(everything, {p.name: data for p in everything if (data := kept(p))}),
+        encoding="utf-8",
+    )
+
+
+def main() -> int:
+    """Run what is not proved yet."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", metavar="NAME", nargs="+", help="some proofs")
+    parser.add_argument("--fresh", action="store_true", help="forget what is kept")
+    parser.add_argument("--jobs", type=int, default=2, help="how many at once (default 2)")
+    parser.add_argument(
+        "--page", action="store_true", help="only write docs/figures.md from what is kept"
+    )
+    options = parser.parse_args()
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    KEPT.mkdir(parents=True, exist_ok=True)
+    if options.page:
+        write_page()
+        return 0
+    chosen = [p for p in proofs() if options.only is None or p.name in options.only]
+    found = {p.name: kept(p) for p in chosen}
+    todo = [
+        p
+        for p in chosen
+        if options.fresh or (found[p.name] or {}).get("sources") != p.fingerprint()
+    ]
+    old = all(data["holds"] for p in chosen if p not in todo and (data := found[p.name]))
+    print(f"{len(chosen) - len(todo)} kept, {len(todo)} to measure")
+    good = run(todo, options.jobs)
+    write_page()
+    return 0 if good and old else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,172 @@
+"""The catching cell's figures: throws of each regime, disturbed ones, and one seed that gives one
+file."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from typing import Any
+
+from tools.proof.proof import ROOT, Proof, Result, run_task
+
+CHAPTER = "Catching, lock step"
+THROWS = 1000
+DISTURBED_THROWS = 200
+SEED = 20_000
+FLOORS = {"A": 0.98, "B": 0.94, "C": 0.89}
+SOURCES = (
+    *(
+        "coordinator/engine",
+        "coordinator/task",
+        "coordinator/task/file",
+        "coordinator/task/conditions",
+    ),
+    *(
+        "coordinator/task/net.py",
+        "coordinator/run/executor.py",
+        "coordinator/run/interfaces.py",
+        "coordinator/run/mission.py",
+    ),
+    *(
+        "coordinator/run/lockstep.py",
+        "coordinator/tasks/catch_ball.toml",
+        "services.toml",
+        "services",
+        "sim",
+    ),
+)
+APART = ("services/mobile", "sim/track", "sim/rover")
+
+
+def wilson_lower(successes: int, trials: int, z: float = 1.959964) -> float:
+    """Lower end of Wilson's 95 % interval for a share (Wilson 1927)."""
+    if trials == 0:
+        return 0.0
+    share = successes / trials
+    centre = share + z * z / (2 * trials)
+    margin = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
+    return (centre - margin) / (1 + z * z / trials)
+
+
+def catching(regime: str, throws: int) -> Callable[[], Result]:
+    """Throws of a regime: caught among the reachable ones, and how far off the middle of the
+    cup."""
+
+    def measure() -> Result:
+        given = (
+            "--mode",
+            "lockstep",
+            "--runs",
+            str(throws),
+            "--seed",
+            str(SEED),
+            "--regime",
+            regime,
+        )
+        return summary(run_task(f"catch_{regime}", "catch_ball", *given))
+
+    return measure
+
+
+def summary(result: dict[str, Any]) -> Result:
+    """What docs/figures.md says of a run."""
+    throws = result["throws"]
+    reachable = [t for t in throws if t["reachable"]]
+    caught = sum(t["caught"] for t in reachable)
+    misses = [t["miss_mm"] for t in throws if t["miss_mm"] is not None]
+    return {
+        "throws": len(throws),
+        "reachable": len(reachable),
+        "caught of reachable": caught,
+        "caught of all": sum(t["caught"] for t in throws),
+        "Wilson lower bound": round(wilson_lower(caught, len(reachable)), 4),
+        "median miss (mm)": round(statistics.median(misses), 1) if misses else None,
+        "cycle (s)": round(result["sim_s"] / len(throws), 2),
+    }
+
+
+def same_file_anywhere() -> Result:
+    """One seed, one file: in one process, in one process a node, and beside a process that takes a
+    core."""
+    given = ("catch_ball", "--mode", "lockstep", "--runs", "20", "--seed", str(SEED))
+    alone = run_task("alone", *given)
+    spread = run_task("spread", *given, "--processes", "0")
+    load = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        loaded = run_task("loaded", *given)
+        loaded_spread = run_task("loaded_spread", *given, "--processes", "0")
+    finally:
+        load.kill()
+        load.wait()
+    speeds = {
+        name: round(r["sim_s"] / r["wall_s"], 1) for name, r in (("one", alone), ("spread", spread))
+    }
+    cycle = round(alone["sim_s"] / 20, 2)
+    for result in (alone, spread, loaded, loaded_spread):
+        del result["wall_s"]
+    return {
+        "same in a process a node": alone == spread,
+        "same under load": alone == loaded == loaded_spread,
+        "times real time, one process": speeds["one"],
+        "times real time, a process a node": speeds["spread"],
+        "cycle (s)": cycle,
+    }
+
+
+def disturbances() -> list[str]:
+    """Every disturbed regime by name, each at every speed."""
+    laboratory = tomllib.loads((ROOT / "sim" / "laboratory.toml").read_text(encoding="utf-8"))
+    return [f"{speed}+{name}" for name in laboratory["disturbances"] for speed in FLOORS]
+
+
+def proofs() -> list[Proof]:
+    """Throws first, then what they rest on."""
+    main = [
+        Proof(
+            regime,
+            CHAPTER,
+            catching(regime, THROWS),
+            _above(floor),
+            f"lower bound >= {floor}",
+            SOURCES,
+            APART,
+        )
+        for regime, floor in FLOORS.items()
+    ]
+    disturbed = [
+        Proof(
+            *(
+                name,
+                CHAPTER,
+                catching(name, DISTURBED_THROWS),
+                lambda r: r["throws"] == DISTURBED_THROWS,
+            ),
+            *("measured", SOURCES, APART),
+        )
+        for name in disturbances()
+    ]
+    same = Proof(
+        *("one seed, one file", "Lock step", same_file_anywhere, _same),
+        "equal files; >= 10x in one process, >= 4x in four",
+        SOURCES,
+        APART,
+        alone=True,
+    )
+    return [*main, same, *disturbed]
+
+
+def _same(result: Result) -> bool:
+    equal = result["same in a process a node"] and result["same under load"]
+    fast = (
+        result["times real time, one process"] >= 10
+        and result["times real time, a process a node"] >= 4
+    )
+    return bool(equal and fast)
+
+
+def _above(floor: float) -> Callable[[Result], bool]:
+    return lambda result: bool(result["Wilson lower bound"] >= floor)

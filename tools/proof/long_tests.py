@@ -1,0 +1,29 @@
+"""The tests that take too long for `make test`."""
+
+from __future__ import annotations
+
+from tools.proof.proof import Proof, Result, command
+
+SOURCES = ("coordinator", "services", "sim", "services.toml", "tests")
+
+
+def marked_proof() -> Result:
+    """All of them, two at a time."""
+    done = command("pytest", "-m", "proof", "-n", "2", "-q")
+    lines = done.stdout.strip().splitlines()
+    return {"exit": done.returncode, "said": lines[-1].strip("= ") if lines else ""}
+
+
+def proofs() -> list[Proof]:
+    """One for the lot."""
+    return [
+        Proof(
+            "long tests",
+            "Tests",
+            marked_proof,
+            lambda r: r["exit"] == 0,
+            "all pass",
+            SOURCES,
+            ("tools/proof",),
+        )
+    ]

@@ -1,0 +1,54 @@
+"""Writes docs/figures.md: one table a chapter, in it all that was measured and what was not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tools.proof.proof import Proof
+
+HEAD = """# Figures
+
+Written by `make proof`, which anyone can repeat: it resumes where it stopped and measures again what has changed since.
+
+What came of faults that were injected on purpose: [figures-faults.md](figures-faults.md).
+"""
+
+
+def figures(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) -> str:
+    """The whole page; `measured` holds what is kept of each proof by its name."""
+    chapters = list(dict.fromkeys(proof.chapter for proof in proofs))
+    parts = [HEAD]
+    for chapter in chapters:
+        parts += [
+            f"\n## {chapter}\n",
+            *_table([p for p in proofs if p.chapter == chapter], measured),
+        ]
+    return "\n".join(parts) + "\n"
+
+
+def _table(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    columns = list(
+        dict.fromkeys(key for p in proofs for key in measured.get(p.name, {}).get("result", {}))
+    )
+    lines = [_row("", *columns, "floor", "holds", "sources"), _row(*["---"] * (len(columns) + 4))]
+    for proof in proofs:
+        data = measured.get(proof.name)
+        if data is None:
+            lines.append(_row(proof.name, *[""] * len(columns), proof.floor, "not measured", ""))
+            continue
+        holds = "yes" if data["holds"] else "**no**"
+        stale = "" if data["sources"] == proof.fingerprint() else " (older)"
+        values = [_said(data["result"].get(key)) for key in columns]
+        lines.append(_row(proof.name, *values, proof.floor, holds, data["sources"][:8] + stale))
+    return lines
+
+
+def _said(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "" if value is None else str(value)
+
+
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(cells) + " |"
