@@ -103,7 +103,7 @@ IMPURE_IMPORTS = {
     "secrets",
 }
 FORBIDDEN_IMPORTS = {"pickle", "marshal", "shelve", "dill", "cloudpickle"}
-ROBOT_WORDS = {"puma", "ball", "camera", "cup", "track", "rover", "catch"}
+ROBOT_WORDS = {"throw", "throws", "puma", "ball", "camera", "cup", "track", "rover", "catch"}
 
 
 def modules() -> Iterator[tuple[str, Path]]:

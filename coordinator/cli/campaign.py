@@ -206,7 +206,8 @@ def _written(folder: Path) -> Iterator[None]:
 
 def _refuse_misfit(forecast: Path, plan: Plan) -> None:
     from petrobot.coordinator.cli.forecast import fitting
-    from petrobot.coordinator.studies.forecast.registered import ForecastError, read
+    from petrobot.coordinator.studies.forecast.history import ForecastError
+    from petrobot.coordinator.studies.forecast.registered import read
 
     try:
         fitting(forecast, read(forecast), plan)
@@ -216,7 +217,7 @@ def _refuse_misfit(forecast: Path, plan: Plan) -> None:
 
 def _checked(forecast: Path, folder: Path) -> dict[str, Any]:
     from petrobot.coordinator.cli.forecast import compared
-    from petrobot.coordinator.studies.forecast.registered import ForecastError
+    from petrobot.coordinator.studies.forecast.history import ForecastError
 
     try:
         return compared(forecast, folder)

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--estimates",
         metavar="FILE|CAMPAIGN",
         type=Path,
-        help="a campaign's folder, or an estimates file without its throws",
+        help="a campaign's folder, or an estimates file without its trials",
     )
     parser.add_argument(
         "--runs",
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Forecast, or compare: exit code 1 when the forecast is doubtful or disagrees."""
     from petrobot.coordinator.studies.campaign.plan import CampaignError
-    from petrobot.coordinator.studies.forecast.registered import ForecastError
+    from petrobot.coordinator.studies.forecast.history import ForecastError
 
     try:
         if options.compare is not None:
@@ -140,7 +140,7 @@ def _forecast(options: argparse.Namespace) -> int:
 
 
 def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, dict[str, Any]]:
-    """Training throws by regime, the estimates, and what the forecast says about where they come
+    """Training trials by regime, the estimates, and what the forecast says about where they come
     from."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of
     from petrobot.coordinator.studies.campaign.plan import digest, read_manifest
@@ -165,7 +165,7 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
     _refuse_other_runs(task, rows, path)
     found = by_regime(task, rows)
     if not found:
-        raise CommandError(2, f"{path}: the table holds no throw yet")
+        raise CommandError(2, f"{path}: the table holds no trial yet")
     about = {
         "estimates": {
             "campaign": path.name,
@@ -200,7 +200,7 @@ def _refuse_other_runs(task: Task, rows: Iterable[Row], path: Path) -> None:
 
     actions: dict[str, dict[str, None]] = {}
     for row in rows:
-        for run in row.throw.runs if row.throw is not None else ():
+        for run in row.trial.runs if row.trial is not None else ():
             actions.setdefault(run.place, {})[run.action] = None
     for place, found in actions.items():
         known = task.flat.places.get(place)
@@ -304,7 +304,7 @@ def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
     if training.get("seed") == plan.seed and training.get("block") == plan.block:
         raise CommandError(
             2,
-            f"{registered} was trained on these throws (seed {plan.seed}): run the campaign "
+            f"{registered} was trained on these trials (seed {plan.seed}): run the campaign "
             "with another --seed",
         )
     for regime, counts in _planned(plan, task).items():

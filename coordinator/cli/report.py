@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against",
         metavar="CAMPAIGN",
         type=Path,
-        help="compare with this campaign, throw by throw",
+        help="compare with this campaign, trial by trial",
     )
     parser.add_argument(
         "--rho-of",

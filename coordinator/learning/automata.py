@@ -25,7 +25,7 @@ from petrobot.coordinator.learning.batch import (
     Batch,
     Index,
     Mask,
-    Trial,
+    Response,
     drawn,
     restricted,
 )
@@ -95,7 +95,7 @@ class NikolicFu:
         """Draw."""
         return drawn(self.probabilities(batch, offered), u[:, 0])
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Estimate, order, move."""
         batch.counting(trial)
         target = one_hot(batch.best(eligible), batch.n)
@@ -135,7 +135,7 @@ class RewardInaction:
         """Draw."""
         return drawn(self.probabilities(batch, offered), u[:, 0])
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Move towards the chosen action as far as it paid; not at all towards one that is not
         eligible."""
         batch.counting(trial)
@@ -175,7 +175,7 @@ class DiscretisedPursuit:
         """Draw."""
         return drawn(self.probabilities(batch, offered), u[:, 0])
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Pursue the best estimate when the trial was a success and the first trials are over."""
         batch.counting(trial)
         best = batch.best(eligible)
@@ -239,7 +239,7 @@ class Tracking:
         """Draw."""
         return drawn(self.probabilities(batch, offered), u[:, 0])
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Fade, estimate, test, order, move."""
         keep = 1.0 - 1.0 / self.memory
         for name in SUMS[1:]:
@@ -264,7 +264,7 @@ class Tracking:
         left: float = change * (1.0 - 1.0 / self.memory) ** age
         return left
 
-    def _alarm(self, batch: Batch, trial: Trial) -> Mask:
+    def _alarm(self, batch: Batch, trial: Response) -> Mask:
         """Whether the chosen action's success or cost has left its mean since the restart."""
         at = (np.arange(len(batch.k)), trial.action)
         own, executed = batch.own, trial.executed

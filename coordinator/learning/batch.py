@@ -22,7 +22,7 @@ SUMS = ("tries", "runs", "successes", "cost", "squares", "costed", "missing")
 
 
 @dataclass
-class Trial:
+class Response:
     """One trial of each row: arrays of shape (rows,)."""
 
     action: Index
@@ -78,7 +78,7 @@ class Batch:
         """Count a choice of each row."""
         self.tries[np.arange(len(self.k)), action] += 1
 
-    def counting(self, trial: Trial) -> None:
+    def counting(self, trial: Response) -> None:
         """Add a trial of each row to the sums."""
         rows = np.arange(len(self.k))
         executed = trial.executed.astype(float)
@@ -139,7 +139,7 @@ class Batch:
         best: Index = np.argmin(j, axis=1)
         return best
 
-    def payoff(self, trial: Trial) -> Array:
+    def payoff(self, trial: Response) -> Array:
         """A trial's gain in [0, 1], affine in its share of J: success, and cost where costs count;
         shape (rows,)."""
         rows = np.arange(len(self.k))

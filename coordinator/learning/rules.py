@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from scipy.special import betaincinv
 
-from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Trial
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Response
 
 
 class Rule(Protocol):
@@ -29,7 +29,7 @@ class Rule(Protocol):
         """The next action of each row. `u` are uniform numbers in [0, 1) of shape (rows, n);
         nothing changes."""
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Learn from a trial of each row. Only eligible actions (None: all) may be taken for the
         best."""
 
@@ -73,7 +73,7 @@ class Fixed:
         first: Index = np.argmax(offered, axis=1)
         return first
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Count only."""
         batch.counting(trial)
 
@@ -101,7 +101,7 @@ class RoundRobin:
         """The next one in turn."""
         return forced(batch, offered, np.inf)[1]
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Count only."""
         batch.counting(trial)
 
@@ -136,7 +136,7 @@ def _begin(rows: int, n: int, rho: float | None) -> Batch:
     return batch
 
 
-def _learn(batch: Batch, trial: Trial, eligible: Mask | None) -> None:
+def _learn(batch: Batch, trial: Response, eligible: Mask | None) -> None:
     batch.counting(trial)
     if eligible is not None:
         batch.own["ruled_out"][:] = ~eligible
@@ -182,7 +182,7 @@ class UCB1:
         bound = np.where(_allowed(batch, offered), self.index(batch), -np.inf)
         return np.where(owed, least, np.argmax(bound, axis=1))
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Count."""
         _learn(batch, trial, eligible)
 
@@ -225,7 +225,7 @@ class Thompson:
         lowest: Index = np.argmin(np.where(_allowed(batch, offered), j, np.inf), axis=1)
         return lowest
 
-    def learn(self, batch: Batch, trial: Trial, eligible: Mask | None = None) -> None:
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
         """Count."""
         _learn(batch, trial, eligible)
 

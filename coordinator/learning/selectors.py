@@ -19,7 +19,7 @@ from petrobot.coordinator.learning.automata import (
     RewardInaction,
     Tracking,
 )
-from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Trial
+from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Response
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.rules import UCB1, Fixed, RoundRobin, Rule, Thompson
@@ -192,7 +192,7 @@ class RuleSelector:
         if self.frozen or not self.learns_from(action, outcome):
             return
         batch, missing = self._kept(context), _is_missing(outcome)
-        trial = Trial(
+        trial = Response(
             np.array([self.actions.index(action)]),
             np.array([float(outcome.status is Status.SUCCESS)]),
             np.array([cost_of(outcome, self.question.measure)]),

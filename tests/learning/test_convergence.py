@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from petrobot.coordinator.learning.automata import NikolicFu, Tracking
-from petrobot.coordinator.learning.batch import Trial
+from petrobot.coordinator.learning.batch import Response
 from petrobot.coordinator.learning.rules import Rule
 from petrobot.coordinator.learning.selectors import RULES
 from tests.learning.worlds import Played, World, gapped, play
@@ -144,7 +144,9 @@ def test_the_gain_of_tracking_never_falls_below_its_floor() -> None:
         100,
         [[10, 90]],
     )
-    rule.learn(batch, Trial(np.array([1]), np.array([1.0]), np.array([np.nan]), np.array([True])))
+    rule.learn(
+        batch, Response(np.array([1]), np.array([1.0]), np.array([np.nan]), np.array([True]))
+    )
     assert batch.p == pytest.approx(p + rule.gain_floor * (np.array([[0.0, 1.0]]) - p))
     batch.p[:] = [[1.0, 0.0]]
     assert rule.probabilities(batch, np.ones((1, 2), bool)).min() == pytest.approx(

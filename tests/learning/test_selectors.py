@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.cli.learning_options import SELECTORS
-from petrobot.coordinator.learning.batch import SUMS, Batch, Trial, drawn, restricted
+from petrobot.coordinator.learning.batch import SUMS, Batch, Response, drawn, restricted
 from petrobot.coordinator.learning.estimate import Observation, Tally
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.selectors import RULES, RuleSelector, eligible, make
@@ -87,7 +87,9 @@ def test_rows_of_a_batch_are_the_shipped_selector(
         chosen = rule.choose(batch, offered, u[t])
         batch.choosing(chosen)
         good = v[t] < r[chosen]
-        rule.learn(batch, Trial(chosen, good.astype(float), seconds[t], np.ones(rows, dtype=bool)))
+        rule.learn(
+            batch, Response(chosen, good.astype(float), seconds[t], np.ones(rows, dtype=bool))
+        )
         for i, selector in enumerate(alone):
             action, why = selector.choose("", actions, feeds[i])
             assert action == actions[chosen[i]]

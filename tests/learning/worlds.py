@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from petrobot.coordinator.learning.batch import Array, Batch, Index, Trial
+from petrobot.coordinator.learning.batch import Array, Batch, Index, Response
 from petrobot.coordinator.learning.rules import Rule
 
 
@@ -91,7 +91,7 @@ def play(
         batch.choosing(action)
         success = (rng.random(seeds) < np.array(now.reliability)[action]).astype(float)
         cost = np.array(now.cost)[action] * rng.gamma(10.0, 0.1, seeds)
-        rule.learn(batch, Trial(action, success, cost, executed))
+        rule.learn(batch, Response(action, success, cost, executed))
         total += j[action] - j.min()
         recent[t % 100] = j[action] <= j.min() + 1e-12
         if watch is not None:

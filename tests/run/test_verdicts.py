@@ -18,7 +18,7 @@ from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import Mission, MissionError
 from petrobot.coordinator.run.recording import replay
 from petrobot.coordinator.run.timeline import Timeline
-from petrobot.coordinator.studies.campaign.trials import ThrowLog
+from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Status
 from petrobot.services.comm.calls.callee import Callee, Offer
 from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
@@ -92,7 +92,7 @@ def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_pat
     """The estimates, the selector and the run's own tally hold what is true; the net went on by
     what was said first."""
     cellar = Cellar(tmp_path)
-    timeline, log = Timeline(), ThrowLog(cellar.task, lambda record, values: record.seconds)
+    timeline, log = Timeline(), TrialLog(cellar.task, lambda record, values: record.seconds)
     mission, _ = cellar.begin(0, timeline, log)
     assert told(mission) == TRULY
     assert learned(cellar.selector) == LEARNED
@@ -108,8 +108,8 @@ def test_verdicts_of_another_node_and_of_the_score_correct_each_run_once(tmp_pat
     )
     assert set(mission.executor.state.deferred) == {"pick#6"} and not mission.executor.state.early
     assert [(c.status, c.cause) for c in mission.tally.cycles] == list(TRULY.values())
-    assert [(t.status, t.cause) for t in log.throws] == [(s.value, c) for s, c in TRULY.values()]
-    assert [t.all_success for t in log.throws] == [s is OK for s, _ in TRULY.values()]
+    assert [(t.status, t.cause) for t in log.trials] == [(s.value, c) for s, c in TRULY.values()]
+    assert [t.all_success for t in log.trials] == [s is OK for s, _ in TRULY.values()]
     assert {run: (timeline.bars[run].status, timeline.bars[run].cause) for run in TRULY} == TRULY
     assert timeline.bars["pick#1"].text == "held by a corner"
 

@@ -53,15 +53,15 @@ def main() -> None:
         Plan(
             str(task_path("catch_ball")),
             str(ROOT / "services.toml"),
-            options.throws,
+            options.trials,
             ("B",),
-            block=options.throws,
+            block=options.trials,
         )
     )
     times: dict[str, list[float]] = {"bare cell": [], "campaign block": []}
     for seed in range(1, options.rounds + 2):
-        times["bare cell"].append(bare(bench, seed, options.throws) / options.throws)
-        times["campaign block"].append(block(bench, seed, options.throws) / options.throws)
+        times["bare cell"].append(bare(bench, seed, options.trials) / options.trials)
+        times["campaign block"].append(block(bench, seed, options.trials) / options.trials)
     for name, spent in times.items():
         print(f"{name:16}{statistics.mean(spent[1:]):.4f} CPU s a throw")
     ratios = [b / a for a, b in zip(*(spent[1:] for spent in times.values()), strict=True)]

@@ -87,7 +87,7 @@ def screened(sizes: Sizes, task: Task, regime: str) -> tuple[list[Row], list[dic
     campaign(sizes, "screen", sizes.of(100, 5) * count, 50, regime, "--selector", "round_robin")
     rotation = RoundRobin(offered(task, load_directory(sizes.services)), {})
     rows = rows_of(sizes, "screen")
-    return rows, [rotation.combination(row.n - 1) for row in rows if row.throw is not None]
+    return rows, [rotation.combination(row.n - 1) for row in rows if row.trial is not None]
 
 
 def best_fixed(
@@ -104,7 +104,7 @@ def best_fixed(
     for number, one in enumerate(finalists):
         chosen = dict(one.combination)
         judge(sizes, f"final_{number}", chosen, regime, throws=sizes.of(500), seed=51)
-        rows = [row for row in rows_of(sizes, f"final_{number}") if row.throw is not None]
+        rows = [row for row in rows_of(sizes, f"final_{number}") if row.trial is not None]
         every += rows
         plans += [chosen] * len(rows)
     ranked: list[Judged] = by_combination(task, every, plans, weighting)

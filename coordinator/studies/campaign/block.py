@@ -24,7 +24,7 @@ from petrobot.coordinator.learning.estimate import COUNT
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import Mission, MissionError
 from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan, digest
-from petrobot.coordinator.studies.campaign.trials import CostOf, ThrowLog
+from petrobot.coordinator.studies.campaign.trials import CostOf, TrialLog
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError
 from petrobot.coordinator.task.file import load as load_task
@@ -35,8 +35,8 @@ from petrobot.services.comm.lockstep.party import TICK, Party
 
 Weights = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
-LONGEST_THROW = 3600.0
-"""Simulated seconds after which a throw counts as one that never ends."""
+LONGEST_TRIAL = 3600.0
+"""Simulated seconds after which a trial counts as one that never ends."""
 PLOTS = "plots"
 """Key of a score under which a task declares pictures of its own (docs/campaigns.md)."""
 
@@ -67,13 +67,13 @@ class Bench:
 
 class BlockSelector:
     """Draws each choice from probabilities that were fixed before the block, keyed by mission seed,
-    throw and occurrence."""
+    trial and occurrence."""
 
     def __init__(self, seed: int, weights: Sequence[Weights]) -> None:
         self._seed, self._weights = seed, weights
         self._counts: dict[tuple[int, str], int] = {}
-        self.throw: Callable[[], int] = lambda: 0
-        """Index of the throw that goes on, from 0."""
+        self.trial: Callable[[], int] = lambda: 0
+        """Index of the trial that goes on, from 0."""
 
     def choose(
         self,
@@ -83,7 +83,7 @@ class BlockSelector:
         variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
         """One alternative and why."""
-        k = max(0, min(self.throw(), len(self._weights) - 1))
+        k = max(0, min(self.trial(), len(self._weights) - 1))
         given = self._weights[k].get(task, {}) if self._weights else {}
         offered = [
             (action, given[action]) for action in alternatives if given.get(action, 0.0) > 0.0
@@ -101,22 +101,22 @@ class BlockSelector:
 
 
 def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
-    """Run a block. `weights`: for each of its throws, the probabilities of each primitive task's
+    """Run a block. `weights`: for each of its trials, the probabilities of each primitive task's
     actions.
 
-    Gives `throws` (see Throw.to_plain), `score` (one map for each throw), `plots`, `mission_s`,
+    Gives `trials` (see Trial.to_plain), `score` (one map for each trial), `plots`, `mission_s`,
     `cpu_s`, `wall_s`, `rss_mb`. Raises CampaignError.
     """
     cpu, wall = time.process_time(), time.perf_counter()
     selector = BlockSelector(block.seed, weights)
     mission, parties = _cell(bench, block, selector)
-    log = ThrowLog(bench.task, costs(bench.task, bench.directory))
+    log = TrialLog(bench.task, costs(bench.task, bench.directory))
     mission.executor.observers.append(log)
-    selector.throw = lambda: len(log.throws) - 1
+    selector.trial = lambda: len(log.trials) - 1
     coordinator = CoordinatorParty(bench.directory, mission)
     try:
         cell = Cell([coordinator, *parties], Delays(bench.directory.delays()))
-        limit = round(LONGEST_THROW * block.count / TICK)
+        limit = round(LONGEST_TRIAL * block.count / TICK)
         if not cell.run(lambda: coordinator.over, limit):
             raise CampaignError(
                 f"seed {block.seed}: not over after {limit * TICK:.0f} s of simulated time"
@@ -132,7 +132,7 @@ def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[st
                 close()
     return {
         "index": block.index,
-        "throws": [throw.to_plain() for throw in log.throws],
+        "trials": [trial.to_plain() for trial in log.trials],
         "score": scores(mission.score, block.count),
         PLOTS: dict(mission.score.get(PLOTS, {})),
         "mission_s": round(mission.ended - mission.begun, 6),
@@ -183,10 +183,10 @@ def costs(task: Task, directory: Directory) -> CostOf:
 
 
 def scores(score: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
-    """The task's own results for each throw, as `table.column` by the score's lists of rows.
+    """The task's own results for each trial, as `table.column` by the score's lists of rows.
 
-    A row belongs to the throw that its `run` says (its `n` if it has none). If no list has such
-    rows and there is only one throw, the plain values of the score are its results, as
+    A row belongs to the trial that its `run` says (its `n` if it has none). If no list has such
+    rows and there is only one trial, the plain values of the score are its results, as
     `score.name`.
     """
     out: list[dict[str, Any]] = [{} for _ in range(count)]

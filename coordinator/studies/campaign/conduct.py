@@ -53,10 +53,10 @@ class Progress:
     """How far a campaign is."""
 
     done: int
-    """Throws in the table."""
+    """Trials in the table."""
     of: int
     already: int
-    """Throws that had been done before this session."""
+    """Trials that had been done before this session."""
     goals: int
     seconds: float
     """Since this session began (wall clock)."""
@@ -95,7 +95,7 @@ class Campaign:
         open_folder(folder, plan)
         self.table = Table(folder, self.bench.task)
         self._watch = watch
-        self._goals = self._throws = self._already = 0
+        self._goals = self._trials = self._already = 0
         self._began = time.monotonic()
         self._sessions: list[dict[str, str]] = []
         self._session: dict[str, Any] = {}
@@ -120,7 +120,7 @@ class Campaign:
             "blocks": 0,
         }
         self._began = time.monotonic()
-        self._already = self._throws = sum(block.count for block in blocks[:done])
+        self._already = self._trials = sum(block.count for block in blocks[:done])
         if self.policy.learns:
             await self._learn(pool, done)
         else:
@@ -181,11 +181,11 @@ class Campaign:
         note_block(self.folder, block, result)
         self._note_session(pool)
         self.table.append(rows)
-        self._throws += len(rows)
-        self._goals += sum(1 for row in rows if row.throw is not None and row.throw.goals > 0)
+        self._trials += len(rows)
+        self._goals += sum(1 for row in rows if row.trial is not None and row.trial.goals > 0)
         if self._watch is not None:
             now = time.monotonic() - self._began
-            self._watch(Progress(self._throws, self.plan.runs, self._already, self._goals, now))
+            self._watch(Progress(self._trials, self.plan.runs, self._already, self._goals, now))
         return rows
 
     def _note_session(self, pool: Pool) -> None:

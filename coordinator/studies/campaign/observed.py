@@ -50,19 +50,19 @@ def observation(task: Task, run: RunEntry) -> Observation:
 
 def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
     """Count a row's runs and firings."""
-    if row.throw is None:
+    if row.trial is None:
         return
     context = context_of(row.regime)
-    for run in row.throw.runs:
+    for run in row.trial.runs:
         key = Key(task.primitive_task_of(run.place).name, run.action, context)
         name = f"{salt}/{row.regime}/{row.seed}/{row.k}"
         estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(
             observation(task, run), name
         )
     waits: dict[str, list[float]] = {}
-    for transition, seconds in row.throw.waits:
+    for transition, seconds in row.trial.waits:
         waits.setdefault(transition, []).append(seconds)
-    for transition, count in row.throw.fired.items():
+    for transition, count in row.trial.fired.items():
         where = PassageKey(task.name, transition, context)
         flow = estimates.flows.get(where, Flow())
         known = waits.get(transition, [])

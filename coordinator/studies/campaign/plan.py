@@ -1,7 +1,7 @@
 """What a campaign is given, and how it is cut into blocks: the same blocks and seeds whoever does
 them, however many do.
 
-A block is one mission run with a few throws in a cell of its own. Throw i of a regime has number
+A block is one mission run with a few trials in a cell of its own. Trial i of a regime has number
 `k` in the mission run with seed `seed * SEEDS + block`: so `petrobot run TASK --mode lockstep
 --seed (that) --runs (the block's)` repeats it alone.
 """
@@ -38,7 +38,7 @@ class Plan:
     """Path of the task file."""
     services: str
     runs: int
-    """Throws in all regimes together."""
+    """Trials in all regimes together."""
     regimes: tuple[str, ...]
     """Values of the task's parameter `regime`; one empty name if it has none."""
     seed: int = 1
@@ -47,9 +47,9 @@ class Plan:
     """The action of each primitive task that is chosen by hand."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     block: int = 5
-    """Throws in one mission run; it changes which throws there are."""
+    """Trials in one mission run; it changes which trials there are."""
     batch: int = 20
-    """Throws between two updates of what is learned; 0: nothing is learned, so nobody waits."""
+    """Trials between two updates of what is learned; 0: nothing is learned, so nobody waits."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Of the selector."""
     mock: str = ""
@@ -100,7 +100,7 @@ class Plan:
 
     @property
     def batches(self) -> Iterator[list[Block]]:
-        """Blocks whose choices are drawn from one state: `batch` throws or a little more, all of
+        """Blocks whose choices are drawn from one state: `batch` trials or a little more, all of
         them if nothing is learned."""
         blocks, batch = self.blocks, []
         for block in blocks:
@@ -122,9 +122,9 @@ class Block:
     """In its regime, from 0: its seed depends on this alone."""
     regime: str
     first: int
-    """Throws of the campaign before it."""
+    """Trials of the campaign before it."""
     regime_first: int
-    """Throws of its regime before it."""
+    """Trials of its regime before it."""
     count: int
     seed: int
 
@@ -188,8 +188,8 @@ def differences(old: Plan, new: Plan) -> list[str]:
 
 
 def identity(plan: Plan) -> str:
-    """A short name of what a campaign runs, the same wherever its files lie: throws of equal
-    identity are the same throws."""
+    """A short name of what a campaign runs, the same wherever its files lie: trials of equal
+    identity are the same trials."""
     data = plan.to_plain()
     for key in ("task", "services", "mock"):
         data[key] = plan.digests.get(key, "")

@@ -1,4 +1,4 @@
-"""Who chooses actions in a campaign: for each throw, the probabilities of each primitive task's
+"""Who chooses actions in a campaign: for each trial, the probabilities of each primitive task's
 actions.
 
 A policy is asked before a batch and told all rows of the batch after it, in the order of the table;
@@ -33,7 +33,7 @@ class Policy(Protocol):
     """Whether `update` changes what is chosen."""
 
     def weights(self, block: Block) -> list[Weights]:
-        """For each throw of a block, the probabilities of each primitive task's actions."""
+        """For each trial of a block, the probabilities of each primitive task's actions."""
 
     def update(self, rows: Sequence[Row]) -> None:
         """Take the rows of a whole batch, in the order of the table."""
@@ -76,7 +76,7 @@ class Fixed:
         }
 
     def weights(self, block: Block) -> list[Weights]:
-        """The same for every throw of a regime."""
+        """The same for every trial of a regime."""
         return [self._by_regime.get(block.regime, self._weights)] * block.count
 
     def update(self, rows: Sequence[Row]) -> None:
@@ -92,7 +92,7 @@ class Fixed:
 
 
 class RoundRobin:
-    """All combinations of alternatives in turn (of those not chosen by hand), from throw to throw
+    """All combinations of alternatives in turn (of those not chosen by hand), from trial to trial
     of a regime."""
 
     learns = False
@@ -106,7 +106,7 @@ class RoundRobin:
 
     def combination(self, index: int) -> dict[str, str]:
         """Combination number `index` (counted on and on): the first primitive task changes with
-        each throw."""
+        each trial."""
         out = {}
         for task, actions in self._alternatives.items():
             index, which = divmod(index, len(actions))
@@ -114,7 +114,7 @@ class RoundRobin:
         return out
 
     def weights(self, block: Block) -> list[Weights]:
-        """One combination for each throw."""
+        """One combination for each trial."""
         combinations = [self.combination(block.regime_first + k) for k in range(block.count)]
         return [{task: {action: 1.0} for task, action in c.items()} for c in combinations]
 
@@ -135,7 +135,7 @@ class Random(RoundRobin):
     forecasts train on."""
 
     def weights(self, block: Block) -> list[Weights]:
-        """The same for every throw."""
+        """The same for every trial."""
         even: Weights = {
             task: dict.fromkeys(actions, 1.0 / len(actions))
             for task, actions in self._alternatives.items()
@@ -146,7 +146,7 @@ class Random(RoundRobin):
 class Learned:
     """A learner for each primitive task with alternatives and each regime (docs/learning.md).
 
-    One choice for each throw and primitive task: a run that is repeated within its throw takes the
+    One choice for each trial and primitive task: a run that is repeated within its trial takes the
     same action again.
     """
 
@@ -169,7 +169,7 @@ class Learned:
         }
 
     def weights(self, block: Block) -> list[Weights]:
-        """A choice for each throw. Each is counted as a trial for the others of its batch, until
+        """A choice for each trial. Each is counted as a trial for the others of its batch, until
         the batch is known."""
         if self._before is None:
             self._before = self._learning.state()
@@ -194,7 +194,7 @@ class Learned:
         self._before = None
         for row in rows:
             context = context_of(row.regime)
-            for run in row.throw.runs if row.throw is not None else ():
+            for run in row.trial.runs if row.trial is not None else ():
                 name = self._task.primitive_task_of(run.place).name
                 self._learning.apply(Choice(name, run.action, context))
                 self._learning.apply(End(name, run.action, context, observation(self._task, run)))

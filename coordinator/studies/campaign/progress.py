@@ -19,7 +19,7 @@ def clock(seconds: float) -> str:
 
 
 def line(progress: Progress) -> str:
-    """The line: a bar, how many throws are done, how many met their goal in this session, time gone
+    """The line: a bar, how many trials are done, how many met their goal in this session, time gone
     and to go."""
     full = round(WIDTH * progress.done / max(1, progress.of))
     fresh = progress.done - progress.already

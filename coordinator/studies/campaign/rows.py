@@ -1,4 +1,4 @@
-"""One row of a campaign's table: what the columns are, and a throw as a row and back. Columns come
+"""One row of a campaign's table: what the columns are, and a trial as a row and back. Columns come
 from task and score."""
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.coordinator.studies.campaign.plan import Block
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import Kind, Task
 from petrobot.services.host.json_text import json_text
 
@@ -28,20 +28,20 @@ GENERAL = (
     "at",
     "mission_s",
 )
-"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the throw took; `at`: s
+"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the trial took; `at`: s
 since the mission began."""
 BY_PLACE = ("status", "cause", "seconds", "cost")
-"""Of the throw's first run in a place; all runs stand in the column `runs`."""
+"""Of the trial's first run in a place; all runs stand in the column `runs`."""
 LAST = ("more", "runs", "waits", "fired")
 """JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run;
-Throw.waits, Throw.fired."""
+Trial.waits, Trial.fired."""
 
 Cell = str | int | float | None
 
 
 @dataclass
 class Row:
-    """A throw of a campaign. `throw` is None when the mission run was given up before it."""
+    """A trial of a campaign. `trial` is None when the mission run was given up before it."""
 
     n: int
     regime: str
@@ -49,14 +49,14 @@ class Row:
     k: int
     block: int
     mission_s: float
-    throw: Throw | None
+    trial: Trial | None
     score: dict[str, Any] = field(default_factory=dict)
     """The task's own results, as `table.column`."""
 
 
 def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
     """The rows of a block's result."""
-    throws = {t["k"]: Throw.from_plain(t) for t in result["throws"]}
+    trials = {t["k"]: Trial.from_plain(t) for t in result["trials"]}
     return [
         Row(
             block.first + k,
@@ -65,7 +65,7 @@ def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
             k,
             block.index,
             result["mission_s"],
-            throws.get(k),
+            trials.get(k),
             dict(result["score"][k - 1]),
         )
         for k in range(1, block.count + 1)
@@ -88,7 +88,7 @@ def columns(task: Task, rows: Sequence[Row]) -> list[str]:
 
 def cells(task: Task, row: Row, names: Sequence[str]) -> list[str]:
     """A row as texts, in the order of the columns."""
-    found = {**_general(row), **_runs(task, row.throw), **row.score}
+    found = {**_general(row), **_runs(task, row.trial), **row.score}
     more = {k: v for k, v in row.score.items() if k not in names}
     found["more"] = _json(more) if more else ""
     return [_text(found.get(name)) for name in names]
@@ -96,24 +96,24 @@ def cells(task: Task, row: Row, names: Sequence[str]) -> list[str]:
 
 def _general(row: Row) -> dict[str, Any]:
     base = {name: getattr(row, name) for name in ("n", "regime", "seed", "k", "block", "mission_s")}
-    throw = row.throw
-    if throw is None:
+    trial = row.trial
+    if trial is None:
         return {**base, "begun": False}
     own = {
         "begun": True,
-        "at": throw.begun,
-        "waits": _json([list(w) for w in throw.waits]),
-        "fired": _json(throw.fired),
+        "at": trial.begun,
+        "waits": _json([list(w) for w in trial.waits]),
+        "fired": _json(trial.fired),
     }
     own |= {
-        name: getattr(throw, name) for name in ("status", "cause", "completed", "goals", "time")
+        name: getattr(trial, name) for name in ("status", "cause", "completed", "goals", "time")
     }
-    return {**base, **own, "runs": _json([run.to_plain() for run in throw.runs])}
+    return {**base, **own, "runs": _json([run.to_plain() for run in trial.runs])}
 
 
-def _runs(task: Task, throw: Throw | None) -> dict[str, Any]:
+def _runs(task: Task, trial: Trial | None) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for run in throw.runs if throw else ():
+    for run in trial.runs if trial else ():
         primitive = task.primitive_task_of(run.place).name
         found.setdefault(f"chosen.{primitive}", run.action)
         if f"{run.place}.status" not in found:
@@ -141,9 +141,9 @@ def _text(value: Any) -> str:
 
 def read_row(record: Mapping[str, str]) -> Row:
     """A row back from its texts. Raises KeyError or ValueError for a record that is none."""
-    throw = None
+    trial = None
     if record["begun"] == "true":
-        throw = Throw(
+        trial = Trial(
             int(record["k"]),
             float(record["at"]),
             _number(record["time"]),
@@ -164,7 +164,7 @@ def read_row(record: Mapping[str, str]) -> Row:
         int(record["k"]),
         int(record["block"]),
         float(record["mission_s"]),
-        throw,
+        trial,
         own,
     )
 

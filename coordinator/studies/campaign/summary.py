@@ -24,12 +24,12 @@ from petrobot.coordinator.task import PrimitiveTask, Task
 
 @dataclass
 class Counts:
-    """Throws of one regime, or of all."""
+    """Trials of one regime, or of all."""
 
     runs: int = 0
-    """Throws that were begun."""
+    """Trials that were begun."""
     not_begun: int = 0
-    """Throws for which the mission run was given up before."""
+    """Trials for which the mission run was given up before."""
     goals: int = 0
     completed: int = 0
     all_success: int = 0
@@ -37,16 +37,16 @@ class Counts:
     """s, of the completed ones."""
 
     def add(self, row: Row) -> None:
-        """Count a throw."""
-        if row.throw is None:
+        """Count a trial."""
+        if row.trial is None:
             self.not_begun += 1
             return
         self.runs += 1
-        self.goals += row.throw.goals > 0
-        self.completed += row.throw.completed
-        self.all_success += row.throw.all_success
-        if row.throw.completed and row.throw.time is not None:
-            self.times.append(row.throw.time)
+        self.goals += row.trial.goals > 0
+        self.completed += row.trial.completed
+        self.all_success += row.trial.all_success
+        if row.trial.completed and row.trial.time is not None:
+            self.times.append(row.trial.time)
 
     def to_plain(self, has_goal: bool) -> dict[str, Any]:
         """Plain data; R_goal of a task without goal transitions is none."""
@@ -142,7 +142,7 @@ class Summary:
         self.whole.add(row)
         self.by_regime.setdefault(row.regime, Counts()).add(row)
         self.mission_s[row.block] = row.mission_s
-        for run in row.throw.runs if row.throw is not None else ():
+        for run in row.trial.runs if row.trial is not None else ():
             primitive = self.task.primitive_task_of(run.place).name
             actions = self.chosen.setdefault(primitive, {})
             actions[run.action] = actions.get(run.action, 0) + 1

@@ -40,11 +40,11 @@ class Table:
         if header is None:
             self.path.unlink()
             return 0
-        done, end, throws = 0, header, 0
+        done, end, trials = 0, header, 0
         for block in blocks:
             last = None
-            while throws < block.first + block.count and (last := next(ends, None)) is not None:
-                throws += 1
+            while trials < block.first + block.count and (last := next(ends, None)) is not None:
+                trials += 1
             if last is None:
                 break
             done, end = done + 1, last

@@ -1,8 +1,8 @@
-"""What one throw was: one token out of the runs place and all that came of it, as plain data; and
+"""What one trial was: one token out of the runs place and all that came of it, as plain data; and
 who writes it down.
 
-A *throw* here is one run of a task, whatever the task does (design: "mission run" is a whole
-execution, which may hold several). A task without a runs place has one throw in each mission run.
+A *trial* here is one run of a task, whatever the task does (design: "mission run" is a whole
+execution, which may hold several). A task without a runs place has one trial in each mission run.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ CostOf = Callable[[RunRecorded, Mapping[str, Any]], float | None]
 
 @dataclass(slots=True)
 class RunEntry:
-    """One run of an action within a throw. Times in s."""
+    """One run of an action within a trial. Times in s."""
 
     place: str
     action: str
     begun: float
-    """When its token came into the place, since the throw's begin."""
+    """When its token came into the place, since the trial's begin."""
     took: float = 0.0
     """From there until the coordinator knew its end, or a preempting transition took the token:
     with all waiting."""
@@ -72,7 +72,7 @@ class RunEntry:
 
 
 @dataclass(slots=True)
-class Throw:
+class Trial:
     """One run of the task. Times in s."""
 
     k: int
@@ -82,7 +82,7 @@ class Throw:
     time: float | None = None
     """Until every token was back where it stood before; None if it never was."""
     completed: bool = False
-    """The task could go on, or was over as designed; False when it was given up in this throw."""
+    """The task could go on, or was over as designed; False when it was given up in this trial."""
     goals: int = 0
     """Firings of goal transitions."""
     status: str = Status.SUCCESS.value
@@ -112,7 +112,7 @@ class Throw:
         }
 
     @classmethod
-    def from_plain(cls, data: Mapping[str, Any]) -> Throw:
+    def from_plain(cls, data: Mapping[str, Any]) -> Trial:
         """Back from `to_plain`."""
         runs = [RunEntry.from_plain(run) for run in data["runs"]]
         return cls(
@@ -124,8 +124,8 @@ class Throw:
         )
 
 
-class ThrowLog:
-    """An observer of the executor that writes down each throw."""
+class TrialLog:
+    """An observer of the executor that writes down each trial."""
 
     def __init__(self, task: Task, cost_of: CostOf) -> None:
         flat = task.flat
@@ -139,15 +139,15 @@ class ThrowLog:
             if (t.events or t.after is not None)
             and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
         }
-        self.throws: list[Throw] = []
+        self.trials: list[Trial] = []
         self._since = dict.fromkeys(self._net.places, 0.0)
-        self._entries: dict[str, tuple[Throw, RunEntry]] = {}
+        self._entries: dict[str, tuple[Trial, RunEntry]] = {}
         self._going: dict[str, float] = {}
         self._values: dict[str, Mapping[str, Any]] = {}
         self._ends: dict[int, list[RunEntry]] = {}
-        """By throw: its runs in the order in which they ended."""
+        """By trial: its runs in the order in which they ended."""
         self._given_up: str | None = None
-        """Why the mission run ended before its last throw was completed, if it did."""
+        """Why the mission run ended before its last trial was completed, if it did."""
         self._origin: float | None = None
 
     # --- an observer --------------------------------------------------------------------------
@@ -163,7 +163,7 @@ class ThrowLog:
             self._values[stimulus.run] = stimulus.values
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Keep what a throw is made of."""
+        """Keep what a trial is made of."""
         if isinstance(instruction, Fired):
             self._fired(now, instruction)
         elif isinstance(instruction, StartRun):
@@ -184,10 +184,10 @@ class ThrowLog:
     # --- what happened ------------------------------------------------------------------------
 
     def _begin(self, now: float) -> None:
-        if self.throws:
-            self.throws[-1].completed = True
+        if self.trials:
+            self.trials[-1].completed = True
         assert self._origin is not None
-        self.throws.append(Throw(len(self.throws) + 1, round(now - self._origin, DIGITS)))
+        self.trials.append(Trial(len(self.trials) + 1, round(now - self._origin, DIGITS)))
 
     def _fired(self, now: float, fired: Fired) -> None:
         if (
@@ -200,22 +200,22 @@ class ThrowLog:
                 self._entries[run][1].taken = fired.transition
                 if run in self._going:  # preempted
                     self._ended(now, run)
-        if not self.throws:
+        if not self.trials:
             return
-        throw = self.throws[-1]
-        throw.goals += fired.transition in self._goals
-        throw.fired[fired.transition] = throw.fired.get(fired.transition, 0) + 1
+        trial = self.trials[-1]
+        trial.goals += fired.transition in self._goals
+        trial.fired[fired.transition] = trial.fired.get(fired.transition, 0) + 1
         if fired.transition in self._waiting:
             since = max(
                 (self._since[place] for place, _ in self._waiting[fired.transition]), default=now
             )
-            throw.waits.append((fired.transition, round(now - since, DIGITS)))
+            trial.waits.append((fired.transition, round(now - since, DIGITS)))
         for name, before, after in zip(self._net.places, fired.before, fired.after, strict=True):
             if after > before:
                 self._since[name] = now
-        if throw.time is None and self._idle(fired.after):
-            throw.completed = True
-            throw.time = self._span(now, throw)
+        if trial.time is None and self._idle(fired.after):
+            trial.completed = True
+            trial.time = self._span(now, trial)
 
     def _idle(self, marking: Marking) -> bool:
         """Whether all but the runs left is as it was at first."""
@@ -227,17 +227,17 @@ class ThrowLog:
             and marking[own + 1 :] == self._net.initial[own + 1 :]
         )
 
-    def _span(self, now: float, throw: Throw) -> float:
+    def _span(self, now: float, trial: Trial) -> float:
         assert self._origin is not None
-        return round(now - self._origin - throw.begun, DIGITS) + 0.0  # no -0.0
+        return round(now - self._origin - trial.begun, DIGITS) + 0.0  # no -0.0
 
     def _entry(self, now: float, start: StartRun) -> RunEntry:
-        throw = self.throws[-1] if self.throws else None
+        trial = self.trials[-1] if self.trials else None
         came = self._since[start.place]
-        entry = RunEntry(start.place, start.action, self._span(came, throw) if throw else 0.0)
-        if throw is not None:
-            throw.runs.append(entry)
-            self._entries[start.run], self._going[start.run] = (throw, entry), came
+        entry = RunEntry(start.place, start.action, self._span(came, trial) if trial else 0.0)
+        if trial is not None:
+            trial.runs.append(entry)
+            self._entries[start.run], self._going[start.run] = (trial, entry), came
         return entry
 
     def _ended(self, now: float, run: str) -> None:
@@ -260,7 +260,7 @@ class ThrowLog:
         ):  # else a preemption has taken its token, and the place may hold a later one
             self._since[record.place] = now
         self._ended(now, record.run)
-        throw, entry = known
+        trial, entry = known
         values = self._values.pop(record.run, {})
         entry.status = record.status.value if record.status is not None else ""
         entry.cause = record.cause if record.status is not Status.SUCCESS else ""
@@ -269,32 +269,32 @@ class ThrowLog:
         entry.values = _numbers(values)
         cost = self._cost_of(record, values)
         entry.cost = None if cost is None else round(cost, DIGITS)
-        self._ends.setdefault(throw.k, []).append(entry)
-        if _RANK[entry.status] > _RANK[throw.status]:
-            throw.status, throw.cause = entry.status, entry.cause
+        self._ends.setdefault(trial.k, []).append(entry)
+        if _RANK[entry.status] > _RANK[trial.status]:
+            trial.status, trial.cause = entry.status, entry.cause
 
     def _corrected(self, corrected: Corrected) -> None:
-        """The verdict on a run replaces its status, and the throw is what its runs really came
+        """The verdict on a run replaces its status, and the trial is what its runs really came
         to."""
-        throw, entry = self._entries[corrected.run]
+        trial, entry = self._entries[corrected.run]
         entry.status, entry.text = corrected.status.value, corrected.text or entry.text
         entry.cause = corrected.cause if corrected.status is not Status.SUCCESS else ""
-        worst = max(self._ends[throw.k], key=lambda one: _RANK[one.status])
+        worst = max(self._ends[trial.k], key=lambda one: _RANK[one.status])
         bad = _RANK[worst.status] > _RANK[Status.SUCCESS.value]
-        throw.status, throw.cause = (
+        trial.status, trial.cause = (
             (worst.status, worst.cause) if bad else (Status.SUCCESS.value, "")
         )
-        if throw is self.throws[-1]:
-            self._give_up(throw)
+        if trial is self.trials[-1]:
+            self._give_up(trial)
 
-    def _give_up(self, last: Throw) -> None:
+    def _give_up(self, last: Trial) -> None:
         if self._given_up is not None:
             last.status, last.cause = Status.ERROR.value, last.cause or self._given_up
 
     def _finished(self, now: float, finished: Finished) -> None:
-        if not self.throws:
+        if not self.trials:
             return
-        last = self.throws[-1]
+        last = self.trials[-1]
         last.completed = last.completed or finished.status is Status.SUCCESS
         if last.completed and last.time is None:
             last.time = self._span(now, last)

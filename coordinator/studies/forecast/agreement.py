@@ -2,7 +2,7 @@
 equivalence, whole law.
 
 Shares: a beta-binomial predictive law whose weight is that of the forecast's own uncertainty
-(Jeffreys prior), so a share of 1 that was forecast from n throws still expects a miss in a further
+(Jeffreys prior), so a share of 1 that was forecast from n trials still expects a miss in a further
 n. Times: normal with the bootstrap's predictive deviation. Many comparisons: S. Holm, Scandinavian
 Journal of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is the
 measurement's 90 % interval lies within the margin about the forecast number (D. J. Schuirmann,
@@ -12,59 +12,22 @@ measurement's 90 % interval lies within the margin about the forecast number (D.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.stats import betabinom, binom, chi2_contingency, norm, t
+from scipy.stats import binom, chi2_contingency, norm, t
 
 from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.predict import GRID, SHARES, figures
 from petrobot.coordinator.studies.forecast.residual import measured, routing, ways_table
-
-# What tests of shares need: the predictive law of a share of new throws, and Holm's adjustment for many tests.
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjusted p-values: each may be compared with the level for all of them together."""
-    order = np.argsort(p_values, kind="stable")
-    out, largest = [0.0] * len(p_values), 0.0
-    for rank, i in enumerate(order):
-        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
-        out[i] = largest
-    return out
-
-
-def share_weight(value: float, sd: float, runs: int, training: int) -> float:
-    """How many throws the forecast of a share weighs: from its predictive deviation less the noise
-    of `runs` new throws.
-
-    At most as much as the training throws themselves; exactly that where the bootstrap saw no
-    variation.
-    """
-    noise = value * (1.0 - value)
-    own = sd * sd - noise / runs
-    return float(training) if noise <= 0.0 or own <= noise / training else max(2.0, noise / own)
-
-
-def _beta(value: float, weight: float) -> tuple[float, float]:
-    return value * weight + 0.5, (1.0 - value) * weight + 0.5
-
-
-def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
-    """In which a share of n new throws is expected."""
-    a, b = _beta(value, weight)
-    low, high = betabinom.ppf([(1 - level) / 2, (1 + level) / 2], n, a, b)
-    return [round(float(low) / n, 6), round(float(high) / n, 6)]
-
-
-def share_p_value(value: float, weight: float, count: int, n: int) -> float:
-    """Two-sided p-value of `count` successes among n new throws."""
-    a, b = _beta(value, weight)
-    below, above = float(betabinom.cdf(count, n, a, b)), float(betabinom.sf(count - 1, n, a, b))
-    return min(1.0, 2.0 * min(below, above))
-
+from petrobot.coordinator.studies.forecast.shares import (
+    holm,
+    predictive_interval,
+    share_p_value,
+    share_weight,
+)
 
 FAMILY = ("R_goal", "P_complete", "mean", "q90")
 """What is judged together by Holm, in all regimes."""
@@ -110,7 +73,7 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
     played = measured(training)
     value, found = figures(played)[figure], said["figures"][figure]
     times = played.time[~np.isnan(played.time)]
-    n = len(training.throws)
+    n = len(training.trials)
     row: dict[str, Any] = {
         "regime": regime,
         "figure": figure,
@@ -127,14 +90,14 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
     if found["value"] is None or row["measured"] is None:
         return row
     if figure in SHARES:
-        weight = share_weight(found["value"], found["sd"], said["runs"], said["training_throws"])
+        weight = share_weight(found["value"], found["sd"], said["runs"], said["training_trials"])
         row["interval"] = predictive_interval(found["value"], weight, n)
         row["p"] = share_p_value(found["value"], weight, round(value * n), n)
         low, high = wilson(round(value * n), n, EQUIVALENCE)
         row["margin"] = MARGIN_SHARE
     else:
         row["p"] = time_p_value(
-            found["value"], found["sd"], value, said["runs"], len(times), said["training_throws"]
+            found["value"], found["sd"], value, said["runs"], len(times), said["training_trials"]
         )
         low, high = mean_interval(times) if figure == "mean" else quantile_interval(times, 0.9)
         row["margin"] = round(MARGIN_TIME * found["value"], 6)
@@ -146,7 +109,7 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
 
 
 def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, training: int) -> float:
-    """Two-sided p-value of a time of n new throws, given the predictive deviation for `runs` of
+    """Two-sided p-value of a time of n new trials, given the predictive deviation for `runs` of
     them (both from n^-1/2 laws)."""
     scaled = sd * math.sqrt((1.0 / n + 1.0 / training) / (1.0 / runs + 1.0 / training))
     if scaled <= 0.0:
@@ -177,9 +140,9 @@ def quantile_interval(times: Values, q: float, level: float = EQUIVALENCE) -> tu
 
 def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
     """The negative control: the product of marginal reliabilities as a forecast of R_conj."""
-    value, n = said["product"]["R_conj"], len(training.throws)
+    value, n = said["product"]["R_conj"], len(training.trials)
     seen = figures(measured(training))["R_conj"]
-    p = share_p_value(value, float(said["training_throws"]), round(seen * n), n)
+    p = share_p_value(value, float(said["training_trials"]), round(seen * n), n)
     return {
         "regime": regime,
         "forecast": value,
@@ -213,7 +176,7 @@ def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, 
 def _routing(
     regime: str, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """For each place: chi-square test that training and new throws left it by the same ways equally
+    """For each place: chi-square test that training and new trials left it by the same ways equally
     often."""
     rows = []
     for place in before:

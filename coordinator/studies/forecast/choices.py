@@ -23,8 +23,8 @@ FEW = 30
 def choice_counts(training: Training) -> dict[str, dict[str, int]]:
     """How often each action was run."""
     counts: dict[str, dict[str, int]] = {}
-    for throw in training.throws:
-        for run in throw.runs:
+    for trial in training.trials:
+        for run in trial.runs:
             actions = counts.setdefault(training.task.primitive_task_of(run.place).name, {})
             actions[run.action] = actions.get(run.action, 0) + 1
     return counts
@@ -50,7 +50,7 @@ def misfit(said: Mapping[str, Any], run: Counts) -> list[str]:
 
 def _alike(said: Mapping[str, Any], name: str, counts: Mapping[str, float]) -> bool:
     chosen: Mapping[str, float] = {a: p for a, p in said["choices"][name].items() if p > 0}
-    trained = said.get("choice_runs", {}).get(name, said["training_throws"])
+    trained = said.get("choice_runs", {}).get(name, said["training_trials"])
     others = sum(n for action, n in counts.items() if action not in chosen)
     if len(chosen) == 1 and (name in said.get("asked", [name]) or trained >= FEW):
         return others == 0

@@ -3,7 +3,7 @@ tell apart.
 
 Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on
 which the response depends most significantly splits the runs, again and again, until no test
-rejects independence. Factors are what had ended before in the same throw: in each action place
+rejects independence. Factors are what had ended before in the same trial: in each action place
 outcome, action and duration of the latest run, and the number of runs. First the outcome is
 unfolded so, then, for each outcome of each of these contexts, the duration: so a strong dependence
 among durations never hides one among outcomes. Within a context a duration keeps its linear trend
@@ -59,7 +59,7 @@ class Law:
     preempted: np.ndarray
     took: Values
     weight: Values
-    throw: Codes
+    trial: Codes
     trend: Trend | None = None
     """Durations only: how they go with an earlier one, within this context."""
 
@@ -97,7 +97,7 @@ class Split:
     edges: tuple[float, ...] = ()
     """took: where its classes end (s)."""
     missing: bool = False
-    """took: the first child is for throws in which no such run had ended."""
+    """took: the first child is for trials in which no such run had ended."""
     groups: Mapping[int, int] = field(default_factory=dict)
     """outcome, action, visits: child of each code; any other code has the last child."""
     p_value: float = 1.0
@@ -222,7 +222,7 @@ def _law(runs: Runs, *, trend: bool) -> Law:
     whole = runs.weight.sum()
     weight = runs.weight / whole if whole else runs.weight
     return Law(
-        runs.outcome, runs.preempted, runs.took, weight, runs.throw, _trend(runs) if trend else None
+        runs.outcome, runs.preempted, runs.took, weight, runs.trial, _trend(runs) if trend else None
     )
 
 
@@ -247,7 +247,7 @@ def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
     independence.
 
     Of factors that tell about as much, one of the runs' own place: branches side by side go on in
-    step, so the visits of one tell those of the other in every throw that was run, but the branches
+    step, so the visits of one tell those of the other in every trial that was run, but the branches
     drift apart where they are played.
     """
     response = runs.outcome if outcomes else _classes(runs.took)
@@ -329,10 +329,10 @@ def crossed(one: Codes, other: Codes) -> np.ndarray:
 
 
 def dependences(training: Training) -> list[dict[str, Any]]:
-    """Chi-square tests of the statuses of two places within one throw (first runs), the most
+    """Chi-square tests of the statuses of two places within one trial (first runs), the most
     significant first."""
     vocabulary, runs = training.vocabulary, training.runs
-    status = first_statuses(vocabulary, runs, len(training.throws))
+    status = first_statuses(vocabulary, runs, len(training.trials))
     out = []
     for i, one in enumerate(vocabulary.places):
         for j in range(i + 1, len(vocabulary.places)):
@@ -345,21 +345,21 @@ def dependences(training: Training) -> list[dict[str, Any]]:
             if min(table.shape) < 2:
                 continue
             p = float(chi2_contingency(table).pvalue)
-            out.append({"places": [one, vocabulary.places[j]], "throws": int(both.sum()), "p": p})
+            out.append({"places": [one, vocabulary.places[j]], "trials": int(both.sum()), "p": p})
     return sorted(out, key=lambda d: float(d["p"]))
 
 
-def first_statuses(vocabulary: Vocabulary, runs: Runs, throws: int) -> Codes:
-    """(q, throws): status code of the first run in each place of each throw; CENSORED - 1 where
+def first_statuses(vocabulary: Vocabulary, runs: Runs, trials: int) -> Codes:
+    """(q, trials): status code of the first run in each place of each trial; CENSORED - 1 where
     there is none."""
-    out = np.full((len(vocabulary.places), throws), CENSORED - 1)
+    out = np.full((len(vocabulary.places), trials), CENSORED - 1)
     status, _ = vocabulary.parts(runs.outcome)
     for i in range(len(runs) - 1, -1, -1):
-        out[runs.place[i], runs.throw[i]] = status[i]
+        out[runs.place[i], runs.trial[i]] = status[i]
     return out
 
 
-# Draws ends of runs and waits from laws, for many replicas at once, each with its own bootstrap weights of the throws.
+# Draws ends of runs and waits from laws, for many replicas at once, each with its own bootstrap weights of the trials.
 
 Mask = NDArray[np.bool_]
 
@@ -377,7 +377,7 @@ class Ends:
 
 
 class Drawer:
-    """`weights` (replicates, throws): how often each training throw counts in each replicate; `of`
+    """`weights` (replicates, trials): how often each training trial counts in each replicate; `of`
     each column's replicate."""
 
     def __init__(
@@ -419,7 +419,7 @@ class Drawer:
     ) -> None:
         """First the outcome, then the duration from the outcome's own tree."""
         law = leaf.law
-        index = self._draw(leaf.number, law.weight, law.throw, replicate[columns])
+        index = self._draw(leaf.number, law.weight, law.trial, replicate[columns])
         if not leaf.durations and not law.beyond.any():
             out.took[columns] = law.took[index] + _along(law, index, seen.took[:, columns])
             np.clip(out.took, 0.0, None, out=out.took)
@@ -443,7 +443,7 @@ class Drawer:
             return
         index = seen[
             self._draw(
-                (leaf.number, "beyond"), law.weight[seen], law.throw[seen], replicate[columns]
+                (leaf.number, "beyond"), law.weight[seen], law.trial[seen], replicate[columns]
             )
         ]
         out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
@@ -453,17 +453,17 @@ class Drawer:
         """Waits of a transition (s), one for each column; None if it was never measured."""
         if transition not in self._waits:
             return None
-        seconds, throws = self._waits[transition]
-        index = self._draw(transition, np.full(len(seconds), 1.0 / len(seconds)), throws, replicate)
+        seconds, trials = self._waits[transition]
+        index = self._draw(transition, np.full(len(seconds), 1.0 / len(seconds)), trials, replicate)
         drawn: Values = seconds[index]
         return drawn
 
-    def _draw(self, key: object, weight: Values, throws: Codes, replicate: Codes) -> Codes:
+    def _draw(self, key: object, weight: Values, trials: Codes, replicate: Codes) -> Codes:
         """A member for each column, by its replicate's weights; by the plain ones where those leave
         none."""
         bounds = self._bounds.get(key)
         if bounds is None:
-            each = weight * self._weights[:, throws]
+            each = weight * self._weights[:, trials]
             each = np.where(each.sum(axis=1, keepdims=True) > 0, each, weight)
             bounds = np.cumsum(each, axis=1)
             bounds = bounds / bounds[:, -1:] + np.arange(len(bounds))[:, None]

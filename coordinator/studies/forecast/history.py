@@ -1,5 +1,5 @@
 """Runs of a campaign as arrays: what each came to, how long it took, and what had ended before it
-in its throw."""
+in its trial."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from petrobot.coordinator.learning.estimates_file import EstimatesError, Estimat
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
 from petrobot.coordinator.studies.campaign.rows import Row
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
-from petrobot.coordinator.studies.forecast.registered import ForecastError
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import End, Kind, Status, Task, Transition
 
 Codes = NDArray[np.int64]
@@ -28,10 +27,14 @@ Values = NDArray[np.float64]
 CENSORED = -1
 """Status code of a run that was preempted and counts none."""
 NONE = 0
-"""Outcome and action code of a place where no run has ended in this throw yet."""
+"""Outcome and action code of a place where no run has ended in this trial yet."""
 CUT = 1
 """Outcome code of a run that nothing is known to end: no status, and no transition took it."""
 STATUSES: Final[tuple[Status, ...]] = tuple(Status)
+
+
+class ForecastError(Exception):
+    """A forecast file cannot be made or used; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class Vocabulary:
 
 @dataclass(frozen=True)
 class Seen:
-    """What had ended before in the same throw. Arrays (q places, n columns)."""
+    """What had ended before in the same trial. Arrays (q places, n columns)."""
 
     outcome: Codes
     """Of the latest run in each place; NONE without any."""
@@ -124,7 +127,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Runs:
-    """All runs of some throws. `n` runs, `q` action places."""
+    """All runs of some trials. `n` runs, `q` action places."""
 
     place: Codes
     action: Codes
@@ -136,8 +139,8 @@ class Runs:
     """Something cut it off: its own end is not known, only that it had lasted so long."""
     took: Values
     """s from the token's coming to its end."""
-    throw: Codes
-    """Index of its throw."""
+    trial: Codes
+    """Index of its trial."""
     weight: Values
     seen: Seen
 
@@ -150,7 +153,7 @@ class Runs:
             self.preempted[which],
             self.censored[which],
             self.took[which],
-            self.throw[which],
+            self.trial[which],
             self.weight[which],
             self.seen.of(which),
         )
@@ -161,30 +164,30 @@ class Runs:
 
 @dataclass(frozen=True)
 class Training:
-    """What a regime's throws are known to be."""
+    """What a regime's trials are known to be."""
 
     task: Task
     vocabulary: Vocabulary
-    throws: tuple[Throw, ...]
+    trials: tuple[Trial, ...]
     runs: Runs
     waits: dict[str, tuple[Values, Codes]]
-    """By waiting transition: seconds of each firing, and the throw that it belongs to."""
+    """By waiting transition: seconds of each firing, and the trial that it belongs to."""
     whole: bool = True
-    """Its throws are those that were run; else each holds a single run or wait, and what a throw
+    """Its trials are those that were run; else each holds a single run or wait, and what a trial
     came to is not known."""
 
     @classmethod
-    def of(cls, task: Task, throws: Iterable[Throw], *, whole: bool = True) -> Training:
-        """Of throws. Raises ValueError without any."""
-        kept, vocabulary = tuple(throws), Vocabulary.of(task)
+    def of(cls, task: Task, trials: Iterable[Trial], *, whole: bool = True) -> Training:
+        """Of trials. Raises ValueError without any."""
+        kept, vocabulary = tuple(trials), Vocabulary.of(task)
         if not kept:
-            raise ValueError("no throw to learn from")
+            raise ValueError("no trial to learn from")
         waits: dict[str, list[tuple[float, int]]] = {}
         timers = _cutting_timers(task)
-        for i, throw in enumerate(kept):
+        for i, trial in enumerate(kept):
             for name, seconds in (
-                *throw.waits,
-                *((t, s) for t in timers for s in _waited(t, throw)),
+                *trial.waits,
+                *((t, s) for t in timers for s in _waited(t, trial)),
             ):
                 waits.setdefault(name, []).append((seconds, i))
         return cls(
@@ -202,11 +205,11 @@ class Training:
 
 def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
     """The training of each regime of a table."""
-    throws: dict[str, list[Throw]] = {}
+    trials: dict[str, list[Trial]] = {}
     for row in rows:
-        if row.throw is not None:
-            throws.setdefault(row.regime, []).append(row.throw)
-    return {regime: Training.of(task, kept) for regime, kept in throws.items()}
+        if row.trial is not None:
+            trials.setdefault(row.regime, []).append(row.trial)
+    return {regime: Training.of(task, kept) for regime, kept in trials.items()}
 
 
 def _cutting_timers(task: Task) -> list[str]:
@@ -223,11 +226,11 @@ def _cutting_timers(task: Task) -> list[str]:
     ]
 
 
-def _waited(timer: str, throw: Throw) -> list[float]:
+def _waited(timer: str, trial: Trial) -> list[float]:
     """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended,
     where it takes ended ones)."""
     by_place: dict[str, list[RunEntry]] = {}
-    for run in throw.runs:
+    for run in trial.runs:
         if run.taken == timer:
             by_place.setdefault(run.place, []).append(run)
     out = []
@@ -237,10 +240,10 @@ def _waited(timer: str, throw: Throw) -> list[float]:
     return out
 
 
-def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
+def _runs(vocabulary: Vocabulary, trials: tuple[Trial, ...]) -> Runs:
     places = {name: i for i, name in enumerate(vocabulary.places)}
     actions = {name: i + 1 for i, name in enumerate(vocabulary.actions)}
-    flat = [(i, run) for i, throw in enumerate(throws) for run in throw.runs if run.place in places]
+    flat = [(i, run) for i, trial in enumerate(trials) for run in trial.runs if run.place in places]
     codes = [_outcome(vocabulary, run) for _, run in flat]
     n, q = len(flat), len(places)
     seen = Seen.nothing(q, n)
@@ -273,7 +276,7 @@ def _runs(vocabulary: Vocabulary, throws: tuple[Throw, ...]) -> Runs:
 
 
 def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int) -> list[int]:
-    """Runs of the same throw that had ended when run j began, in the order of their ends."""
+    """Runs of the same trial that had ended when run j began, in the order of their ends."""
     came = flat[j][1].begun
     over = [
         i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9
@@ -323,28 +326,28 @@ def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
     """Of estimates, by regime."""
     regimes = sorted({regime_of(key.context) for key in estimates.tallies})
     return {
-        regime: Training.of(task, _throws(task, estimates, regime), whole=False)
+        regime: Training.of(task, _trials(task, estimates, regime), whole=False)
         for regime in regimes
     }
 
 
-def _throws(task: Task, estimates: Estimates, regime: str) -> list[Throw]:
-    """A throw of its own for each run of the samples, as often as it stands for a run that was
+def _trials(task: Task, estimates: Estimates, regime: str) -> list[Trial]:
+    """A trial of its own for each run of the samples, as often as it stands for a run that was
     counted."""
     flat, context = task.flat, context_of(regime)
-    out: list[Throw] = []
+    out: list[Trial] = []
     for place in flat.places.values():
         if place.kind is not Kind.ACTION:
             continue
         for key, tally in estimates.tallies.items():
             if (key.primitive_task, key.context) == (place.task, context):
                 out += [
-                    Throw(1, 0.0, runs=[run])
+                    Trial(1, 0.0, runs=[run])
                     for run in _runs_of_sums(place.name, key.action, tally)
                 ]
     for where, flow in estimates.flows.items():
         if (where.task, where.context) == (task.name, context) and flow.waits.n:
-            out.append(Throw(1, 0.0, waits=[(where.transition, flow.waits.mean)]))
+            out.append(Trial(1, 0.0, waits=[(where.transition, flow.waits.mean)]))
     return out
 
 

@@ -1,4 +1,4 @@
-"""Plays throws of a task through its net, many side by side: runs end as their laws draw, the net
+"""Plays trials of a task through its net, many side by side: runs end as their laws draw, the net
 says what follows.
 
 This is the generalised semi-Markov process of docs/forecast.md: when a token enters an action place
@@ -23,7 +23,7 @@ from petrobot.coordinator.task.net import Marking
 
 IDLE, GOING, DONE = 0, 1, 2
 LONGEST = 10_000
-"""Firings without time going on, and steps of a throw, after which it counts as one that never
+"""Firings without time going on, and steps of a trial, after which it counts as one that never
 ends."""
 Choices = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
@@ -31,7 +31,7 @@ Choices = Mapping[str, Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Played:
-    """What throws came to. Arrays (columns,); a throw that never ended has not completed."""
+    """What trials came to. Arrays (columns,); a trial that never ended has not completed."""
 
     goals: Codes
     completed: Mask
@@ -39,19 +39,19 @@ class Played:
     time: Values
     """s from the taking of the run token to the end; nan for those that did not complete."""
     endless: int = 0
-    """Throws that were cut off after `longest` steps."""
+    """Trials that were cut off after `longest` steps."""
     beyond: Mapping[str, int] = field(default_factory=dict)
-    """By action place: throws in which a run went on for longer than any run that was seen, before
+    """By action place: trials in which a run went on for longer than any run that was seen, before
     anything took it."""
     astray: Mapping[str, int] = field(default_factory=dict)
-    """By transition: throws in which its measured preemption came when the marking did not allow
+    """By transition: trials in which its measured preemption came when the marking did not allow
     it."""
     ways: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """By action place: how often each transition took a token out of it."""
 
 
 class Play:
-    """Throws under way; `replicate` (columns,) says whose bootstrap weights each one draws with."""
+    """Trials under way; `replicate` (columns,) says whose bootstrap weights each one draws with."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Play:
         replicate: Codes,
         longest: int = LONGEST,
     ) -> None:
-        """`longest`: steps (ends of runs and of waits) of a throw at most. Raises ValueError for a
+        """`longest`: steps (ends of runs and of waits) of a trial at most. Raises ValueError for a
         choice without probabilities."""
         self._longest = longest
         self._s, self._drawer = structure, drawer

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.studies.forecast.agreement import predictive_interval, share_weight
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws, dependences
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
 from petrobot.coordinator.studies.forecast.residual import doubts, residuals, routing
+from petrobot.coordinator.studies.forecast.shares import predictive_interval, share_weight
 
 POINT = 40_000
-"""Throws played for the expected numbers: the simulation's own error of a share is then below 0.25
+"""Trials played for the expected numbers: the simulation's own error of a share is then below 0.25
 points."""
 REPLICATES = 200
 TOGETHER = 25_000
-"""Throws played side by side."""
+"""Trials played side by side."""
 LEVEL = 0.95
 SHARES = ("R_goal", "P_complete", "R_conj")
 TIMES = ("mean", "q90")
@@ -34,7 +34,7 @@ class Request:
     """What is asked of a forecast."""
 
     runs: int
-    """Throws that will be run."""
+    """Trials that will be run."""
     choices: Choices
     seed: int = 1
     replicates: int = REPLICATES
@@ -42,7 +42,7 @@ class Request:
 
 
 def figures(played: Played) -> dict[str, float]:
-    """The numbers that are forecast, of played or measured throws; times are nan where no throw
+    """The numbers that are forecast, of played or measured trials; times are nan where no trial
     completed."""
     times = played.time[played.completed & ~np.isnan(played.time)]
     return {
@@ -55,12 +55,12 @@ def figures(played: Played) -> dict[str, float]:
 
 
 def predict(training: Training, request: Request) -> dict[str, Any]:
-    """Forecast further throws of a regime. Raises ValueError for a choice that was never
+    """Forecast further trials of a regime. Raises ValueError for a choice that was never
     measured."""
     structure, laws = Structure.of(training.task), Laws(training)
     _refuse_unmeasured(training, laws, request.choices)
     random = np.random.default_rng(request.seed)
-    even = np.ones((1, len(training.throws)))
+    even = np.ones((1, len(training.trials)))
     residual = (
         residuals(training, _replayed(training, structure, laws, request)) if training.whole else []
     )
@@ -71,10 +71,10 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     point = figures(whole)
     times = whole.time[whole.completed]
     return {
-        "training_throws": len(training.throws),
+        "training_trials": len(training.trials),
         "runs": request.runs,
         "figures": {
-            name: _figure(name, point[name], samples[name], request, len(training.throws))
+            name: _figure(name, point[name], samples[name], request, len(training.trials))
             for name in (*SHARES, *TIMES)
         },
         "product": product_rule(training, request.choices),
@@ -94,7 +94,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
             for name, chosen in request.choices.items()
             if dict(chosen) != choices_of(training).get(name)
         ),
-        "not_back": sum(t.completed and t.time is None for t in training.throws),
+        "not_back": sum(t.completed and t.time is None for t in training.trials),
         "endless": round(whole.endless / request.point, 6),
         "assumptions": list(structure.assumptions),
     }
@@ -136,8 +136,8 @@ def _played(
 
 
 def _replayed(training: Training, structure: Structure, laws: Laws, request: Request) -> Played:
-    """Four times as many throws as were run, with the choices of the training."""
-    n = len(training.throws)
+    """Four times as many trials as were run, with the choices of the training."""
+    n = len(training.trials)
     own = Request(request.runs, choices_of(training), request.seed)
     random = np.random.default_rng([request.seed, 1])
     return _played(
@@ -146,9 +146,9 @@ def _replayed(training: Training, structure: Structure, laws: Laws, request: Req
 
 
 def longest_of(training: Training) -> int:
-    """Steps after which a played throw counts as endless: twenty times as many as the longest
+    """Steps after which a played trial counts as endless: twenty times as many as the longest
     measured one had, and a hundred."""
-    return 100 + 20 * max(len(throw.runs) + len(throw.waits) for throw in training.throws)
+    return 100 + 20 * max(len(trial.runs) + len(trial.waits) for trial in training.trials)
 
 
 def _bootstrap(
@@ -159,9 +159,9 @@ def _bootstrap(
     whole: Played,
     random: np.random.Generator,
 ) -> tuple[dict[str, Values], Values]:
-    """Figures of `runs` new throws under resampled training throws, and how far each law of the
+    """Figures of `runs` new trials under resampled training trials, and how far each law of the
     time is from the whole one."""
-    n = len(training.throws)
+    n = len(training.trials)
     at_once = max(1, TOGETHER // request.runs)
     found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
     distances: list[float] = []

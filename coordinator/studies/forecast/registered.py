@@ -18,7 +18,7 @@ from petrobot.coordinator.analysis.time.task_forecast import forecast as solve
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.propagation import Choice, measured_from
 from petrobot.coordinator.studies.campaign.observed import context_of
-from petrobot.coordinator.studies.forecast.history import Training
+from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, predict
 from petrobot.coordinator.task import Task
 from petrobot.services.host.json_text import finite, json_text
@@ -30,18 +30,14 @@ METHOD = (
     "contexts told apart by "
     "chi-square tests, with their measured durations (no phase-type fit); predictive "
     "intervals by a cluster bootstrap over "
-    "training throws, with the noise of the new runs. Beside it the exact solution of the "
+    "training trials, with the noise of the new runs. Beside it the exact solution of the "
     "stochastic view (GSPN): phase-type "
-    "durations, statuses of one throw independent of each other."
+    "durations, statuses of one trial independent of each other."
 )
 LARGEST = 50_000
 """Markings up to which the stochastic view is solved."""
 JUMPS = 20_000
 """Jumps of the uniformised chain up to which its quantile is worked out."""
-
-
-class ForecastError(Exception):
-    """A forecast file cannot be made or used; the text says why."""
 
 
 def register(
@@ -60,7 +56,7 @@ def register(
     for name, request in requests.items():
         if name not in trainings:
             raise ForecastError(
-                f"no throw of regime {name} was measured; there are {', '.join(trainings)}"
+                f"no trial of regime {name} was measured; there are {', '.join(trainings)}"
             )
         try:
             regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
@@ -114,6 +110,9 @@ def read(path: Path) -> dict[str, Any]:
         raise _no_forecast(path, "a table with schema and sha256 is missing") from fault
     if said != _hash(body):
         raise ForecastError(f"{path} was changed after it was registered")
+    for regime in found["regimes"].values():
+        if "training_throws" in regime:  # files registered before a throw became a trial
+            regime["training_trials"] = regime.pop("training_throws")
     return found
 
 

@@ -1,4 +1,4 @@
-"""Whether a forecast can be true: throws played with the training's own choices against the throws
+"""Whether a forecast can be true: trials played with the training's own choices against the trials
 that they were learned from."""
 
 from __future__ import annotations
@@ -14,28 +14,28 @@ from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.play import Choices, Played
 
 LEVEL = 0.01
-"""Level at which played and measured throws differ, over all tests of a regime (Holm)."""
+"""Level at which played and measured trials differ, over all tests of a regime (Holm)."""
 NEGLIGIBLE = 0.02
-"""Share of throws that may rest on a guess, or by which a share of played throws may miss the
+"""Share of trials that may rest on a guess, or by which a share of played trials may miss the
 measured one: what is less moves no forecast share by more than the margin of equivalence."""
 TIME, MEAN = "time", "mean time"
 OFF_TIME = 0.05
-"""The same of mean times (relative) and of shares of throws in classes of the time."""
+"""The same of mean times (relative) and of shares of trials in classes of the time."""
 
 
 def measured(training: Training) -> Played:
-    """Measured throws in the form of played ones."""
-    throws = training.throws
+    """Measured trials in the form of played ones."""
+    trials = training.trials
     return Played(
-        np.array([t.goals for t in throws], np.int64),
-        np.array([t.completed for t in throws], np.bool_),
-        np.array([t.all_success for t in throws], np.bool_),
-        np.array([np.nan if t.time is None or not t.completed else t.time for t in throws]),
+        np.array([t.goals for t in trials], np.int64),
+        np.array([t.completed for t in trials], np.bool_),
+        np.array([t.all_success for t in trials], np.bool_),
+        np.array([np.nan if t.time is None or not t.completed else t.time for t in trials]),
     )
 
 
 def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
-    """Chi-square tests that measured and played throws come from one law, with p, Holm's p and how
+    """Chi-square tests that measured and played trials come from one law, with p, Holm's p and how
     far off they are.
 
     Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which
@@ -70,7 +70,7 @@ def _shares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _same_mean(one: Values, other: Values) -> float:
-    """Welch's test: classes say little about a few throws that last very long."""
+    """Welch's test: classes say little about a few trials that last very long."""
     kept_one, kept_other = one[~np.isnan(one)], other[~np.isnan(other)]
     if min(len(kept_one), len(kept_other)) < 2 or kept_one.std() + kept_other.std() == 0:
         return 1.0
@@ -110,18 +110,18 @@ def _classes(times: Values, of: Values) -> Values:
 def routing(training: Training, choices: Choices | None = None) -> dict[str, dict[str, int]]:
     """By action place: how often each transition took a token out of it.
 
-    With `choices` only in throws all of whose runs might have been chosen so: they alone say how
-    such throws go on.
+    With `choices` only in trials all of whose runs might have been chosen so: they alone say how
+    such trials go on.
     """
     primitive = training.task.primitive_task_of
     out: dict[str, dict[str, int]] = {}
-    for throw in training.throws:
+    for trial in training.trials:
         if choices is not None and any(
             choices.get(primitive(run.place).name, {run.action: 1.0}).get(run.action, 0.0) <= 0
-            for run in throw.runs
+            for run in trial.runs
         ):
             continue
-        for run in throw.runs:
+        for run in trial.runs:
             if run.taken:
                 ways = out.setdefault(run.place, {})
                 ways[run.taken] = ways.get(run.taken, 0) + 1
@@ -134,15 +134,15 @@ def ways_table(before: Mapping[str, int], after: Mapping[str, int]) -> np.ndarra
     return np.array([[counts.get(way, 0) for way in ways] for counts in (before, after)])
 
 
-def doubts(residual: Sequence[Mapping[str, Any]], played: Played, throws: int) -> list[str]:
-    """Why a forecast is doubtful, in words; nothing where it is not. `throws` were played for the
+def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:
+    """Why a forecast is doubtful, in words; nothing where it is not. `trials` were played for the
     forecast.
 
-    Played throws have to be off by more than chance and by more than matters: with many throws the
+    Played trials have to be off by more than chance and by more than matters: with many trials the
     first alone says little.
     """
     out = [
-        "throws played with the training's own choices differ from the training's: "
+        "trials played with the training's own choices differ from the training's: "
         f"{row['of']}, off by {row['off']:.1%} "
         f"(p = {row['p_holm']:.1e})"
         for row in residual
@@ -150,23 +150,23 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, throws: int) -
         and row["off"] > (OFF_TIME if row["of"] in (TIME, MEAN) else NEGLIGIBLE)
     ]
     for place, n in sorted(played.beyond.items()):
-        if n > NEGLIGIBLE * throws:
+        if n > NEGLIGIBLE * trials:
             out.append(
-                f"in {n / throws:.1%} of the throws played a run in {place} goes on for "
+                f"in {n / trials:.1%} of the trials played a run in {place} goes on for "
                 "longer than any that was measured: "
                 "what it comes to then is a guess; train with runs that nothing cuts off so early"
             )
     for name, n in sorted(played.astray.items()):
-        if n > NEGLIGIBLE * throws:
+        if n > NEGLIGIBLE * trials:
             out.append(
-                f"in {n / throws:.1%} of the throws played {name} comes when the marking "
+                f"in {n / trials:.1%} of the trials played {name} comes when the marking "
                 "does not allow it: how long a run goes on "
                 "until it is preempted depends on more than the run"
             )
-    if played.endless > NEGLIGIBLE * throws:
+    if played.endless > NEGLIGIBLE * trials:
         out.append(
-            f"{played.endless / throws:.1%} of the throws played never end: branches that "
+            f"{played.endless / trials:.1%} of the trials played never end: branches that "
             "watch each other need more training "
-            "throws, so that the contexts can tell them apart"
+            "trials, so that the contexts can tell them apart"
         )
     return out

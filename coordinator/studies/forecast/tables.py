@@ -31,7 +31,7 @@ def forecast_text(made: Mapping[str, Any]) -> str:
     lines = [f"{made['task']}: forecast of {made['registered_at']}"]
     for name, said in made["regimes"].items():
         lines.append(
-            f"  regime {name or '-'}: {said['runs']} runs, from {said['training_throws']} throws"
+            f"  regime {name or '-'}: {said['runs']} runs, from {said['training_trials']} trials"
         )
         for figure, found in said["figures"].items():
             if found["value"] is not None:
@@ -52,7 +52,7 @@ def forecast_text(made: Mapping[str, Any]) -> str:
                 )
         lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
         if 0.0005 < said["endless"] <= NEGLIGIBLE:
-            lines.append(f"    note: {said['endless']:.1%} of the throws played never end")
+            lines.append(f"    note: {said['endless']:.1%} of the trials played never end")
         lines += [f"    note: {note}" for note in said["assumptions"]]
         lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
     return "\n".join(lines)
@@ -67,9 +67,9 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
 
 def _worst(residual: Sequence[Mapping[str, Any]]) -> str:
     if not residual:
-        return "from an estimates file: no throws to check against"
+        return "from an estimates file: no trials to check against"
     worst = min(residual, key=lambda row: row["p"])
-    return f"played throws against the training's own: least p {worst['p']:.2f} ({worst['of']})"
+    return f"played trials against the training's own: least p {worst['p']:.2f} ({worst['of']})"
 
 
 def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -157,7 +157,7 @@ def agreement_text(found: Mapping[str, Any]) -> str:
         ]
     if not found["same_block"]:
         lines.append(
-            "note: the training had another --block: the first throws of a cell are a "
+            "note: the training had another --block: the first trials of a cell are a "
             "different share of all"
         )
     if not found["same_task_file"]:

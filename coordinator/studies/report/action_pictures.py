@@ -10,7 +10,7 @@ from petrobot.coordinator.learning.estimate import Key, Tally
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.report import charts
-from petrobot.coordinator.studies.report.trials import Curves, Trials
+from petrobot.coordinator.studies.report.learning_curves import Curves, LearningCurves
 from petrobot.coordinator.task import Task
 
 Pictures = dict[str, tuple[str, str]]
@@ -23,7 +23,7 @@ def put(pictures: Pictures, name: str, heading: str, svg: str) -> None:
     pictures["".join(c if c.isalnum() else "_" for c in name)] = (heading, svg)
 
 
-def trial_pictures(trials: Iterable[Trials], word: str) -> Pictures:
+def trial_pictures(trials: Iterable[LearningCurves], word: str) -> Pictures:
     """`word`: what the curves of choices show."""
     out: Pictures = {}
     for one in trials:
@@ -108,7 +108,7 @@ def _unit(measure: str) -> str:
     )
 
 
-def _settled(trials: Trials) -> Curves:
+def _settled(trials: LearningCurves) -> Curves:
     """J curves without the first few trials, where a single failure hides everything else."""
     last = max((points[-1][0] for points in trials.objective.values()), default=0.0)
     return {

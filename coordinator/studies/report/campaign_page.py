@@ -16,7 +16,7 @@ from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import Plan
 from petrobot.coordinator.studies.campaign.rows import Row
 from petrobot.coordinator.studies.campaign.summary import Summary
-from petrobot.coordinator.studies.campaign.trials import Throw
+from petrobot.coordinator.studies.campaign.trials import Trial
 from petrobot.coordinator.studies.report import charts
 from petrobot.coordinator.studies.report.action_pictures import (
     ACTIONS,
@@ -28,13 +28,13 @@ from petrobot.coordinator.studies.report.action_pictures import (
     trial_pictures,
 )
 from petrobot.coordinator.studies.report.comparing import Weighting, objectives
+from petrobot.coordinator.studies.report.learning_curves import learned_curves, objective_curves
 from petrobot.coordinator.studies.report.page import gallery, html_page, section, table, text
 from petrobot.coordinator.studies.report.plots import declared
 from petrobot.coordinator.studies.report.run_page import gantt_svg
-from petrobot.coordinator.studies.report.trials import learned_curves, objective_curves
 from petrobot.coordinator.task import Status, Task
 
-# Fixed combinations of actions side by side: what each came to over the throws in which it was chosen, with one rho for all.
+# Fixed combinations of actions side by side: what each came to over the trials in which it was chosen, with one rho for all.
 
 Combination = tuple[tuple[str, str], ...]
 """(primitive task, action) of each primitive task with alternatives, in the order of the task
@@ -47,18 +47,18 @@ class Judged:
     that of the whole task."""
 
     combination: Combination
-    throws: int
+    trials: int
     goal: float
     objective: float
     task_objective: float
     time: float
-    """Mean of the completed throws (s)."""
+    """Mean of the completed trials (s)."""
 
     def to_plain(self) -> dict[str, Any]:
         """Plain data."""
         return {
             **dict(self.combination),
-            "runs": self.throws,
+            "runs": self.trials,
             "R_goal": round(self.goal, 6),
             "J": round(self.objective, 6),
             "J of the task": round(self.task_objective, 6),
@@ -67,9 +67,9 @@ class Judged:
 
 
 def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]:
-    """The actions of a throw's first runs."""
+    """The actions of a trial's first runs."""
     out: dict[str, str] = {}
-    for run in row.throw.runs if row.throw is not None else ():
+    for run in row.trial.runs if row.trial is not None else ():
         name = task.primitive_task_of(run.place).name
         if name in names:
             out.setdefault(name, run.action)
@@ -84,10 +84,10 @@ def by_combination(
 ) -> list[Judged]:
     """Every combination in these rows, the lowest J first.
 
-    `planned`: the combination meant for each row; a throw that ended before all of its runs still
-    counts for it. Without it, only throws in which every primitive task ran can be told apart.
+    `planned`: the combination meant for each row; a trial that ended before all of its runs still
+    counts for it. Without it, only trials in which every primitive task ran can be told apart.
     """
-    kept = [row for row in rows if row.throw is not None]
+    kept = [row for row in rows if row.trial is not None]
     names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
     weighting = weighting or Weighting.of(task, kept)
     groups: dict[Combination, list[Row]] = {}
@@ -105,8 +105,8 @@ def _judged(
     task: Task, combination: Combination, rows: Sequence[Row], weighting: Weighting
 ) -> Judged:
     found = objectives(task, rows, weighting)
-    times = [row.throw.time for row in rows if row.throw is not None and row.throw.time is not None]
-    goal = float(np.mean([row.throw is not None and row.throw.goals > 0 for row in rows]))
+    times = [row.trial.time for row in rows if row.trial is not None and row.trial.time is not None]
+    goal = float(np.mean([row.trial is not None and row.trial.goals > 0 for row in rows]))
     mean = float(np.mean(times)) if times else float("nan")
     known = [value for name, value in found.items() if name != "task" and not np.isnan(value)]
     return Judged(
@@ -125,7 +125,7 @@ AHEAD = (DIFFERENCES, TRIALS, ACTIONS)
 MOST = 12
 """Combinations that are listed."""
 WORST = 40
-"""Throws that went wrong which are listed."""
+"""Trials that went wrong which are listed."""
 
 
 class CampaignReport:
@@ -161,11 +161,11 @@ class CampaignReport:
         times: dict[str, list[float]] = {}
         latencies: dict[str, list[float]] = {}
         for row in self.rows:
-            if row.throw is None:
+            if row.trial is None:
                 continue
-            if row.throw.time is not None:
-                times.setdefault(row.regime or "time", []).append(row.throw.time)
-            for run in row.throw.runs:
+            if row.trial.time is not None:
+                times.setdefault(row.regime or "time", []).append(row.trial.time)
+            for run in row.trial.runs:
                 add_latencies(latencies, run.action, run.values)
         if times:
             self._add("times", "Times", charts.histogram("Time of a run of the task", "s", times))
@@ -173,8 +173,8 @@ class CampaignReport:
             self._add("latencies", "Times", latency_svg(latencies))
 
     def _gantt(self) -> None:
-        block = next((row.block for row in self.rows if row.throw is not None), None)
-        chosen = [row for row in self.rows if row.block == block and row.throw is not None]
+        block = next((row.block for row in self.rows if row.trial is not None), None)
+        chosen = [row for row in self.rows if row.block == block and row.trial is not None]
         if chosen:
             self._add(
                 "gantt",
@@ -185,12 +185,12 @@ class CampaignReport:
             (
                 r
                 for r in self.rows
-                if r.throw and r.throw.status == Status.ERROR.value and r.block != block
+                if r.trial and r.trial.status == Status.ERROR.value and r.block != block
             ),
             None,
         )
         if bad is not None:
-            same = [row for row in self.rows if row.block == bad.block and row.throw is not None]
+            same = [row for row in self.rows if row.block == bad.block and row.trial is not None]
             self._add(
                 "gantt error",
                 f"Runs over time: a cell with an error, seed {bad.seed}",
@@ -253,7 +253,7 @@ class CampaignReport:
         return out
 
     def _combinations(self) -> dict[str, list[dict[str, Any]]]:
-        """The best combinations of actions by regime, of throws in which each primitive task ran;
+        """The best combinations of actions by regime, of trials in which each primitive task ran;
         none of a single one."""
         found = {}
         for regime in self.summary.by_regime:
@@ -266,7 +266,7 @@ class CampaignReport:
         counts: dict[tuple[str, str, str, str, str], int] = {}
         first: dict[tuple[str, str, str, str, str], Row] = {}
         for row in self.rows:
-            for run in row.throw.runs if row.throw is not None else ():
+            for run in row.trial.runs if row.trial is not None else ():
                 key = (row.regime, run.place, run.action, run.status or "none", run.cause)
                 counts[key] = counts.get(key, 0) + 1
                 first.setdefault(key, row)
@@ -283,7 +283,7 @@ class CampaignReport:
         bad = [
             row
             for row in self.rows
-            if row.throw is not None and row.throw.status != Status.SUCCESS.value
+            if row.trial is not None and row.trial.status != Status.SUCCESS.value
         ]
         rows = [
             {
@@ -291,11 +291,11 @@ class CampaignReport:
                 "regime": row.regime,
                 "seed": row.seed,
                 "run": row.k,
-                "status": row.throw.status,
-                "firings": story(row.throw),
+                "status": row.trial.status,
+                "firings": story(row.trial),
             }
             for row in bad[:WORST]
-            if row.throw is not None
+            if row.trial is not None
         ]
         if not rows:
             return "<p>Nothing: every run met its specification.</p>"
@@ -328,9 +328,9 @@ def timeline_of(rows: Sequence[Row]) -> Timeline:
     """The runs of a mission run as bars."""
     made = Timeline()
     for row in rows:
-        for i, run in enumerate(row.throw.runs if row.throw is not None else ()):
-            assert row.throw is not None
-            begun = row.throw.begun + run.begun
+        for i, run in enumerate(row.trial.runs if row.trial is not None else ()):
+            assert row.trial is not None
+            begun = row.trial.begun + run.begun
             key = f"{run.place} of run {row.k}" + (f" ({i})" if i else "")
             status = Status(run.status) if run.status else None
             made.bars[key] = Bar(
@@ -339,9 +339,9 @@ def timeline_of(rows: Sequence[Row]) -> Timeline:
     return made
 
 
-def story(throw: Throw) -> str:
-    """A throw in one line: what ended when and how, and which transition took it."""
-    ends = sorted(throw.runs, key=lambda run: run.begun + run.took)
+def story(trial: Trial) -> str:
+    """A trial in one line: what ended when and how, and which transition took it."""
+    ends = sorted(trial.runs, key=lambda run: run.begun + run.took)
     parts = []
     for run in ends:
         how = (
@@ -390,8 +390,8 @@ def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
         if "difference" in row
     ]
     lead = (
-        f"<p>{found['pairs']} pairs of throws with equal seeds; {found['left_out']} "
-        "throws without a partner.</p>"
+        f"<p>{found['pairs']} pairs of trials with equal seeds; {found['left_out']} "
+        "trials without a partner.</p>"
     )
     return section(f"{one} against {other}", lead + table(shares) + table(rest))
 

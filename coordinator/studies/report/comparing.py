@@ -1,4 +1,4 @@
-"""Two campaigns compared throw by throw: the same seeds met the same throws, so differences are
+"""Two campaigns compared trial by trial: the same seeds met the same trials, so differences are
 paired.
 
 Shares: McNemar's exact test (Q. McNemar 1947, binomial on the discordant pairs), difference with
@@ -26,12 +26,12 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pairs:
-    """Throws of two campaigns with equal regime, seed and number that were begun in both."""
+    """Trials of two campaigns with equal regime, seed and number that were begun in both."""
 
     one: tuple[Row, ...]
     other: tuple[Row, ...]
     left_out: int
-    """Throws without a partner, or not begun."""
+    """Trials without a partner, or not begun."""
 
 
 def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
@@ -41,7 +41,7 @@ def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
     common = [
         k
         for k in first
-        if k in second and first[k].throw is not None and second[k].throw is not None
+        if k in second and first[k].trial is not None and second[k].trial is not None
     ]
     left = len(first) + len(second) - 2 * len(common)
     return Pairs(tuple(first[k] for k in common), tuple(second[k] for k in common), left)
@@ -58,19 +58,19 @@ def compare(
     than the second.
 
     `weighting` gives the rho of J, so that several comparisons have one; without it, rho is that of
-    the actions in these two. Raises ValueError when they have no throw in common.
+    the actions in these two. Raises ValueError when they have no trial in common.
     """
     pairs = paired(one, other)
     if not pairs.one:
         raise ValueError(
-            "the two campaigns have no throw in common: run them with the same --seed, "
+            "the two campaigns have no trial in common: run them with the same --seed, "
             "--block and --regime"
         )
     random = np.random.default_rng(seed)
     shares = {
-        "R_goal": lambda row: row.throw is not None and row.throw.goals > 0,
-        "P_complete": lambda row: row.throw is not None and row.throw.completed,
-        "R_conj": lambda row: row.throw is not None and row.throw.all_success,
+        "R_goal": lambda row: row.trial is not None and row.trial.goals > 0,
+        "P_complete": lambda row: row.trial is not None and row.trial.completed,
+        "R_conj": lambda row: row.trial is not None and row.trial.all_success,
     }
     found: dict[str, Any] = {name: share_difference(pairs, met) for name, met in shares.items()}
     own = own_flags(pairs)
@@ -125,9 +125,9 @@ def share_difference(pairs: Pairs, met: Callable[[Row], bool]) -> dict[str, Any]
 
 def _time(pairs: Pairs) -> dict[str, Any]:
     times = [
-        (a.throw.time, b.throw.time)
+        (a.trial.time, b.trial.time)
         for a, b in zip(pairs.one, pairs.other, strict=True)
-        if a.throw and b.throw and a.throw.time is not None and b.throw.time is not None
+        if a.trial and b.trial and a.trial.time is not None and b.trial.time is not None
     ]
     if len(times) < 2:
         return {"pairs": len(times)}
@@ -147,7 +147,7 @@ def _time(pairs: Pairs) -> dict[str, Any]:
 @dataclass(frozen=True)
 class Weighting:
     """rho of each primitive task with alternatives, and of the task (whose cost is the time of a
-    throw)."""
+    trial)."""
 
     rho: Mapping[str, float]
     task: float
@@ -155,10 +155,10 @@ class Weighting:
     @classmethod
     def of(cls, task: Task, rows: Sequence[Row]) -> Weighting:
         """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of
-        their throws."""
+        their trials."""
         names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
         times = [
-            row.throw.time for row in rows if row.throw is not None and row.throw.time is not None
+            row.trial.time for row in rows if row.trial is not None and row.trial.time is not None
         ]
         mean = sum(times) / len(times) if times else 0.0
         return cls(
@@ -218,14 +218,14 @@ def _difference(one: float, other: float, spread: Values) -> dict[str, Any]:
 
 
 Sums = tuple[Values, Values, Values, Values]
-"""By throw: counted runs, successes, cost, runs with a cost."""
+"""By trial: counted runs, successes, cost, runs with a cost."""
 
 
 def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
     """Of a primitive task."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
-        for run in row.throw.runs if row.throw is not None else ():
+        for run in row.trial.runs if row.trial is not None else ():
             if run.status and task.primitive_task_of(run.place).name == name:
                 known = run.cost is not None
                 out[:, i] += (1.0, run.status == Status.SUCCESS.value, run.cost or 0.0, known)
@@ -233,12 +233,12 @@ def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
 
 
 def _task_sums(rows: Sequence[Row]) -> Sums:
-    """Of the whole task: a throw is a run, a met goal its success, its time the cost."""
+    """Of the whole task: a trial is a run, a met goal its success, its time the cost."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
-        if row.throw is not None:
-            time = row.throw.time
-            out[:, i] = (1.0, row.throw.goals > 0, time or 0.0, time is not None)
+        if row.trial is not None:
+            time = row.trial.time
+            out[:, i] = (1.0, row.trial.goals > 0, time or 0.0, time is not None)
     return out[0], out[1], out[2], out[3]
 
 
@@ -247,7 +247,7 @@ def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
     costs."""
     costs: dict[str, list[float]] = {}
     for row in rows:
-        for run in row.throw.runs if row.throw is not None else ():
+        for run in row.trial.runs if row.trial is not None else ():
             if (
                 run.status
                 and run.cost is not None

@@ -24,7 +24,7 @@ MOST = 4000
 
 def declared(plots: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """SVG by name of every declared picture for which the rows have values; each row is the score
-    of one throw."""
+    of one trial."""
     out = {}
     for name, plot in plots.items():
         if not isinstance(plot, Mapping) or "x" not in plot:

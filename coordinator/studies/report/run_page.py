@@ -20,6 +20,7 @@ from petrobot.coordinator.studies.report.action_pictures import (
     put,
     trial_pictures,
 )
+from petrobot.coordinator.studies.report.learning_curves import Curves, recorded_curves
 from petrobot.coordinator.studies.report.page import (
     apart,
     gallery,
@@ -32,7 +33,6 @@ from petrobot.coordinator.studies.report.page import (
     table,
 )
 from petrobot.coordinator.studies.report.plots import declared, finished
-from petrobot.coordinator.studies.report.trials import Curves, recorded_curves
 from petrobot.coordinator.task import Status, Task
 
 ROW, LEFT, WIDTH = 26, 150, 1040

@@ -78,15 +78,15 @@ def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
         "parts.gripped",
     } <= set(header)
     for row in rows:
-        assert row.throw is not None
-        assert row.throw.runs[0].place == "look"
+        assert row.trial is not None
+        assert row.trial.runs[0].place == "look"
         assert row.score["parts.n"] == row.k
-        grips = [run for run in row.throw.runs if run.place == "grip"]
+        grips = [run for run in row.trial.runs if run.place == "grip"]
         assert all(run.cost == 1.0 for run in grips)  # grip_soft costs its force
-        assert row.throw.goals == sum(run.taken == "gripped" for run in row.throw.runs)
+        assert row.trial.goals == sum(run.taken == "gripped" for run in row.trial.runs)
         assert (
-            row.throw.time is not None
-            and row.throw.time >= sum(run.took for run in row.throw.runs) - 1e-6
+            row.trial.time is not None
+            and row.trial.time >= sum(run.took for run in row.trial.runs) - 1e-6
         )
 
 
@@ -98,7 +98,7 @@ def test_a_block_is_the_mission_run_that_petrobot_run_gives(conduct: Conduct) ->
     cell, party = lockstep_cell(campaign.bench.directory, setting)
     assert cell.run(lambda: party.over, 100_000)
     rows = [row for row in campaign.table.rows() if row.block == block.index]
-    in_table = [run.seconds for row in rows for run in (row.throw.runs if row.throw else ())]
+    in_table = [run.seconds for row in rows for run in (row.trial.runs if row.trial else ())]
     assert [run.seconds for run in party.mission.tally.runs] == pytest.approx(in_table)
     assert rows[0].mission_s == pytest.approx(party.mission.ended - party.mission.begun)
 
@@ -211,7 +211,7 @@ def test_a_bad_regime_is_the_campaigns_fault(conduct: Conduct) -> None:
 def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
     """Three ways to look times two to grip, in each regime."""
     rows = list(conduct("a", selector="round_robin", runs=24).table.rows())
-    easy = [row.throw for row in rows if row.regime == "easy"]
+    easy = [row.trial for row in rows if row.regime == "easy"]
     seen = {
         tuple(run.action for run in t.runs if run.place in ("look", "grip"))
         for t in easy
@@ -295,7 +295,7 @@ def test_learning_depends_on_batches_alone(conduct: Conduct) -> None:
         assert table(resumed.folder) == table(whole.folder)
         assert resumed.policy.state() == whole.policy.state()
     looks = [
-        row.throw.runs[0].action for row in whole.table.rows() if row.throw and row.regime == "easy"
+        row.trial.runs[0].action for row in whole.table.rows() if row.trial and row.regime == "easy"
     ]
     assert set(looks[:15]) == {"look_quick", "look_twice", "look_long"}  # first trials of each
 
@@ -312,7 +312,7 @@ def test_what_was_learned_can_be_judged_afresh(conduct: Conduct) -> None:
     assert set(best) == {"easy", "rough"}
     judged = conduct("judged", seed=2, options={"by_regime": best})
     for row in judged.table.rows():
-        for run in row.throw.runs if row.throw else ():
+        for run in row.trial.runs if row.trial else ():
             if run.place in best[row.regime]:
                 assert run.action == best[row.regime][run.place]
 
@@ -426,8 +426,8 @@ def test_a_count_is_a_cost_in_campaigns_and_runs_alike(
     counted = {"look_quick": 1.0, "look_twice": 2.0, "look_long": 16.0}
     campaign = conduct("a", task=str(task), mock=str(mock), digests=digests, selector="round_robin")
     for row in campaign.table.rows():
-        assert row.throw is not None
-        assert row.throw.runs[0].cost == counted[row.throw.runs[0].action]
+        assert row.trial is not None
+        assert row.trial.runs[0].cost == counted[row.trial.runs[0].action]
     result = campaign.result()
     assert result["judged"]["look"]["cost"] == "count"
     assert result["J"]["look"] == {action: count / 16 for action, count in counted.items()}

@@ -43,10 +43,10 @@ def test_the_table_and_the_estimates_hold_what_was_judged(tmp_path: Path, plan: 
     assert len(rows) == 6 * BLOCKS
     for row in rows:
         status, cause = TRULY[f"pick#{row.k}"]
-        assert row.throw is not None
-        assert (row.throw.status, row.throw.cause, row.throw.completed) == (status, cause, True)
-        assert row.throw.all_success is (status == "success")
-        assert [(run.status, run.cause) for run in row.throw.runs] == [
+        assert row.trial is not None
+        assert (row.trial.status, row.trial.cause, row.trial.completed) == (status, cause, True)
+        assert row.trial.all_success is (status == "success")
+        assert [(run.status, run.cause) for run in row.trial.runs] == [
             (status, cause),
             ("success", ""),
         ]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
 
@@ -69,7 +69,7 @@ in = ["second:error"]
 out = ["free"]
 """
 
-Make = Callable[..., list[Throw]]
+Make = Callable[..., list[Trial]]
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def make_throws() -> Make:
         random: np.random.Generator,
         dependence: float = 1.0,
         actions: tuple[str, ...] = ("first_a",),
-    ) -> list[Throw]:
+    ) -> list[Trial]:
         out = []
         for k in range(n):
             hard = random.random() < 0.3
@@ -130,7 +130,7 @@ def make_throws() -> Make:
             )
             goals = int(runs[-1].taken == "done")
             wait = [("begin", float(random.uniform(0, 0.2)))]
-            out.append(Throw(k % 5 + 1, 0.0, round(time, 6), True, goals, worst, "", runs, wait))
+            out.append(Trial(k % 5 + 1, 0.0, round(time, 6), True, goals, worst, "", runs, wait))
         return out
 
     return make

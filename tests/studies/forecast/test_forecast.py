@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.agreement import (
     agreement,
     holm,
@@ -23,9 +23,9 @@ from petrobot.coordinator.studies.forecast.agreement import (
 )
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Laws, dependences
-from petrobot.coordinator.studies.forecast.history import Training
+from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, distance, figures, predict
-from petrobot.coordinator.studies.forecast.registered import ForecastError, read, register, write
+from petrobot.coordinator.studies.forecast.registered import read, register, write
 from petrobot.coordinator.studies.forecast.residual import measured
 from petrobot.coordinator.task import Task
 from tests.studies.forecast.conftest import Make
@@ -33,7 +33,7 @@ from tests.studies.forecast.conftest import Make
 RUNS = 400
 
 
-def forecast(task: Task, throws: list[Throw], **given_: Any) -> dict[str, Any]:
+def forecast(task: Task, throws: list[Trial], **given_: Any) -> dict[str, Any]:
     """A forecast from throws with their own choices."""
     training = Training.of(task, throws)
     return predict(
@@ -160,7 +160,7 @@ def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
         for took, status in ((1.0, "success"), (2.0, ""), (3.0, "failure"))
     ]
     law = next(
-        iter(Laws(Training.of(pair, [Throw(1, 0.0, runs=[run]) for run in runs])).contexts.values())
+        iter(Laws(Training.of(pair, [Trial(1, 0.0, runs=[run]) for run in runs])).contexts.values())
     ).law
     assert law.took.tolist() == [1.0, 3.0]
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])

@@ -15,7 +15,7 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.studies.campaign.plan import Plan, digest, write_manifest
 from petrobot.coordinator.studies.campaign.rows import Row
 from petrobot.coordinator.studies.campaign.table import Table
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import misfit
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.residual import routing
@@ -33,7 +33,7 @@ BOTH = ("first_a", "first_b")
 def write_campaign(tmp_path: Path) -> Write:
     """A campaign's folder with given throws of a task file."""
 
-    def write(name: str, text: str, throws: list[Throw], seed: int = 1, **more: Any) -> Path:
+    def write(name: str, text: str, throws: list[Trial], seed: int = 1, **more: Any) -> Path:
         task = loads(text, "task.toml")
         path = tmp_path / f"{task.name}.toml"
         path.write_text(text, encoding="utf-8")
@@ -57,7 +57,7 @@ def write_campaign(tmp_path: Path) -> Write:
     return write
 
 
-def dependent(random: np.random.Generator) -> Throw:
+def dependent(random: np.random.Generator) -> Trial:
     """Watching always ends a little before locating: what two independent runs would not do, and no
     context tells."""
     locate = float(random.uniform(0.5, 1.5))
@@ -73,7 +73,7 @@ def dependent(random: np.random.Generator) -> Throw:
         ),
         RunEntry("locate", "locate_a", 0.0, locate, "success", taken="found_late", seconds=locate),
     ]
-    return Throw(1, 0.0, round(locate, 6), True, 0, runs=runs, fired={"next": 1, "found_late": 1})
+    return Trial(1, 0.0, round(locate, 6), True, 0, runs=runs, fired={"next": 1, "found_late": 1})
 
 
 def test_a_doubtful_forecast_is_told_and_not_registered(
@@ -167,7 +167,7 @@ def test_misfits(
 ) -> None:
     """Of 400 training throws: a mix by its shares, one action alone by the others' absence, unless
     it was hardly ever run."""
-    said = {"choices": {"t": choices}, "training_throws": 400, **more}
+    said = {"choices": {"t": choices}, "training_trials": 400, **more}
     assert misfit(said, {"t": run, "of another forecast": {"x": 5}}) == ([] if fits else ["t"])
 
 

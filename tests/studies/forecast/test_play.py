@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws
 from petrobot.coordinator.studies.forecast.history import Training
@@ -45,7 +45,7 @@ kind = "control"
 
 def play(
     text: str,
-    throws: list[Throw],
+    throws: list[Trial],
     n: int = 2000,
     task: str = 'final = "end == 1"\nruns_place = "jobs"',
 ) -> Played:
@@ -84,7 +84,7 @@ out = ["end"]
 def test_side_by_side_takes_the_longer_one() -> None:
     """Uniform on 1, 3 beside 2: the time is 2 or 3, half each."""
     throws = [
-        Throw(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")])
+        Trial(1, 0.0, runs=[entry("a", took, taken="join"), entry("b", 2.0, taken="join")])
         for took in (1.0, 3.0)
     ]
     played = play(FORK, throws)
@@ -121,7 +121,7 @@ in = ["b:error"]
 out = ["end"]
 """
     yes = [
-        Throw(
+        Trial(
             1,
             0.0,
             runs=[
@@ -130,7 +130,7 @@ out = ["end"]
             ],
         )
     ]
-    no = [Throw(1, 0.0, runs=[entry("a", 2.0, taken="no")])]
+    no = [Trial(1, 0.0, runs=[entry("a", 2.0, taken="no")])]
     played = play(text, yes + no * 3)
     assert set(played.time.tolist()) == {2.0, 6.0}
     assert np.mean(played.time == 6.0) == pytest.approx(0.25, abs=0.04)
@@ -159,8 +159,8 @@ out = ["end"]
 def test_a_loop_is_geometric() -> None:
     """Tried again with probability 1/2 each time: mean number of runs 2."""
     throws = [
-        Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
-        Throw(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
+        Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")]),
+        Trial(1, 0.0, runs=[entry("a", 1.0, "error", "again")]),
     ]
     played = play(LOOP, throws, 5000)
     assert played.time.mean() == pytest.approx(2.0, abs=0.08)
@@ -180,16 +180,16 @@ def test_a_loop_that_is_counted_is_no_geometric_one() -> None:
         )
         for k in range(3)
     ]
-    played = play(LOOP, [Throw(1, 0.0, runs=runs)] * 60)
+    played = play(LOOP, [Trial(1, 0.0, runs=runs)] * 60)
     assert set(played.time.tolist()) == {3.0}
 
 
 def test_a_rare_further_round_is_like_the_last_frequent_one() -> None:
     """Five of 65 are interrupted a third time, and then done: nobody goes round for ever."""
 
-    def rounds(n: int) -> Throw:
+    def rounds(n: int) -> Trial:
         ends = [("error", "again")] * (n - 1) + [("success", "done")]
-        return Throw(
+        return Trial(
             1,
             0.0,
             runs=[
@@ -229,7 +229,7 @@ out = ["end"]
                 runs.append(
                     RunEntry(place, f"run_{place}", begun, 1.5 + drift, end[0], taken=end[1])
                 )
-        throws.append(Throw(1, 0.0, runs=runs))
+        throws.append(Trial(1, 0.0, runs=runs))
     training = Training.of(
         loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws
     )
@@ -267,7 +267,7 @@ in = ["b:error"]
 out = ["end"]
 """
     throws = [
-        Throw(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)])
+        Trial(1, 0.0, runs=[entry("a", 4.0, taken="done")], waits=[("rung", wait)])
         for wait in (1.0, 3.0)
     ]
     played = play(text, throws, task='final = "end == 1"')
@@ -297,8 +297,8 @@ in = ["b:error"]
 out = ["end"]
 """
     throws = [
-        Throw(1, 0.0, runs=[entry("a", 1.0, "error", "lost")]),
-        *[Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")])] * 3,
+        Trial(1, 0.0, runs=[entry("a", 1.0, "error", "lost")]),
+        *[Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")])] * 3,
     ]
     for ending in (
         'final = "end == 1"\nfinal_error = "broken == 1"\nruns_place = "jobs"',
@@ -336,7 +336,7 @@ in = ["a:error", "alarm"]
 out = ["end"]
 """
     runs = [entry("a", 1.0, taken="drop"), entry("b", 2.0, "error", "b_lost")]
-    played = play(text, [Throw(1, 0.0, runs=runs)])
+    played = play(text, [Trial(1, 0.0, runs=runs)])
     assert played.completed.all() == played.completed.any() == completes
     assert not played.all_success.any()
     assert played.ways.get("a", {}) == ({"drop": 2000} if completes else {})
@@ -359,13 +359,13 @@ out = ["end"]
 def test_several_servers_are_refused_with_a_remedy() -> None:
     """Not silently wrong."""
     with pytest.raises(ValueError, match="servers = 1"):
-        play(FORK + SERVERS, [Throw(1, 0.0, runs=[entry("a", 1.0), entry("b", 1.0)])])
+        play(FORK + SERVERS, [Trial(1, 0.0, runs=[entry("a", 1.0), entry("b", 1.0)])])
 
 
 def test_choices_without_a_single_action_are_refused() -> None:
     """A place that is entered although nothing was measured there."""
     with pytest.raises(ValueError, match="no action has a probability"):
-        play(FORK, [Throw(1, 0.0, runs=[entry("a", 1.0)])])
+        play(FORK, [Trial(1, 0.0, runs=[entry("a", 1.0)])])
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ out = ["end"]
 in = ["b:error"]
 out = ["end"]
 """
-    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
+    throws = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done"), entry("b", 2.0, taken="first")])]
     played = play(text.replace("{threshold}", threshold), throws, n=20)
     assert played.time.tolist() == [seconds] * 20
 
@@ -445,7 +445,7 @@ out = ["end"]
 in = ["b:error"]
 out = ["end"]
 """
-    throws = [Throw(1, 0.0, runs=[entry("a", 1.0, taken="done")])]
+    throws = [Trial(1, 0.0, runs=[entry("a", 1.0, taken="done")])]
     played = play(text.replace("{left}", left).replace("{right}", right), throws)
     assert set(played.time.tolist()) <= {1.0, 2.0}
     assert np.mean(played.time == 2.0) == pytest.approx(late, abs=0.04)
@@ -476,6 +476,6 @@ in = ["b:error"]
 out = ["end"]
 """
     throws = [
-        Throw(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])
+        Trial(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])
     ]
     assert play(text, throws, n=20).time.tolist() == [2.0] * 20

@@ -17,7 +17,7 @@ from petrobot.coordinator.analysis.time.stochastic import is_cause, stochastic_v
 from petrobot.coordinator.learning.propagation import incidences, propagate, unended
 from petrobot.coordinator.studies.campaign.observed import estimates_of
 from petrobot.coordinator.studies.campaign.rows import Row
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Laws, with_weights
 from petrobot.coordinator.studies.forecast.history import NONE, Training
@@ -110,7 +110,7 @@ out = ["idle"]
 """Whichever ends first preempts the other."""
 
 
-def one_way(random: np.random.Generator, slow: float = 1.0) -> Throw:
+def one_way(random: np.random.Generator, slow: float = 1.0) -> Trial:
     """A throw of ONE_WAY: locating 0.5 to 1.5 s, watching exponential of `slow` s."""
     locate, watch = random.uniform(0.5, 1.5), random.exponential(slow)
     status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
@@ -124,12 +124,12 @@ def one_way(random: np.random.Generator, slow: float = 1.0) -> Throw:
         stem += "_late"
         other = RunEntry("watch", "watch_a", 0.0, watch, seen, taken=stem, seconds=watch)
     own = RunEntry("locate", "locate_a", 0.0, locate, status, taken=stem, seconds=locate)
-    return Throw(
+    return Trial(
         1, 0.0, locate, True, int(stem == "found"), runs=[other, own], fired={"next": 1, stem: 1}
     )
 
 
-def both_ways(random: np.random.Generator) -> Throw:
+def both_ways(random: np.random.Generator) -> Trial:
     """A throw of BOTH_WAYS with the same laws."""
     locate, watch = random.uniform(0.5, 1.5), random.exponential(1.0)
     status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
@@ -156,7 +156,7 @@ def both_ways(random: np.random.Generator) -> Throw:
             ),
             RunEntry("watch", "watch_a", 0.0, watch, seen, taken=taken, seconds=watch),
         ]
-    return Throw(
+    return Trial(
         1,
         0.0,
         min(locate, watch),
@@ -167,7 +167,7 @@ def both_ways(random: np.random.Generator) -> Throw:
     )
 
 
-def throws_of(make: object, n: int, seed: int) -> list[Throw]:
+def throws_of(make: object, n: int, seed: int) -> list[Trial]:
     """n throws."""
     random = np.random.default_rng(seed)
     assert callable(make)
@@ -261,7 +261,7 @@ out = ["idle"]
     random = np.random.default_rng(1)
     runs = [(min(0.5, t), t < 0.5) for t in random.exponential(1.0, 300)]
     throws = [
-        Throw(
+        Trial(
             1,
             0.0,
             t,
@@ -349,7 +349,7 @@ out = ["idle"]
 """
     ends = (("", 1.0, "rung"), ("success", 2.0, "found"))
     throws = [
-        Throw(
+        Trial(
             1,
             0.0,
             took,
@@ -401,7 +401,7 @@ after = 1.0
                 ),
             ]
             random.shuffle(runs)
-            throw = Throw(1, 0.0, 1.02, True, 0, runs=runs, fired={"next": 1, "dog": 1})
+            throw = Trial(1, 0.0, 1.02, True, 0, runs=runs, fired={"next": 1, "dog": 1})
         throws.append(throw)
     training = Training.of(loads(text, "scan.toml"), throws)
     assert set(training.waits["dog"][0].round(9)) == {1.02}
@@ -443,7 +443,7 @@ def test_beyond_the_longest_run_by_hand() -> None:
     task = loads(ONE_WAY, "scan.toml")
     runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
     throws = [
-        Throw(
+        Trial(
             1,
             0.0,
             runs=[

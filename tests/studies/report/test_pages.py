@@ -12,12 +12,12 @@ from scipy.stats import binomtest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.studies.campaign.rows import Row
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.report.campaign_page import CampaignReport, story, timeline_of
 from petrobot.coordinator.studies.report.comparing import Weighting, compare, cost_weight, paired
+from petrobot.coordinator.studies.report.learning_curves import objective_curves
 from petrobot.coordinator.studies.report.plots import declared, finished
 from petrobot.coordinator.studies.report.run_page import own_pictures
-from petrobot.coordinator.studies.report.trials import objective_curves
 from petrobot.coordinator.task.file import load
 from tests.studies.campaign.conftest import HERE, SERVICES, TASK
 
@@ -29,7 +29,7 @@ def row(k: int, action: str, status: str, seconds: float, goal: bool, regime: st
     run = RunEntry(
         "look", action, 0.0, seconds, status, seconds=seconds, cost=seconds, taken="seen"
     )
-    throw = Throw(1, 0.0, seconds, True, int(goal), status, "", [run])
+    throw = Trial(1, 0.0, seconds, True, int(goal), status, "", [run])
     return Row(
         k,
         regime,
@@ -88,10 +88,10 @@ def test_pairs_have_equal_seeds() -> None:
     """Throws that only one of them has are left out and counted."""
     one = [row(k, "look_quick", "success", 1.0, True) for k in range(4)]
     other = [row(k, "look_quick", "success", 1.0, True) for k in range(2, 8)]
-    other[0].throw = None
+    other[0].trial = None
     assert len(paired(one, other).one) == 1
     assert paired(one, other).left_out == 8
-    with pytest.raises(ValueError, match="no throw in common"):
+    with pytest.raises(ValueError, match="no trial in common"):
         compare(TOY, one, [row(0, "look_quick", "success", 1.0, True, regime="rough")])
 
 
@@ -118,7 +118,7 @@ def test_the_interval_of_the_difference_covers() -> None:
         from petrobot.coordinator.studies.report.comparing import share_difference
 
         found = share_difference(
-            paired(one, other), lambda r: r.throw is not None and r.throw.goals > 0
+            paired(one, other), lambda r: r.trial is not None and r.trial.goals > 0
         )
         hits += found["interval"][0] <= 0.1 <= found["interval"][1]
     assert 180 <= hits <= 199
@@ -185,13 +185,13 @@ def test_a_throws_story_says_what_took_what() -> None:
         RunEntry("look", "look_quick", 0.0, 1.0, "success", taken="seen"),
         RunEntry("grip", "grip_soft", 1.0, 0.5, "error", "jammed", "stuck fast", taken="stuck"),
     ]
-    told = story(Throw(1, 0.0, 1.5, True, 0, "error", "jammed", runs))
+    told = story(Trial(1, 0.0, 1.5, True, 0, "error", "jammed", runs))
     assert (
         told
         == "1.00 s look_quick success, seen; 1.50 s grip_soft ERROR (jammed: stuck fast), stuck"
     )
     bars = timeline_of(
-        [Row(1, "", 1, 1, 0, 1.5, Throw(1, 2.0, 1.5, True, 0, "error", "", runs))]
+        [Row(1, "", 1, 1, 0, 1.5, Trial(1, 2.0, 1.5, True, 0, "error", "", runs))]
     ).bars
     assert [(bar.begun, bar.ended) for bar in bars.values()] == [(2.0, 3.0), (3.0, 3.5)]
 
@@ -320,7 +320,7 @@ def test_combinations_by_hand() -> None:
         dict(best.combination)["look"] == "look_long"
     )  # 1 - .5 + 1/2 = 1.0 and 1 - 1 + 2/2 = 1.0: the first by name
     assert [best.objective, other.objective] == pytest.approx([1.0, 1.0])
-    assert (best.goal, other.goal, best.throws) == (0.5, 1.0, 20)
+    assert (best.goal, other.goal, best.trials) == (0.5, 1.0, 20)
     assert other.task_objective == pytest.approx(0.0 + 2.0 / 1.5)
 
 

@@ -26,7 +26,7 @@ WINDOW = 50
 
 
 @dataclass
-class Trials:
+class LearningCurves:
     """Curves of one primitive task in one regime, by action; x is the trial (runs of the primitive
     task in that regime)."""
 
@@ -41,7 +41,7 @@ class Trials:
     """J from the sums so far with the rho so far."""
 
 
-def objective_curves(task: Task, rows: Sequence[Row]) -> list[Trials]:
+def objective_curves(task: Task, rows: Sequence[Row]) -> list[LearningCurves]:
     """J and shares of choices of every primitive task with alternatives, by regime."""
     out = []
     for primitive in task.primitive_tasks.values():
@@ -50,13 +50,13 @@ def objective_curves(task: Task, rows: Sequence[Row]) -> list[Trials]:
         for regime in dict.fromkeys(row.regime for row in rows):
             runs = list(_runs(task, primitive.name, [row for row in rows if row.regime == regime]))
             if runs:
-                made = Trials(primitive.name, regime)
+                made = LearningCurves(primitive.name, regime)
                 _fill(made, runs, primitive.alternatives)
                 out.append(made)
     return out
 
 
-def recorded_curves(task: Task, records: Iterable[Record]) -> list[Trials]:
+def recorded_curves(task: Task, records: Iterable[Record]) -> list[LearningCurves]:
     """The same of a single mission run, from what was observed of it."""
     runs: dict[tuple[str, str], list[tuple[str, bool, float | None]]] = {}
     for record in records:
@@ -72,7 +72,7 @@ def recorded_curves(task: Task, records: Iterable[Record]) -> list[Trials]:
     for (name, context), seen_runs in runs.items():
         alternatives = task.primitive_tasks[name].alternatives
         if len(alternatives) > 1:
-            made = Trials(name, regime_of(context), context)
+            made = LearningCurves(name, regime_of(context), context)
             _fill(made, seen_runs, alternatives)
             out.append(made)
     return out
@@ -82,13 +82,13 @@ def _runs(
     task: Task, primitive: str, rows: Sequence[Row]
 ) -> Iterator[tuple[str, bool, float | None]]:
     for row in rows:
-        for run in row.throw.runs if row.throw is not None else ():
+        for run in row.trial.runs if row.trial is not None else ():
             if run.status and task.primitive_task_of(run.place).name == primitive:
                 yield run.action, run.status == Status.SUCCESS.value, run.cost
 
 
 def _fill(
-    made: Trials, runs: Sequence[tuple[str, bool, float | None]], actions: Sequence[str]
+    made: LearningCurves, runs: Sequence[tuple[str, bool, float | None]], actions: Sequence[str]
 ) -> None:
     sums = {action: [0, 0, 0.0, 0] for action in actions}
     step = max(1, len(runs) // POINTS)
@@ -111,7 +111,7 @@ def _fill(
                 made.objective.setdefault(a, []).append((i, 1.0 - s[1] / s[0] + rho * costs[a]))
 
 
-def learned_curves(plan: Plan, rows: Sequence[Row], trials: Sequence[Trials]) -> None:
+def learned_curves(plan: Plan, rows: Sequence[Row], trials: Sequence[LearningCurves]) -> None:
     """Replace shares of choices by the probabilities that the selectors had, batch after batch;
     nothing to do without a learner."""
     bench = Bench.of(plan)

@@ -18,7 +18,7 @@ from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import scores
 from petrobot.coordinator.studies.campaign.plan import Plan, identity
 from petrobot.coordinator.studies.campaign.rows import Row, cells, columns, read_row
-from petrobot.coordinator.studies.campaign.trials import RunEntry, Throw, ThrowLog
+from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load
 from petrobot.services.action import Status as ActionStatus
@@ -29,11 +29,11 @@ from tests.studies.campaign.conftest import TASK
 TOY = load(TASK)
 
 
-def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[ThrowLog, Mission]:
+def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[TrialLog, Mission]:
     """Throws of catch_ball with scripted actions."""
     task = load_task("catch_ball")
     cell, party = lockstep_cell(directory_for(task), Setting(task, runs=runs), scripts(task, lines))
-    log = ThrowLog(task, lambda record, values: record.seconds)
+    log = TrialLog(task, lambda record, values: record.seconds)
     party.mission.executor.observers.append(log)
     assert cell.run(lambda: party.over, 400_000)
     return log, party.mission
@@ -45,8 +45,8 @@ def test_a_throw_has_its_runs_and_what_took_them() -> None:
     log, _ = logged(
         {"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
     )
-    assert len(log.throws) == 3
-    throw = log.throws[0]
+    assert len(log.trials) == 3
+    throw = log.trials[0]
     by_place = {run.place: run for run in throw.runs}
     assert [by_place[p].taken for p in ("locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home")] == [
         "located", "tracked", "in_place", "missed", "homed",
@@ -69,7 +69,7 @@ def test_an_error_branch_belongs_to_its_throw() -> None:
     """Recovery is part of the throw that needed it; the next one is clean."""
     bad = Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="too far")
     log, _ = logged({"move_to_point": [bad, Line(seconds=(0.2, 0.2)), Line(seconds=(0.2, 0.2))]})
-    first, second, _ = log.throws
+    first, second, _ = log.trials
     assert (first.status, first.cause) == ("error", "unreachable")
     assert first.fired["recovered"] == first.fired["arm_back"] == 1
     assert first.completed and not first.all_success
@@ -80,9 +80,9 @@ def test_giving_up_leaves_throws_unbegun() -> None:
     """The last throw was begun and not completed; those after it never were."""
     dead = [Line(ActionStatus.ERROR, (0.1, 0.1), cause="drive_fault")]
     log, mission = logged({"move_to_point": dead, "recover_arm": dead}, runs=4)
-    assert len(log.throws) == 1 < mission.runs
-    assert not log.throws[0].completed and log.throws[0].time is None
-    assert log.throws[0].status == "error"
+    assert len(log.trials) == 1 < mission.runs
+    assert not log.trials[0].completed and log.trials[0].time is None
+    assert log.trials[0].status == "error"
 
 
 def test_a_deferred_verdict_corrects_the_entry() -> None:
@@ -99,7 +99,7 @@ def test_a_deferred_verdict_corrects_the_entry() -> None:
             "late",
         ),
     )
-    runs = [run for run in log.throws[0].runs if run.place == "locate_ball"]
+    runs = [run for run in log.trials[0].runs if run.place == "locate_ball"]
     known = [key for key in log._entries if key.startswith("locate_ball")]
     log.instruction(
         9.0,
@@ -126,7 +126,7 @@ RUNS = st.builds(
     values=st.dictionaries(TEXT, FINITE, max_size=2),
 )
 THROWS = st.builds(
-    Throw,
+    Trial,
     k=st.integers(1, 99),
     begun=FINITE,
     time=st.none() | FINITE,
@@ -146,7 +146,7 @@ SCORES = st.dictionaries(
 
 @given(THROWS | st.none(), SCORES, st.booleans())
 def test_rows_come_back_as_they_were(
-    throw: Throw | None, score: dict[str, Any], known: bool
+    throw: Trial | None, score: dict[str, Any], known: bool
 ) -> None:
     """Through CSV, whatever texts hold; results that the first block did not have travel in
     `more`."""
@@ -159,7 +159,7 @@ def test_rows_come_back_as_they_were(
     out.seek(0)
     (record,) = csv.DictReader(io.StringIO(out.getvalue(), newline=""))
     back = read_row(record)
-    assert back.throw == row.throw
+    assert back.trial == row.trial
     assert back.score == row.score
     assert (back.n, back.regime, back.seed, back.k, back.mission_s) == (
         row.n,
@@ -172,7 +172,7 @@ def test_rows_come_back_as_they_were(
 
 def test_carriage_returns_do_not_break_the_table() -> None:
     """They become newlines, which CSV quotes."""
-    row = Row(1, "", 1, 1, 0, 1.0, Throw(1, 0.0, cause="one\rtwo\r\nthree"))
+    row = Row(1, "", 1, 1, 0, 1.0, Trial(1, 0.0, cause="one\rtwo\r\nthree"))
     names = columns(TOY, [])
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([names, cells(TOY, row, names)])
@@ -181,11 +181,11 @@ def test_carriage_returns_do_not_break_the_table() -> None:
 
 
 @given(THROWS)
-def test_throws_travel_as_plain_data(throw: Throw) -> None:
+def test_throws_travel_as_plain_data(throw: Trial) -> None:
     """From a worker to the campaign."""
     import json
 
-    assert Throw.from_plain(json.loads(json.dumps(throw.to_plain()))) == throw
+    assert Trial.from_plain(json.loads(json.dumps(throw.to_plain()))) == throw
 
 
 def test_scores_go_to_the_throw_that_they_are_of() -> None:
