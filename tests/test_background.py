@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator import background as analysing
+from petrobot.coordinator import background as background
 from petrobot.coordinator.background import Apart, RefusedError, Superseded, analyse_apart, analysed
 from tests.waiting import until
 
-CATCH_BALL = (Path(analysing.__file__).parent / "tasks" / "catch_ball.toml").read_text(
+CATCH_BALL = (Path(background.__file__).parent / "tasks" / "catch_ball.toml").read_text(
     encoding="utf-8"
 )
 
@@ -45,8 +45,8 @@ async def test_a_text_that_is_no_task_is_refused_with_its_fault() -> None:
 def test_a_search_that_ran_out_of_time_leaves_verdicts_open(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(analysing, "SECONDS", 0.0)
-    monkeypatch.setattr(analysing, "STATES", 1 << 40)
+    monkeypatch.setattr(background, "SECONDS", 0.0)
+    monkeypatch.setattr(background, "STATES", 1 << 40)
     answer = analysed(CATCH_BALL.replace("tokens = 4", "tokens = 4000"), "catch_ball.toml")
     assert answer["complete"] is False
     assert None in {verdict["holds"] for verdict in answer["verdicts"]}
@@ -57,11 +57,11 @@ def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
     """Not wall-clock time: a machine that is busy with a mission changes no verdict."""
     spinning = (
         "from itertools import repeat\n"
-        "from petrobot.coordinator import analysing\n"
-        "analysing.HARD_END = 0\n"
-        "analysing.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else "
+        "from petrobot.coordinator import background\n"
+        "background.HARD_END = 0\n"
+        "background.analysed = lambda text, name, view: all(repeat(1)) if view == 'gspn' else "
         "{'said': 1}\n"
-        "analysing.main()\n"
+        "background.main()\n"
     )
     order = b'{"work": "analysis", "given": {"text": "", "filename": "drawn.toml"}}\n'
     ended = subprocess.run(
@@ -88,7 +88,7 @@ async def test_one_that_does_not_end_is_given_up(
     )
     mute.chmod(0o755)
     monkeypatch.setattr("sys.executable", str(mute))
-    monkeypatch.setattr(analysing, "PATIENCE", 1.0)
+    monkeypatch.setattr(background, "PATIENCE", 1.0)
     if said:
         assert await analyse_apart("", "drawn.toml") == {"said": 1}
     else:

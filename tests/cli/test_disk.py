@@ -15,7 +15,7 @@ from petrobot.coordinator.run.folder import RESULT
 
 pytestmark = pytest.mark.processes
 ROOT = Path(__file__).parents[2]
-GOLDEN = ROOT / "tests" / "record" / "golden" / "catch_ball-undisturbed.journal"
+GOLDEN = ROOT / "tests" / "run" / "golden" / "catch_ball-undisturbed.journal"
 SIMULATED = "run catch_ball --mode lockstep --runs 1 --quiet"
 COMMANDS = {
     "keys": "cell.key",

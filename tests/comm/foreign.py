@@ -7,6 +7,7 @@ of it, written out.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import secrets
@@ -204,7 +205,10 @@ class Foreign:
         while time.monotonic() < until:
             message = unpack(self.body())
             if message[0] == PING:
-                self.say(PONG, message[1])
+                with contextlib.suppress(
+                    ConnectionError
+                ):  # it may have hung up: its REFUSE follows
+                    self.say(PONG, message[1])
             elif message[0] != PONG:
                 return message
         raise TimeoutError(f"nothing but heartbeats for {LIMIT} s; before came {self.skipped[-5:]}")

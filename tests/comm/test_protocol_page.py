@@ -22,11 +22,8 @@ ROWS = {
     for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)
 }
 UNITS = {"B": 1, "KiB": 1024, "MiB": 1024 * 1024}
-SERVICES = Path(m.__file__).parents[1]
-CODE = "\n".join(
-    path.read_text(encoding="utf-8")
-    for path in [*SERVICES.glob("comm/*.py"), *SERVICES.glob("*.py")]
-)
+SERVICES = Path(m.__file__).parents[2]
+CODE = "\n".join(path.read_text(encoding="utf-8") for path in sorted(SERVICES.rglob("*.py")))
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)

@@ -73,9 +73,9 @@ def test_a_node_does_not_listen_beyond_this_host_without_a_key(
 
 ELSEWHERE = """
 import asyncio, json, sys
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
 
 async def main():
     hello = m.Hello(2, 2, "coordinator", "far", "f1", 1)

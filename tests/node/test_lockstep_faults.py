@@ -150,12 +150,12 @@ args = {{ seconds = 0.01 }}
 """
 RUN = textwrap.dedent("""\
     import sys
-    from petrobot.services import watchdog
+    from petrobot.services.node import watchdog
     watchdog.LIMIT, watchdog.LOOK, watchdog.AGAIN, watchdog.ATTEMPTS = 0.4, 0.05, 0.1, 1
-    from petrobot.services.comm.directory import parse
-    from petrobot.services.lockstep_node import LockstepNode
-    from petrobot.services.comm.messages import Call, Hello, Outcome
-    from petrobot.services.comm.party import Envelope
+    from petrobot.services.comm.location_file import parse
+    from petrobot.services.node.lockstep import LockstepNode
+    from petrobot.services.comm.protocol.messages import Call, Hello, Outcome
+    from petrobot.services.comm.lockstep.party import Envelope
     from pathlib import Path
     file = Path(sys.argv[1])
     node = LockstepNode(parse(file.read_text(), file), "only")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-PAGE = Path(__file__).parents[2] / "coordinator" / "hmi" / "page"
+PAGE = Path(__file__).parents[2] / "coordinator" / "page" / "static"
 VENDOR = PAGE / "vendor"
 LIST = tomllib.loads((VENDOR / "vendored.toml").read_text(encoding="utf-8"))
 OWN = sorted(

@@ -194,7 +194,7 @@ def test_a_place_where_no_journal_can_be_is_refused(tmp_path: Path) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from petrobot.coordinator.record.journal import JournalWriter
+from petrobot.coordinator.run.journal import JournalWriter
 writer = JournalWriter(Path(sys.argv[1]), {})
 number = 0
 while True:

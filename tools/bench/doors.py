@@ -59,10 +59,10 @@ async def times(client: Client, until: Callable[[int], bool]) -> list[float]:
 
 HEAVY = """
 import asyncio, sys
-from petrobot.services.comm import messages as m
-from petrobot.services.comm.caller import Caller
-from petrobot.services.comm.client import Client
-from petrobot.services.comm.wire import NEWEST_VERSION as V
+from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.protocol.wire import NEWEST_VERSION as V
 
 PAYLOADS = [
     [[]] * 19_900, [{}] * 19_900, [[None] * 5] * 19_900, [None] * 130_000, [1.5] * 110_000, ["x"] * 130_000,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2_contingency, ttest_ind
 
-from petrobot.coordinator.studies.forecast.agreement import holm
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.play import Choices, Played
+from petrobot.coordinator.studies.forecast.shares import holm
 
 LEVEL = 0.01
 """Level at which played and measured trials differ, over all tests of a regime (Holm)."""

@@ -14,19 +14,18 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
-from petrobot.coordinator.studies.forecast.agreement import (
-    agreement,
-    holm,
-    predictive_interval,
-    quantile_interval,
-    share_p_value,
-)
+from petrobot.coordinator.studies.forecast.agreement import agreement, quantile_interval
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Laws, dependences
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, distance, figures, predict
 from petrobot.coordinator.studies.forecast.registered import read, register, write
 from petrobot.coordinator.studies.forecast.residual import measured
+from petrobot.coordinator.studies.forecast.shares import (
+    holm,
+    predictive_interval,
+    share_p_value,
+)
 from petrobot.coordinator.task import Task
 from tests.studies.forecast.conftest import Make
 
