@@ -1,0 +1,159 @@
+"""The wheel in an environment that has packages called `services` and `coordinator`, in a folder
+with `services/`, `sim/` and `tests/` of its own: every command of the README works there."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+import venv
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.integration.cell_files import services_file
+from tests.waiting import Limit
+
+pytestmark = pytest.mark.processes
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+COMMANDS = [
+    line.split("  #")[0].strip()
+    for block in README.split("```")[1::2]
+    for line in block.splitlines()
+    if line.startswith("petrobot ")
+]
+STAY = ("petrobot up", "petrobot serve --up")
+"""Commands that run until Ctrl-C."""
+ENDS = {"petrobot resume last": (0, 1)}
+"""Exit codes where they are not 0 alone: `resume` of a finished run repeats how it ended."""
+FOREIGN = 'raise ImportError("the wrong package was imported")\n'
+LIMIT = 300.0
+
+
+@dataclass
+class Installed:
+    """An environment with the wheel, and a folder of a user."""
+
+    python: Path
+    folder: Path
+
+    def run(self, command: str) -> subprocess.CompletedProcess[str]:
+        """Run a command of the README in the user's folder, with few repetitions."""
+        few = re.sub(r"--runs \d+", "--runs 2", command)
+        return subprocess.run(
+            [self.python.with_name("petrobot"), *shlex.split(few)[1:]],
+            cwd=self.folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=LIMIT,
+            check=False,
+        )
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """Without what would let this checkout be found."""
+        return {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """Build the wheel from a copy, and install it beside foreign packages of the old names."""
+    base = tmp_path_factory.mktemp("installed")
+    copy = base / "source"
+    left_out = (".*", "build", "*.egg-info", "reports", "runs", "tests", "tools", "docs")
+    shutil.copytree(ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(*left_out))
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    build = ["wheel", "--no-deps", "--no-build-isolation", "-w", str(base), str(copy)]
+    subprocess.run([*pip, *build], check=True, timeout=LIMIT)
+    (wheel,) = base.glob("petrobot-*.whl")
+    venv.create(base / "env", with_pip=False)
+    python = base / "env" / "bin" / "python"
+    install = ["--python", str(python), "install", "--no-deps", "--no-index", str(wheel)]
+    subprocess.run([*pip, *install], check=True, timeout=LIMIT)
+    (site,) = (base / "env" / "lib").glob("python*/site-packages")
+    # The dependencies are those of this environment; a path in a .pth file brings no checkout with
+    # it, since .pth files there are not read again.
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"), encoding="utf-8")
+    folder = base / "robot"
+    for where in (site, folder):
+        for name in ("services", "coordinator", "sim", "tests"):
+            (where / name).mkdir(parents=True)
+            (where / name / "__init__.py").write_text(FOREIGN, encoding="utf-8")
+    return Installed(python, folder)
+
+
+def test_nothing_of_this_checkout_is_imported(installed: Installed) -> None:
+    where = "import petrobot.coordinator.cli as c; print(c.__file__)"
+    said = subprocess.run(
+        [installed.python, "-c", where],
+        cwd=installed.folder,
+        env=installed.environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(said.stdout.strip()).is_relative_to(installed.python.parents[1])
+
+
+def test_every_command_of_the_readme(installed: Installed) -> None:
+    """In its order; the first run takes the location file that the wheel brings along."""
+    assert len(COMMANDS) >= 16 and COMMANDS[0].startswith("petrobot run catch_ball --mode lockstep")
+    _try(installed, COMMANDS[0])
+    services_file(installed.folder)  # from now on on ports that no other test uses
+    with _staying(installed, "petrobot up"):
+        limit = Limit("the nodes")
+        while installed.run("petrobot nodes").returncode and limit.left():
+            time.sleep(0.2)
+        _try(installed, "petrobot run catch_ball --runs 1 --no-page --quiet")
+        for command in COMMANDS[1:]:
+            if command not in STAY:
+                _try(installed, command)
+    with _staying(installed, "petrobot serve --up") as page:
+        limit = Limit("the page")
+        while "http://" not in page.read_text(encoding="utf-8") and limit.left():
+            time.sleep(0.1)
+
+
+def _try(installed: Installed, command: str) -> None:
+    done = installed.run(command)
+    said = f"{command}: {done.stdout}{done.stderr}"
+    assert done.returncode in ENDS.get(command, (0,)), said
+    assert "Traceback" not in said
+
+
+@contextmanager
+def _staying(installed: Installed, command: str) -> Iterator[Path]:
+    """Run a command until the end of the block, then press Ctrl-C; gives what it prints."""
+    said = installed.folder / "said.txt"
+    with said.open("w", encoding="utf-8") as output:
+        process = subprocess.Popen(
+            [installed.python.with_name("petrobot"), *shlex.split(command)[1:]],
+            cwd=installed.folder,
+            env=installed.environment,
+            stdout=output,
+            stderr=output,
+            preexec_fn=_hears_ctrl_c,
+        )
+        try:
+            yield said
+            process.send_signal(signal.SIGINT)
+            assert process.wait(LIMIT) in (0, 130), said.read_text(encoding="utf-8")
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _hears_ctrl_c() -> None:
+    # A shell's background job is started with SIGINT ignored, and its children inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
