@@ -1,0 +1,166 @@
+"""Measure the house: sizes, names, comments and the files on the main path, as a Markdown table.
+
+    python -m tools.house                 of this checkout
+    python -m tools.house REVISION ...    of revisions beside it (read from the repository's history)
+
+Code lines are lines that are neither blank, comment nor docstring. A file serves one other file if
+exactly one module imports it; commands of the command line, `__main__` and package files, which are
+found by their names, are left out. The main path is what one action passes from the token that
+enters its place to the firing that follows: its files are listed in docs/life-of-a-run.md.
+"""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import statistics
+import subprocess
+import sys
+import tarfile
+import tempfile
+import tokenize
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TOPS = ("coordinator", "services", "sim")
+COLUMNS = 100
+
+
+@dataclass
+class Measures:
+    """What was counted in one checkout."""
+
+    files: int = 0
+    code: list[int] = field(default_factory=list)
+    """Code lines of each file."""
+    functions: list[int] = field(default_factory=list)
+    """Code lines of each function."""
+    comments: int = 0
+    long: int = 0
+    lines: int = 0
+    rooms: set[str] = field(default_factory=set)
+    classes: Counter[str] = field(default_factory=Counter)
+    serving_one: int = 0
+    tests: int = 0
+
+    def rows(self) -> list[tuple[str, str]]:
+        """The measures with their names."""
+        repeated = sum(1 for count in self.classes.values() if count > 1)
+        return [
+            ("code lines / files", f"{sum(self.code) / 1000:.1f}k / {self.files}"),
+            ("rooms (folders with modules)", str(len(self.rooms))),
+            ("file, median / most (code lines)", _median_most(self.code)),
+            ("function, median / most (code lines)", _median_most(self.functions)),
+            ("comment lines per 100 code lines", f"{100 * self.comments / sum(self.code):.1f}"),
+            ("files that serve exactly one other file", str(self.serving_one)),
+            ("class names defined more than once", f"{repeated} of {len(self.classes)}"),
+            (f"lines over {COLUMNS} columns", f"{100 * self.long / self.lines:.1f} %"),
+            ("lines of tests", f"{self.tests / 1000:.1f}k"),
+        ]
+
+
+def _median_most(sizes: list[int]) -> str:
+    return f"{statistics.median(sizes):.0f} / {max(sizes)}"
+
+
+def code_lines(text: str, tree: ast.Module) -> set[int]:
+    """Numbers of the lines that hold code."""
+    prose: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str):
+            prose |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    marks = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+    held: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in marks and token.type != tokenize.ENDMARKER:
+            held |= set(range(token.start[0], token.end[0] + 1))
+    return held - prose
+
+
+def measure(root: Path) -> Measures:
+    """Count in a checkout."""
+    found = Measures()
+    imported: dict[str, set[str]] = {}
+    names: dict[str, Path] = {}
+    for top in TOPS:
+        for path in sorted((root / top).rglob("*.py")):
+            parts = path.relative_to(root).with_suffix("").parts
+            names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    for name, path in names.items():
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        held = code_lines(text, tree)
+        found.files += 1
+        found.code.append(len(held))
+        found.comments += sum(1 for line in text.splitlines() if line.lstrip().startswith("#"))
+        found.lines += text.count("\n")
+        found.long += sum(1 for line in text.splitlines() if len(line) > COLUMNS)
+        found.rooms.add(str(path.parent))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                found.classes[node.name] += 1
+            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                last = node.end_lineno or node.lineno
+                found.functions.append(len(held & set(range(node.lineno, last + 1))))
+        for target in imports(tree):
+            imported.setdefault(target.removeprefix("petrobot."), set()).add(name)
+    found.serving_one = sum(
+        1
+        for name, path in names.items()
+        if len(imported.get(name, ())) == 1
+        and path.name not in ("__init__.py", "__main__.py")
+        and ".cli." not in name
+    )
+    for path in (root / "tests").rglob("*.py"):
+        found.tests += path.read_text(encoding="utf-8").count("\n")
+    return found
+
+
+def imports(tree: ast.Module) -> set[str]:
+    """Dotted names that a module imports: modules, and what is taken from them."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def main_path() -> int:
+    """How many files docs/life-of-a-run.md names between the token and the firing."""
+    page = ROOT / "docs" / "life-of-a-run.md"
+    if not page.exists():
+        return 0
+    walked = page.read_text(encoding="utf-8").split("\n## ")[1]
+    return len(set(re.findall(r"`((?:coordinator|services)/[\w/]+\.py)", walked)))
+
+
+def at_revision(revision: str) -> Measures:
+    """Measure a revision of the repository's history."""
+    command = ["git", "-C", str(ROOT), "archive", revision, *TOPS, "tests"]
+    packed = subprocess.run(command, check=True, capture_output=True).stdout
+    with tempfile.TemporaryDirectory() as folder:
+        with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
+            archive.extractall(folder, filter="data")
+        return measure(Path(folder))
+
+
+def main() -> int:
+    """Print the table."""
+    columns = {revision: at_revision(revision).rows() for revision in sys.argv[1:]}
+    columns["now"] = measure(ROOT).rows()
+    print("| | " + " | ".join(columns) + " |")
+    print("|---|" + "---|" * len(columns))
+    for number, (title, _) in enumerate(columns["now"]):
+        print(f"| {title} | " + " | ".join(rows[number][1] for rows in columns.values()) + " |")
+    if path := main_path():
+        print(f"\nFiles from the token to the firing (docs/life-of-a-run.md): {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
