@@ -14,9 +14,12 @@ from typing import Any
 JOURNAL = "run.journal"
 RESULT = "result.json"
 DEFAULT = Path("runs")
-TIMELESS = "timeless"
-"""Key of a journal's header: what becomes of a net that fires without end; it paused in runs whose
-header has no such key."""
+SEMANTICS = 2
+"""The rules by which this engine executes a net, in the header of each journal (key `semantics`).
+
+1 (and no such key): after 1,000 firings without time the net pauses. 2: endless firing ends in
+ERROR. A journal is replayed and resumed under its own rules (`recording.as_recorded`).
+"""
 
 
 class NoRunError(Exception):
@@ -35,7 +38,7 @@ def header(
         "mode": mode,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": {"petrobot": version("petrobot"), "python": platform.python_version()},
-        TIMELESS: "error",
+        "semantics": SEMANTICS,
         **rest,
     }
 

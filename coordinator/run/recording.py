@@ -28,7 +28,7 @@ from petrobot.coordinator.engine import (
     to_plain,
 )
 from petrobot.coordinator.engine.step import RECORDED
-from petrobot.coordinator.run.folder import TIMELESS
+from petrobot.coordinator.run.folder import SEMANTICS
 from petrobot.coordinator.run.journal import Journal, JournalError, JournalWriter
 
 STIMULUS = "stimulus"
@@ -152,9 +152,19 @@ class Step:
 
 
 def as_recorded(engine: Engine, header: Mapping[str, Any]) -> Engine:
-    """The engine with the policy under which a journal was recorded: what it did then it does
-    again."""
-    return engine if TIMELESS in header else Engine(engine.task, engine.compiled.devices, RECORDED)
+    """Return the engine with the rules under which a journal was recorded.
+
+    Raises JournalError for a journal of a newer petrobot.
+    """
+    semantics = header.get("semantics", 1)
+    if semantics > SEMANTICS:
+        raise JournalError(
+            f"semantics: expected at most {SEMANTICS}, found {semantics}: this run was recorded by "
+            "a newer petrobot; use that one to replay or resume it"
+        )
+    if semantics == 1:
+        return Engine(engine.task, engine.compiled.devices, RECORDED)
+    return engine
 
 
 def replay(journal: Journal, engine: Engine) -> Iterator[Step]:

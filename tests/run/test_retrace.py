@@ -4,13 +4,14 @@ compared, and written on."""
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.run.folder import JOURNAL, RESULT
+from petrobot.coordinator.run.folder import JOURNAL, RESULT, SEMANTICS
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
 from petrobot.coordinator.run.recording import ReplayError, RetracingStore
 from tests.run.test_runfolder import SCRIPT, SERVICES
@@ -98,3 +99,19 @@ def test_measured_processor_time_is_no_difference(tmp_path: Path) -> None:
     again = RetracingStore(JournalWriter(path), read_journal(path))
     with pytest.raises(ReplayError, match="record 1 was stage"):
         again.stage("prepared", {})
+
+
+def test_a_journal_of_a_newer_petrobot_is_refused(
+    recorded_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its rules are not known here: a replay would find differences that are none."""
+    journal = read_journal(recorded_run / JOURNAL)
+    assert journal.header["semantics"] == SEMANTICS
+    newer = tmp_path / "run.journal"
+    with closing(JournalWriter(newer, {**journal.header, "semantics": SEMANTICS + 1})) as writer:
+        for record in journal.records:
+            writer.append(record.kind, record.data)
+    assert main(["replay", str(newer)]) == 2
+    said = capsys.readouterr().err
+    assert f"semantics: expected at most {SEMANTICS}, found {SEMANTICS + 1}" in said
+    assert "Traceback" not in said
