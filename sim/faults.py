@@ -27,7 +27,7 @@ from petrobot.services.comm.canopen.bus import Frame
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class InjectedFault:
     """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor
     or joint (from 1)."""
 
@@ -46,7 +46,7 @@ class FaultKinds:
     keys: Mapping[str, tuple[str, ...]]
     drives: int
 
-    def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
+    def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
         """A fault as a caller asks for it. Raises ValueError that says what is wrong and what
         fits."""
         if kind not in self.keys:
@@ -66,7 +66,7 @@ class FaultKinds:
             value = _number(arguments, "joint", None, 1.0, float(self.drives))
             if value != int(value):
                 raise ValueError(f"joint is {value!r}: give a whole number from 1 to {self.drives}")
-        return Fault(kind, now + after, now + after + duration, value, "duration" in keys)
+        return InjectedFault(kind, now + after, now + after + duration, value, "duration" in keys)
 
 
 ARM_FAULTS: Final = FaultKinds(
@@ -84,7 +84,7 @@ ARM_FAULTS: Final = FaultKinds(
 )
 
 
-def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
+def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
     """A fault of the catching cell's as a caller asks for it. Raises ValueError that says what is
     wrong and what fits."""
     return ARM_FAULTS.read(now, kind, arguments)
@@ -106,14 +106,14 @@ class FaultPlan:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._coming: list[Fault] = []
-        self._lasting: list[Fault] = []
+        self._coming: list[InjectedFault] = []
+        self._lasting: list[InjectedFault] = []
 
-    def add(self, fault: Fault) -> None:
+    def add(self, fault: InjectedFault) -> None:
         """Plan a fault."""
         self._coming.append(fault)
 
-    def begin(self, now: float) -> list[Fault]:
+    def begin(self, now: float) -> list[InjectedFault]:
         """The faults whose time has come since the last call, in the order of their time; those
         over are forgotten."""
         begun = sorted((f for f in self._coming if f.start <= now), key=lambda f: f.start)

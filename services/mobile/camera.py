@@ -15,7 +15,7 @@ from petrobot.services.mobile.model import NOMINAL, nominal_rover, read_rover
 from petrobot.services.mobile.watching import FloorWatch
 
 
-class CameraError(ValueError):
+class FloorCameraError(ValueError):
     """The camera's config or its images cannot be used; the text says what to change."""
 
 
@@ -37,7 +37,7 @@ class FloorCamera:
         self.floor = FloorWatch.of(rover)
         self.usual_rate = float(config.get("rate", rover.camera.rate))
         if not 0.0 < self.usual_rate <= 1000.0:
-            raise CameraError(
+            raise FloorCameraError(
                 f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, "
                 "such as 25"
             )
@@ -75,7 +75,7 @@ class FloorCamera:
         view = self.floor.view
         if image.pixels.shape != (view.height, view.width):
             high, wide = image.pixels.shape
-            raise CameraError(
+            raise FloorCameraError(
                 f"the camera gives {wide}x{high} images, its numbers say "
                 f"{view.width}x{view.height}: "
                 f"change [camera] of {NOMINAL} or the camera's settings"

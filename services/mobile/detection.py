@@ -8,20 +8,122 @@ counts.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.mobile.candidates import (
-    Candidates,
-    contrast_threshold,
-    edge_pairs,
-    ridge_strength,
-    ridges,
-)
 from petrobot.services.mobile.floor import Grey, ScanGrid
-from petrobot.services.mobile.sight import UNSEEN, Line, Sight, Vector, polynomial
+from petrobot.services.mobile.sight import UNSEEN, Parabola, Sight, Vector, polynomial
+
+# --- Candidates in one scan row ------------------------------------------------------------------
+
+LEAST_CONTRAST = 14.0
+"""Grey levels: what noise alone does not reach."""
+CONTRAST_SHARE = 0.22
+"""Share of an image's range of grey that an edge must have."""
+NARROWEST, WIDEST = 0.6, 2.1
+"""Track widths between the edges of a pair: a track crossed at an angle is wider."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Places by row: `row` ascending, `y` (m), `strength` (grey levels), all (n,)."""
+
+    row: NDArray[np.intp]
+    y: Vector
+    strength: Vector
+
+
+def contrast_threshold(samples: Grey) -> float:
+    """Grey levels from which a difference counts, for this image."""
+    some = samples[::3, ::5]
+    return max(LEAST_CONTRAST, CONTRAST_SHARE * float(some.max() - some.min()))
+
+
+def edge_pairs(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
+    """Middles of pairs of opposite edges about `width` (m) apart."""
+    gradient = (
+        samples[:, 4:] - samples[:, :-4]
+    )  # the rise over 25 mm: edges are blurred by optics and motion
+    size = np.abs(gradient)
+    size[~(grid.seen[:, 4:] & grid.seen[:, :-4])] = 0.0
+    middle = size[:, 1:-1]
+    peak = (
+        (middle > contrast_threshold(samples)) & (middle >= size[:, :-2]) & (middle > size[:, 2:])
+    )
+    row, column = np.nonzero(peak)
+    if row.size < 2:
+        return Candidates(row[:0], np.empty(0), np.empty(0))
+    before, at, after = size[row, column], size[row, column + 1], size[row, column + 2]
+    shift = 0.5 * (before - after) / np.minimum(before - 2.0 * at + after, -1e-6)
+    place = grid.y[column + 3] + shift * grid.step
+    sign = gradient[row, column + 1] > 0.0
+    pairs = [_paired(row, place, sign, at, gap, width) for gap in (1, 2)]
+    rows = np.concatenate([p[0] for p in pairs])
+    order = np.argsort(rows, kind="stable")
+    y, strength = (np.concatenate([p[i] for p in pairs])[order] for i in (1, 2))
+    return Candidates(rows[order], y, strength)
+
+
+def _paired(
+    row: NDArray[np.intp],
+    place: Vector,
+    sign: NDArray[np.bool_],
+    size: Grey,
+    gap: int,
+    width: float,
+) -> tuple[NDArray[np.intp], Vector, Vector]:
+    """Edges that are `gap` apart in the list and may be the two sides of a track."""
+    apart = place[gap:] - place[:-gap]
+    fits = (row[gap:] == row[:-gap]) & (sign[gap:] != sign[:-gap])
+    fits &= (apart > NARROWEST * width) & (apart < WIDEST * width)
+    index = np.nonzero(fits)[0]
+    strength = np.minimum(size[index], size[index + gap]).astype(float)
+    return row[index], 0.5 * (place[index] + place[index + gap]), strength
+
+
+def ridge_strength(grid: ScanGrid, samples: Grey, width: float) -> Grey:
+    """How far (grey levels) each spot differs from both its sides, the lesser of the two; 0 where
+    they differ oppositely.
+
+    The absolute second difference of a row, made blind to steps: at a step one of the two
+    differences vanishes.
+    """
+    side = round(width / grid.step)
+    core = max(1, round(0.3 * width / grid.step))
+    sums = np.cumsum(np.pad(samples, ((0, 0), (core + 1, core)), mode="edge"), axis=1)
+    mean = (sums[:, 2 * core + 1 :] - sums[:, : -2 * core - 1]) * np.float32(1.0 / (2 * core + 1))
+    left = mean[:, side:-side] - mean[:, : -2 * side]
+    right = mean[:, side:-side] - mean[:, 2 * side :]
+    strength = np.zeros_like(samples)
+    lesser = np.minimum(np.abs(left), np.abs(right))
+    strength[:, side:-side] = np.where(left * right > 0.0, lesser, np.float32(0.0))
+    strength[~grid.seen] = 0.0
+    return strength
+
+
+def ridges(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
+    """Middles of ridges of about `width` (m): peaks of `ridge_strength`, each at its centre of
+    gravity."""
+    strength = ridge_strength(grid, samples, width)
+    reach = max(1, round(0.5 * width / grid.step))
+    middle = strength[:, reach:-reach]
+    peak = middle > contrast_threshold(samples)
+    for shift in range(1, reach + 1):
+        end = strength.shape[1] - reach
+        peak &= (middle >= strength[:, reach - shift : end - shift]) & (
+            middle > strength[:, reach + shift :][:, : middle.shape[1]]
+        )
+    row, column = np.nonzero(peak)
+    around = strength[row[:, None], column[:, None] + np.arange(2 * reach + 1)[None, :]]
+    offsets = (np.arange(2 * reach + 1) - reach) * grid.step
+    y = grid.y[column + reach] + (around @ offsets) / np.maximum(around.sum(axis=1), 1e-6)
+    return Candidates(row, y.astype(float), strength[row, column + reach].astype(float))
+
+
+# --- From candidates to the line -----------------------------------------------------------------
 
 GATE = 0.07
 """m that the line may be off the one expected."""
@@ -41,20 +143,22 @@ SHORTEST = 0.16
 """m of line that count as one."""
 
 
-class Detector(Protocol):
+class TrackDetector(Protocol):
     """Gives the line in samples of an image (rows, columns) of a grid."""
 
-    def __call__(self, grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+    def __call__(
+        self, grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None
+    ) -> Sight:
         """Find the line; `UNSEEN` if there is none."""
 
 
-def detect_edges(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+def detect_edges(grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None) -> Sight:
     """Pairs of opposite edges, chained from near to far: the cheapest and most accurate on clean
     paint."""
     return chain(grid, edge_pairs(grid, samples, width), expected)
 
 
-def detect_ridge(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+def detect_ridge(grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None) -> Sight:
     """Ridges of the absolute second difference, chained from near to far: averages noise over the
     track's width."""
     return chain(grid, ridges(grid, samples, width), expected)
@@ -89,7 +193,7 @@ class _Chain:
         return self.x[-1] - self.x[0]
 
 
-def chain(grid: ScanGrid, candidates: Candidates, expected: Line | None) -> Sight:
+def chain(grid: ScanGrid, candidates: Candidates, expected: Parabola | None) -> Sight:
     """The best line through candidates: each row's nearest to where the line should be, from the
     nearest rows on."""
     rows = _by_row(grid, candidates)
@@ -112,7 +216,7 @@ def _by_row(grid: ScanGrid, candidates: Candidates) -> list[list[float]]:
 
 
 def _seeds(
-    grid: ScanGrid, rows: list[list[float]], expected: Line | None
+    grid: ScanGrid, rows: list[list[float]], expected: Parabola | None
 ) -> list[tuple[_Chain, int]]:
     """Beginnings of lines with the row after which each goes on."""
     seeds: list[tuple[_Chain, int]] = []
@@ -197,7 +301,7 @@ DRAWS = 60
 """Triples that are tried."""
 
 
-def consensus(random: Callable[[], np.random.Generator]) -> Detector:
+def consensus(random: Callable[[], np.random.Generator]) -> TrackDetector:
     """A detector that fits a parabola to edge pairs by random sample consensus (Fischler and Bolles
     1981).
 
@@ -205,7 +309,7 @@ def consensus(random: Callable[[], np.random.Generator]) -> Detector:
     generator to draw from.
     """
 
-    def detect(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+    def detect(grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None) -> Sight:
         found = edge_pairs(grid, samples, width)
         keep = _plausible(grid, found, expected)
         x, y = grid.x[found.row[keep]], found.y[keep]
@@ -222,7 +326,7 @@ def consensus(random: Callable[[], np.random.Generator]) -> Detector:
     return detect
 
 
-def _plausible(grid: ScanGrid, found: Candidates, expected: Line | None) -> NDArray[np.bool_]:
+def _plausible(grid: ScanGrid, found: Candidates, expected: Parabola | None) -> NDArray[np.bool_]:
     """Candidates within the window, and near the expected line if there is one."""
     x = grid.x[found.row]
     keep: NDArray[np.bool_] = x <= (x.min() + WINDOW if x.size else 0.0)
@@ -264,7 +368,7 @@ def chain_about(grid: ScanGrid, found: Candidates, curve: Vector) -> Sight:
         return UNSEEN
     near = float(x[inlier].min())
     slope, bend = float(curve[1] + 2.0 * curve[2] * near), float(2.0 * curve[2])
-    line = Line(
+    line = Parabola(
         near, near + WINDOW, float(curve[0] + curve[1] * near + curve[2] * near * near), slope, bend
     )
     return chain(grid, found, line)
@@ -286,7 +390,9 @@ class TemplateBank:
     def __init__(self) -> None:
         self._grid: ScanGrid | None = None
 
-    def __call__(self, grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+    def __call__(
+        self, grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None
+    ) -> Sight:
         """Find the line."""
         if self._grid is not grid:
             self._lay_out(grid)
@@ -334,7 +440,7 @@ class TemplateBank:
         x = grid.x[: self._rows][heavy]
         c = polynomial(x - x[0], y, 2, mass[heavy])
         found = Candidates(rows[heavy], y, mass[heavy])
-        line = Line(float(x[0]), float(x[-1]), c[0], c[1], 2.0 * c[2])
+        line = Parabola(float(x[0]), float(x[-1]), c[0], c[1], 2.0 * c[2])
         beyond = _beyond(grid, strength, self._rows)
         return chain(grid, _joined(found, beyond), line)
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 NOMINAL = "rover.toml"
 
 
-class ModelError(ValueError):
+class RoverFileError(ValueError):
     """A file of numbers lacks a key or holds a value that cannot be; the message names file, key
     and remedy."""
 
@@ -26,7 +26,7 @@ class _Table:
         """From a file's tables. Raises ModelError."""
         table = tables.get(name)
         if not isinstance(table, Mapping):
-            raise ModelError(
+            raise RoverFileError(
                 f"{source}: table [{name}] is missing; see the one that comes with petrobot, "
                 f"{NOMINAL}"
             )
@@ -36,7 +36,7 @@ class _Table:
 
 
 @dataclass(frozen=True)
-class Track(_Table):
+class FloorSizes(_Table):
     """The contest's floor (m)."""
 
     square: float
@@ -60,7 +60,7 @@ class Wheels(_Table):
 
 
 @dataclass(frozen=True)
-class Bus(_Table):
+class BusLayout(_Table):
     """The CAN bus: period of SYNC (s) and node ids."""
 
     period: float
@@ -95,33 +95,33 @@ class Sensor(_Table):
 
 
 @dataclass(frozen=True)
-class Rover:
+class RoverModel:
     """All numbers of one rover."""
 
-    track: Track
+    track: FloorSizes
     wheels: Wheels
-    bus: Bus
+    bus: BusLayout
     camera: CameraModel
     sensor: Sensor
 
 
-def read_rover(text: str, source: str = NOMINAL) -> Rover:
+def read_rover(text: str, source: str = NOMINAL) -> RoverModel:
     """A rover from the text of a TOML file. Raises ModelError."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as fault:
-        raise ModelError(f"{source}: no TOML ({fault}); mend that line") from fault
-    return Rover(
-        Track.of(tables, "track", source),
+        raise RoverFileError(f"{source}: no TOML ({fault}); mend that line") from fault
+    return RoverModel(
+        FloorSizes.of(tables, "track", source),
         Wheels.of(tables, "rover", source),
-        Bus.of(tables, "bus", source),
+        BusLayout.of(tables, "bus", source),
         CameraModel.of(tables, "camera", source),
         Sensor.of(tables, "sensor", source),
     )
 
 
 @lru_cache(maxsize=1)
-def nominal_rover() -> Rover:
+def nominal_rover() -> RoverModel:
     """The rover that comes with petrobot."""
     return read_rover(
         files("petrobot.services.mobile").joinpath(NOMINAL).read_text(encoding="utf-8")
@@ -133,12 +133,12 @@ def _number(table: Mapping[str, Any], name: str, key: str, source: str) -> Any:
     if key == "principal_px":
         if isinstance(value, list) and len(value) == 2 and all(_positive(v) for v in value):
             return float(value[0]), float(value[1])
-        raise ModelError(
+        raise RoverFileError(
             f"{source}: [{name}] {key} = {value!r}: give two positive numbers, column and "
             "row in pixels"
         )
     if value is None or not _positive(value):
-        raise ModelError(f"{source}: [{name}] {key} = {value!r}: a positive number is needed")
+        raise RoverFileError(f"{source}: [{name}] {key} = {value!r}: a positive number is needed")
     return float(value)
 
 

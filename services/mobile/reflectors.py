@@ -32,7 +32,7 @@ MOST: Final = 24
 
 
 @dataclass(slots=True)
-class Place:
+class EchoSpot:
     """A spot that echoes came from: mean of the latest ones (m, odometry frame), how many, and when
     the last came (s)."""
 
@@ -59,7 +59,7 @@ class ReflectorMap:
     def __init__(self, sensor: Sensor, reflector_height: float) -> None:
         self._forward = sensor.forward
         self._above = reflector_height - sensor.height
-        self._places: list[Place] = []
+        self._places: list[EchoSpot] = []
         self.echoes = 0
 
     def take(self, now: float, pose: Pose, echoes: Sequence[tuple[float, float]]) -> None:
@@ -84,7 +84,7 @@ class ReflectorMap:
     def _note(self, now: float, x: float, y: float) -> None:
         near = min(self._places, key=lambda p: math.hypot(p.x - x, p.y - y), default=None)
         if near is None or math.hypot(near.x - x, near.y - y) > NEAR:
-            self._places.append(Place(x, y, 1, now))
+            self._places.append(EchoSpot(x, y, 1, now))
             return
         near.count, near.last = near.count + 1, now
         part = 1.0 / min(near.count, 12)

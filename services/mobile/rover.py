@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from petrobot.services.device import Ports, Setpoint
 from petrobot.services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
-from petrobot.services.mobile.model import Rover as Numbers
+from petrobot.services.mobile.model import RoverModel as Numbers
 from petrobot.services.mobile.model import nominal_rover, read_rover
 from petrobot.services.mobile.odometry import Odometry, Pose, turned
 from petrobot.services.mobile.reflectors import ReflectorMap, parse_echoes

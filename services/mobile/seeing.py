@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import Final
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
-from petrobot.services.mobile.camera import CameraError, FloorCamera
+from petrobot.services.mobile.camera import FloorCamera, FloorCameraError
 from petrobot.services.mobile.detection import (
-    Detector,
     TemplateBank,
+    TrackDetector,
     consensus,
     detect_edges,
     detect_ridge,
@@ -92,7 +92,9 @@ async def watch_template(
     return await _watch(ctx, TemplateBank(), lost_after, image_timeout)
 
 
-async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout: float) -> Result:
+async def _find(
+    ctx: Context, detector: TrackDetector, timeout: float, image_timeout: float
+) -> Result:
     camera: FloorCamera = ctx.device
     watcher = LineWatcher(camera.floor, detector, find=True)
     until, row = ctx.now + timeout, 0
@@ -118,7 +120,7 @@ async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout:
 
 
 async def _watch(
-    ctx: Context, detector: Detector, lost_after: float, image_timeout: float
+    ctx: Context, detector: TrackDetector, lost_after: float, image_timeout: float
 ) -> Result:
     camera: FloorCamera = ctx.device
     watcher = LineWatcher(camera.floor, detector)
@@ -162,7 +164,7 @@ async def _next(
     """What the next image shows, streamed; or how the run ends without one."""
     try:
         image = await camera.read(ctx, image_timeout)
-    except CameraError as fault:
+    except FloorCameraError as fault:
         return error("bad_image", str(fault))
     if image is None:
         camera.end()  # the next run opens the source anew

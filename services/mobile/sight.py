@@ -35,7 +35,7 @@ class TrackEnd(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class LineEnd:
     """Where (m, body frame at exposure) and how the line ends."""
 
     kind: TrackEnd
@@ -54,7 +54,7 @@ class Sight:
     x: Vector
     y: Vector
     confidence: float = 0.0
-    end: End | None = None
+    end: LineEnd | None = None
     broke_off: bool = False
     """Whether rows that should show more of the line do not."""
 
@@ -63,7 +63,7 @@ class Sight:
         """Whether there is a line."""
         return self.x.size > 2
 
-    def line(self) -> Line:
+    def line(self) -> Parabola:
         """A parabola over the first half metre, to know where to look next. Raises ValueError when
         no line was seen."""
         x, y = self._near()
@@ -111,7 +111,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class Parabola:
     """A parabola y = offset + slope (x - near) + bend (x - near)^2 / 2 over [near, far] (m, body
     frame)."""
 
@@ -127,13 +127,13 @@ class Line:
         return self.offset + self.slope * d + 0.5 * self.bend * d * d
 
 
-def fit_line(x: Vector, y: Vector) -> Line:
+def fit_line(x: Vector, y: Vector) -> Parabola:
     """Least-squares parabola through points, a straight line through fewer than five."""
     near, far = float(x[0]), float(x[-1])
     degree = 2 if x.size >= 5 and far - near > 0.15 else 1
     coefficients = polynomial(x - near, y, degree)
     bend = 2.0 * coefficients[2] if degree == 2 else 0.0
-    return Line(near, far, coefficients[0], coefficients[1], bend)
+    return Parabola(near, far, coefficients[0], coefficients[1], bend)
 
 
 def polynomial(x: Vector, y: Vector, degree: int, weights: Vector | None = None) -> list[float]:
@@ -163,12 +163,12 @@ class TrackAhead:
 
     age: float
     confidence: float
-    end: End | None = None
+    end: LineEnd | None = None
     points: tuple[tuple[float, float], ...] = field(default=())
 
     def values(self) -> list[float]:
         """As numbers."""
-        end = self.end or End(TrackEnd.NONE, 0.0, 0.0)
+        end = self.end or LineEnd(TrackEnd.NONE, 0.0, 0.0)
         flat = [c for point in self.points for c in point]
         return [self.age, self.confidence, float(end.kind), end.x, end.y, *flat]
 
@@ -185,7 +185,7 @@ class TrackAhead:
         age, confidence, kind, x, y = values[:HEAD]
         if kind not in tuple(TrackEnd) or age < 0.0:
             raise ValueError(f"track_ahead: age {age}, end {kind}: not a set point")
-        end = None if kind == TrackEnd.NONE else End(TrackEnd(int(kind)), x, y)
+        end = None if kind == TrackEnd.NONE else LineEnd(TrackEnd(int(kind)), x, y)
         points = tuple(zip(values[HEAD::2], values[HEAD + 1 :: 2], strict=True))
         return TrackAhead(age + held, confidence, end, points)
 

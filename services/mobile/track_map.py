@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from petrobot.services.mobile.odometry import Pose
 from petrobot.services.mobile.paths import join, passes
-from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.mobile.sight import LineEnd, TrackAhead, TrackEnd
 
 Vector = NDArray[np.float64]
 
@@ -212,7 +212,7 @@ class TrackMap:
                 off.append(abs(fit.y - y) * math.cos(fit.heading))
         return len(off) >= 2 and sorted(off)[len(off) // 2] > OTHER
 
-    def _note_end(self, pose: Pose, end: End) -> None:
+    def _note_end(self, pose: Pose, end: LineEnd) -> None:
         self._ends.append((end.kind, *pose.floor(end.x, end.y)))
 
     # Giving out

@@ -20,22 +20,131 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import sub
 from typing import Any, Final
 
 import numpy as np
 
-from petrobot.services.device import Ports, Setpoint
-from petrobot.services.motion.arm_settings import Settings, drive_settings, numbers
-from petrobot.services.motion.barrier import Barrier
-from petrobot.services.motion.drive_master import DriveMaster, Phase
+from petrobot.services.comm.canopen.master import Phase
+from petrobot.services.device import Ports, Setpoint, refuse_unknown_keys
+from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.services.motion.following import Follower
 from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
 from petrobot.services.motion.kinematics import Puma, branch_of
-from petrobot.services.motion.limits import Guard
-from petrobot.services.motion.model import JOINTS
+from petrobot.services.motion.limits import CollisionGuard
+from petrobot.services.motion.model import (
+    JOINTS,
+    ArmModel,
+    CatchingCell,
+    nominal_arm,
+    nominal_cell,
+    read_arm,
+    read_cell,
+)
 from petrobot.services.motion.steering import Steering
+
+# --- Settings ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The driver's configuration in services.toml: stream of catch points and its period (s), speed
+    (share of the joints' greatest), whether to enable the drives at the start, and files instead of
+    the package's own numbers."""
+
+    stream: str = "catch_point"
+    stream_period: float = 0.02
+    speed: float = 1.0
+    enable: bool = True
+    model: str = ""
+    cell: str = ""
+
+    @classmethod
+    def parse(cls, config: Mapping[str, Any]) -> Settings:
+        """From the device's table; keys of its ports (interface, channel, ...) are left alone.
+        Raises ValueError."""
+        refuse_unknown_keys(config, cls.__slots__)
+        fields = {name: config[name] for name in cls.__slots__ if name in config}
+        for name, value in fields.items():
+            kind = type(getattr(_DEFAULTS, name))
+            fits = (
+                isinstance(value, int | float) and not isinstance(value, bool)
+                if kind is float
+                else type(value) is kind
+            )
+            if not fits:
+                raise ValueError(
+                    f"services.toml: arm: {name} = {value!r}: must be of type {kind.__name__}"
+                )
+        settings = cls(**fields)
+        if not 0.0 < settings.speed <= 1.0:
+            raise ValueError(
+                f"services.toml: arm: speed = {settings.speed}: must be above 0 and at most 1"
+            )
+        if not settings.stream_period > 0.0:
+            raise ValueError(
+                f"services.toml: arm: stream_period = {settings.stream_period}: must be above 0"
+            )
+        return settings
+
+
+_DEFAULTS: Final = Settings()
+
+
+def numbers(settings: Settings, ports: Ports) -> tuple[ArmModel, CatchingCell]:
+    """The arm and the cell: the package's own, or those of the files that the settings name."""
+    model = read_arm(ports.file(settings.model).decode()) if settings.model else nominal_arm()
+    return model, (
+        read_cell(ports.file(settings.cell).decode()) if settings.cell else nominal_cell()
+    )
+
+
+def drive_settings(model: ArmModel) -> list[DriveSettings]:
+    """What each drive is configured with, base to flange."""
+    limits = zip(
+        model.lower.tolist(), model.upper.tolist(), model.acceleration.tolist(), strict=True
+    )
+    return [DriveSettings(lower, upper, acceleration) for lower, upper, acceleration in limits]
+
+
+# --- The light barrier in the cup ----------------------------------------------------------------
+
+BALL_SETTLE: Final = 0.06
+"""s for which the beam must be interrupted: a ball that only bounces through does not count."""
+
+
+class CupBarrier:
+    """A ball counts once it has lain there for `BALL_SETTLE`, and is told of once, if one was
+    waited for with an empty cup."""
+
+    def __init__(self) -> None:
+        self.interrupted = False
+        self.present = False
+        self._since = 0.0
+        self._wanted = False
+        self._armed = False
+
+    def arm(self) -> None:
+        """The next ball that comes into the empty cup is one to tell of."""
+        self._wanted, self._armed = True, False
+
+    def look(self, now: float, interrupted: bool) -> bool:
+        """Take the barrier's state; True once a ball that was waited for has come to stay."""
+        if not interrupted:
+            self.interrupted = self.present = False
+            self._armed = self._armed or self._wanted
+            self._wanted = False
+            return False
+        if not self.interrupted:
+            self.interrupted, self._since = True, now
+        self.present = now - self._since >= BALL_SETTLE - 1e-9
+        told = self.present and self._armed
+        self._armed = self._armed and not told
+        return told
+
+
+# --- The driver ----------------------------------------------------------------------------------
 
 PERIOD: Final = 0.004
 """s, the servo's and the bus's cycle."""
@@ -70,7 +179,7 @@ class Arm:
         self._ports = ports
         self.model, cell = numbers(settings, ports)
         self._puma = Puma.of(self.model)
-        self._guard = Guard(self._puma, self.model, cell)
+        self._guard = CollisionGuard(self._puma, self.model, cell)
         home = self.model.poses["home"]
         self._interceptor = Interceptor(
             self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home))
@@ -85,7 +194,7 @@ class Arm:
         self._setpoint: Setpoint = ports.stream(settings.stream)
         self._bus = ports.can()
         self._follower = Follower(settings.stream_period)
-        self._ball = Barrier()
+        self._ball = CupBarrier()
         self._mode = "off"
         self._reason = ""
         self._paused = False

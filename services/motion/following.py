@@ -10,8 +10,8 @@ from typing import Any, Final
 from petrobot.services.device import Setpoint
 from petrobot.services.motion.interception import (
     STRATEGIES,
+    CatchPlan,
     Interceptor,
-    Plan,
     Prediction,
     Strategy,
 )
@@ -38,7 +38,7 @@ class Follower:
     def __init__(self, period: float) -> None:
         self._period = period
         self.strategy: Strategy = STRATEGIES["tilted"]
-        self.plan: Plan | None = None
+        self.plan: CatchPlan | None = None
         self._made = 0.0
         self._prediction: Prediction | None = None
         self._planned: Prediction | None = None
@@ -96,7 +96,7 @@ class Follower:
         speed: Sequence[float],
         acceleration: Sequence[float],
         now: float,
-    ) -> Plan | None:
+    ) -> CatchPlan | None:
         """Plan for the prediction just taken; None if it cannot be reached (the plan of before is
         forgotten)."""
         assert self._prediction is not None

@@ -19,9 +19,9 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.services.motion.kinematics import Branch, Puma
-from petrobot.services.motion.limits import Guard
-from petrobot.services.motion.model import Cell, Vector
+from petrobot.services.motion.kinematics import ArmBranch, Puma
+from petrobot.services.motion.limits import CollisionGuard
+from petrobot.services.motion.model import CatchingCell, Vector
 from petrobot.services.motion.trajectory import reach_time
 
 STREAM_LENGTH: Final = 9
@@ -120,7 +120,7 @@ KEEP: Final = 0.03
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CatchPlan:
     """A catching pose. Times are seconds from when the plan was made; `slack` is the time left
     over, negative if late."""
 
@@ -138,7 +138,12 @@ class Interceptor:
     cycles: make one a prediction."""
 
     def __init__(
-        self, puma: Puma, cell: Cell, guard: Guard, home: Sequence[float], branch: Branch
+        self,
+        puma: Puma,
+        cell: CatchingCell,
+        guard: CollisionGuard,
+        home: Sequence[float],
+        branch: ArmBranch,
     ) -> None:
         self._puma = puma
         self._cell = cell
@@ -165,8 +170,8 @@ class Interceptor:
         qd: Sequence[float],
         speed: Sequence[float],
         acceleration: Sequence[float],
-        before: Plan | None = None,
-    ) -> Plan | None:
+        before: CatchPlan | None = None,
+    ) -> CatchPlan | None:
         """The best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None if no
         candidate can be reached."""
         prediction = prediction.shrunk(PRIOR_SPREAD)
@@ -197,7 +202,7 @@ class Interceptor:
             if not self._guard.violation(pose):
                 x, y, z = points[index // hands].tolist()
                 when = float(arrival[index]), float(times[index]), float(slack[index])
-                return Plan(pose, (x, y, z), _triple(axis), *when, index)
+                return CatchPlan(pose, (x, y, z), _triple(axis), *when, index)
         return None
 
     def retreat(self, q: Sequence[float]) -> tuple[float, ...] | None:

@@ -22,7 +22,7 @@ SINGULAR = 1e-10
 """Sine of q5 below which the axes of joints 4 and 6 count as one line."""
 
 
-class Branch(NamedTuple):
+class ArmBranch(NamedTuple):
     """One of the eight ways to reach a pose, each +1 or -1."""
 
     shoulder: int
@@ -40,7 +40,7 @@ class Branch(NamedTuple):
         return " ".join(pair[(sign + 1) // 2] for pair, sign in zip(words, self, strict=True))
 
 
-BRANCHES = tuple(Branch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1))
+BRANCHES = tuple(ArmBranch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1))
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Puma:
         return pose
 
     def inverse(
-        self, pose: Vector, branches: tuple[Branch, ...] = BRANCHES, near: Vector | None = None
+        self, pose: Vector, branches: tuple[ArmBranch, ...] = BRANCHES, near: Vector | None = None
     ) -> Vector:
         """Joint poses (..., len(branches), 6) of poses (..., 4, 4), in the order of `branches`.
 
@@ -215,10 +215,10 @@ LIMIT_SLACK = 1e-9
 """Radians by which rounding may carry a solution beyond a joint limit."""
 
 
-def branch_of(puma: Puma, q: NDArray[np.float64]) -> Branch:
+def branch_of(puma: Puma, q: NDArray[np.float64]) -> ArmBranch:
     """The branch on which a joint pose (6,) lies."""
     c23, s23 = math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
     reach = puma.a2 * math.cos(q[1]) + puma.a3 * c23 - puma.d4 * s23
     shoulder = 1 if reach >= 0 else -1
     bend = math.sin(q[2] + math.atan2(puma.d4, puma.a3))
-    return Branch(shoulder, 1 if bend * shoulder <= 0 else -1, 1 if math.sin(q[4]) >= 0 else -1)
+    return ArmBranch(shoulder, 1 if bend * shoulder <= 0 else -1, 1 if math.sin(q[4]) >= 0 else -1)

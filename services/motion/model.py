@@ -19,13 +19,13 @@ Vector = NDArray[np.float64]
 JOINTS = 6
 
 
-class ModelError(ValueError):
+class ArmFileError(ValueError):
     """A file of numbers lacks a key or holds a value that cannot be; the message names file, key
     and remedy."""
 
 
 @dataclass(frozen=True)
-class Link:
+class LinkInertia:
     """A link moved by the joint of the same place: mass (kg), centre of mass (m) and inertia about
     it (kg m^2) in its DH frame."""
 
@@ -61,7 +61,7 @@ class ArmModel:
     rotor_inertia: Vector
     viscous: Vector
     coulomb: Vector
-    links: tuple[Link, ...]
+    links: tuple[LinkInertia, ...]
     body: Body
     flange: float
     poses: Mapping[str, tuple[float, ...]]
@@ -81,7 +81,7 @@ class Cup:
 
 
 @dataclass(frozen=True)
-class Cell:
+class CatchingCell:
     """What motion knows of the cell: cup, table (m, base frame) and ball (m, m/s^2)."""
 
     cup: Cup
@@ -99,14 +99,14 @@ def _numbers(table: Mapping[str, Any], key: str, where: str, length: int) -> tup
         or len(value) != length
         or not all(isinstance(v, int | float) for v in value)
     ):
-        raise ModelError(f"{where}: {key} must be {length} numbers, is {value!r}")
+        raise ArmFileError(f"{where}: {key} must be {length} numbers, is {value!r}")
     return tuple(float(v) for v in value)
 
 
 def _number(table: Mapping[str, Any], key: str, where: str) -> float:
     value = table.get(key)
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise ModelError(f"{where}: {key} must be a finite number, is {value!r}")
+        raise ArmFileError(f"{where}: {key} must be a finite number, is {value!r}")
     return float(value)
 
 
@@ -125,7 +125,7 @@ def read_arm(text: str) -> ArmModel:
     table = tomllib.loads(text)
     joints, links = table.get("joint", []), table.get("link", [])
     if len(joints) != JOINTS or len(links) != JOINTS:
-        raise ModelError(
+        raise ArmFileError(
             f"puma560.toml: needs {JOINTS} [[joint]] and [[link]], has {len(joints)} and "
             f"{len(links)}"
         )
@@ -162,9 +162,9 @@ def read_arm(text: str) -> ArmModel:
     )
 
 
-def _link(table: Mapping[str, Any], where: str) -> Link:
+def _link(table: Mapping[str, Any], where: str) -> LinkInertia:
     centre, inertia = _numbers(table, "centre", where, 3), _numbers(table, "inertia", where, 3)
-    return Link(
+    return LinkInertia(
         _number(table, "mass", where),
         (centre[0], centre[1], centre[2]),
         (inertia[0], inertia[1], inertia[2]),
@@ -178,27 +178,27 @@ def _poses(table: Mapping[str, Any], limits: Vector) -> dict[str, tuple[float, .
     }
     for name, pose in poses.items():
         if np.any(np.asarray(pose) < limits[:, 0]) or np.any(np.asarray(pose) > limits[:, 1]):
-            raise ModelError(
+            raise ArmFileError(
                 f"puma560.toml: poses: {name} lies outside the joint limits: bring it inside"
             )
     return poses
 
 
-def read_cell(text: str) -> Cell:
+def read_cell(text: str) -> CatchingCell:
     """What motion needs of a text in the format of `services/cell.toml`. Raises ModelError."""
     table = tomllib.loads(text)
     for section in ("cup", "table", "ball"):
         if section not in table:
-            raise ModelError(f"cell.toml: lacks [{section}]: see services/cell.toml for its keys")
+            raise ArmFileError(f"cell.toml: lacks [{section}]: see services/cell.toml for its keys")
     cup, desk, ball = table["cup"], table["table"], table["ball"]
     mouth, axis = (
         _numbers(cup, "mouth", "cell.toml: cup", 3),
         np.array(_numbers(cup, "axis", "cell.toml: cup", 3)),
     )
     if abs(float(np.linalg.norm(axis)) - 1.0) > 1e-3:
-        raise ModelError(f"cell.toml: cup: axis must be a unit vector, is {axis.tolist()}")
+        raise ArmFileError(f"cell.toml: cup: axis must be a unit vector, is {axis.tolist()}")
     axis = axis / np.linalg.norm(axis)
-    return Cell(
+    return CatchingCell(
         cup=Cup(
             (mouth[0], mouth[1], mouth[2]),
             (float(axis[0]), float(axis[1]), float(axis[2])),
@@ -223,6 +223,6 @@ def nominal_arm() -> ArmModel:
 
 
 @lru_cache(maxsize=1)
-def nominal_cell() -> Cell:
+def nominal_cell() -> CatchingCell:
     """The cell of the package's own `services/cell.toml`."""
     return read_cell(files("petrobot.services").joinpath("cell.toml").read_text(encoding="utf-8"))

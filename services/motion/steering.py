@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import Vector
 from petrobot.services.motion.trajectory import Six, Trajectory, synchronised
 
@@ -32,7 +32,7 @@ class Steering:
 
     def __init__(
         self,
-        guard: Guard,
+        guard: CollisionGuard,
         retreat: Retreat,
         home: Sequence[float],
         period: float,

@@ -16,8 +16,8 @@ from petrobot.services.vision.camera import Camera
 from petrobot.services.vision.locating import LocateSpecification, locate
 from petrobot.services.vision.location import (
     BackgroundSubtraction,
+    BallDetector,
     CompensatedSubtraction,
-    Detector,
     FixedThreshold,
     HoughCircles,
     MixtureOfGaussians,
@@ -32,23 +32,23 @@ from petrobot.services.vision.prediction import (
 from petrobot.services.vision.tracking import TrackSpecification, track
 
 
-def _background(camera: Camera) -> Detector:
+def _background(camera: Camera) -> BallDetector:
     return BackgroundSubtraction(camera.view, camera.background)
 
 
-def _compensated(camera: Camera) -> Detector:
+def _compensated(camera: Camera) -> BallDetector:
     return CompensatedSubtraction(camera.view, camera.background)
 
 
-def _mog2(camera: Camera) -> Detector:
+def _mog2(camera: Camera) -> BallDetector:
     return MixtureOfGaussians(camera.view)
 
 
-def _hough(camera: Camera) -> Detector:
+def _hough(camera: Camera) -> BallDetector:
     return HoughCircles(camera.view)
 
 
-def _threshold(camera: Camera) -> Detector:
+def _threshold(camera: Camera) -> BallDetector:
     return FixedThreshold(camera.view)
 
 

@@ -17,7 +17,7 @@ from petrobot.services.action import Context
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import Ports, refuse_unknown_keys
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
-from petrobot.services.vision.location import Background, Detector
+from petrobot.services.vision.location import Background, BallDetector
 from petrobot.services.vision.prediction import Surface
 from petrobot.services.vision.table import TableView
 
@@ -72,7 +72,7 @@ class Camera:
         self.surface = Surface.of(cell)
         self.background = Background()
         self.usual_rate = _rate(config.get("rate", cell["camera"]["rate"]))
-        self._detectors: dict[str, Detector] = {}
+        self._detectors: dict[str, BallDetector] = {}
         self._times: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._newest: Image | None = None
         self._shown: Image | None = None
@@ -137,7 +137,7 @@ class Camera:
         """Mid-exposure time (s) of an image read lately, None when it is not remembered."""
         return next((time for number, time in reversed(self._times) if number == sequence), None)
 
-    def detector(self, name: str, make: Callable[[], Detector]) -> Detector:
+    def detector(self, name: str, make: Callable[[], BallDetector]) -> BallDetector:
         """The detector of this name with all that it has learned; made at first use."""
         if name not in self._detectors:
             self._detectors[name] = make()

@@ -35,7 +35,7 @@ FASTEST = 3.5
 """m/s, the fastest ball that is looked for."""
 
 
-class Detector(Protocol):
+class BallDetector(Protocol):
     """Candidates in one image."""
 
     def detect(self, pixels: Pixels) -> Array:
@@ -141,7 +141,7 @@ class BackgroundSubtraction(_WholeTable):
     def __init__(self, view: TableView, background: Background) -> None:
         super().__init__(view)
         self._background = background
-        self._window = Window(view)
+        self._window = BallWindow(view)
         self._halved: Pixels | None = None
         self._half_picture: Pixels = np.empty((0, 0), np.uint8)
 
@@ -256,7 +256,7 @@ class FixedThreshold(_WholeTable):
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class MeasuredBall:
     """A ball measured in a window: `centre` (2,) px, `cover`: seen area relative to the expected
     one."""
 
@@ -264,7 +264,7 @@ class Seen:
     cover: float
 
 
-class Window:
+class BallWindow:
     """Measures a ball whose place is about known. The light's change since the background was
     learned is taken from the window itself; a ball partly hidden by arm or cup, or merged with
     them, is not measured."""
@@ -283,7 +283,7 @@ class Window:
         expected: Array,
         streak: float = 0.0,
         spread: float = 4.0,
-    ) -> Seen | None:
+    ) -> MeasuredBall | None:
         """The ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its longest
         way during the exposure (px).
 
@@ -363,7 +363,7 @@ class Window:
         mine: NDArray[np.bool_],
         stats: NDArray[Any],
         box: tuple[slice, slice],
-    ) -> Seen | None:
+    ) -> MeasuredBall | None:
         left, top, wide, high, area = (int(value) for value in stats)
         if left == 0 or top == 0 or left + wide == cover.shape[1] or top + high == cover.shape[0]:
             return None  # cut by the window or the image's border
@@ -376,7 +376,7 @@ class Window:
         u = float(weight.sum(axis=0) @ np.arange(left - 1, left + wide + 1)) / total
         v = float(weight.sum(axis=1) @ np.arange(top - 1, top + high + 1)) / total
         centre = np.array([u + box[1].start, v + box[0].start])
-        return Seen(centre, area / (np.pi * self.view.radius_px**2))
+        return MeasuredBall(centre, area / (np.pi * self.view.radius_px**2))
 
 
 def _median(region: Pixels) -> float:

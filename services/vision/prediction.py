@@ -29,7 +29,7 @@ LARGEST_LOSS, LOSS_SIGMA = 0.12, 0.02
 ball has at least 70 % of the spin of pure rolling, so it settles at 88 % of its speed or more."""
 
 
-class Way(StrEnum):
+class ExitWay(StrEnum):
     """How a ball leaves the table, if it does."""
 
     NEAR_EDGE = "near_edge"
@@ -39,12 +39,12 @@ class Way(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Exit:
+class PredictedExit:
     """Prediction of where the ball's centre passes the edge: `time` on the observations' clock,
     `point` and `velocity` (2,), standard deviations of the time and of the place along the edge.
-    For `Way.STAYS` time is inf."""
+    For `ExitWay.STAYS` time is inf."""
 
-    way: Way
+    way: ExitWay
     time: float
     point: Array
     velocity: Array
@@ -77,16 +77,18 @@ class Surface:
             spread / np.sqrt(3.0) * rolling,
         )
 
-    def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, Way]:
+    def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, ExitWay]:
         """Way along `heading` (2,) from `place` (2,) to the edge that comes first, and which one;
         inf when none does."""
         side = np.inf
         if abs(heading[1]) > 1e-9:
             side = (np.copysign(self.half_width, heading[1]) - place[1]) / heading[1]
         if heading[0] > -1e-9:
-            return (float(side), Way.SIDE) if np.isfinite(side) else (float("inf"), Way.STAYS)
+            return (
+                (float(side), ExitWay.SIDE) if np.isfinite(side) else (float("inf"), ExitWay.STAYS)
+            )
         near = (self.near_edge - place[0]) / heading[0]
-        return (float(near), Way.NEAR_EDGE) if near <= side else (float(side), Way.SIDE)
+        return (float(near), ExitWay.NEAR_EDGE) if near <= side else (float(side), ExitWay.SIDE)
 
 
 class Predictor(Protocol):
@@ -102,7 +104,7 @@ class Predictor(Protocol):
     def place(self, time: float) -> Array:
         """Where the ball is expected (2,). Needs two observations."""
 
-    def exit(self) -> Exit | None:
+    def exit(self) -> PredictedExit | None:
         """How it leaves the table; None before three observations."""
 
 
@@ -132,7 +134,7 @@ class ConstantVelocity:
         middle, velocity, _ = self._fit()
         return np.asarray(middle[1:] + velocity * (time - middle[0]))
 
-    def exit(self) -> Exit | None:
+    def exit(self) -> PredictedExit | None:
         """How it leaves the table."""
         if len(self._rows) < 3:
             return None
@@ -140,12 +142,12 @@ class ConstantVelocity:
         speed = float(np.hypot(*velocity))
         heading = velocity / max(speed, 1e-9)
         gap, way = self._surface.gap(middle[1:], heading)
-        if way is Way.STAYS or speed < 1e-3:
+        if way is ExitWay.STAYS or speed < 1e-3:
             return _stays(middle[1:], velocity)
         ahead = gap / speed
         sigma = self._surface.noise * float(np.sqrt(1.0 / len(self._rows) + ahead * ahead / square))
-        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
-        return Exit(
+        facing = abs(heading[0] if way is ExitWay.NEAR_EDGE else heading[1])
+        return PredictedExit(
             way,
             float(middle[0]) + ahead,
             middle[1:] + gap * heading,
@@ -155,8 +157,8 @@ class ConstantVelocity:
         )
 
 
-def _stays(place: Array, velocity: Array) -> Exit:
-    return Exit(Way.STAYS, float("inf"), place, velocity, float("inf"), float("inf"))
+def _stays(place: Array, velocity: Array) -> PredictedExit:
+    return PredictedExit(ExitWay.STAYS, float("inf"), place, velocity, float("inf"), float("inf"))
 
 
 _PLACES = np.ix_((0, 4, 5), (0, 4, 5))
@@ -267,7 +269,7 @@ class LeastSquares:
         ahead = along - (x * hx + y * hy)
         return np.array([self._origin[1] + x + hx * ahead, self._origin[2] + y + hy * ahead])
 
-    def exit(self) -> Exit | None:
+    def exit(self) -> PredictedExit | None:
         """How it leaves the table."""
         if self.count < 3:
             return None
@@ -275,7 +277,7 @@ class LeastSquares:
         x, y = self._middle()
         middle = np.array([self._origin[1] + x, self._origin[2] + y])
         gap, way = self._surface.gap(middle, heading)
-        if way is Way.STAYS:
+        if way is ExitWay.STAYS:
             return _stays(middle, np.zeros(2))
         along = gap + x * heading[0] + y * heading[1]
         ahead, speed, variance = self._arrivals(along, solution, covariance)
@@ -285,8 +287,8 @@ class LeastSquares:
         weight, ahead, speed = weight[usual] / weight[usual].sum(), ahead[usual], speed[usual]
         mean = float(weight @ ahead)
         sigma = float(np.sqrt(weight @ (variance[usual] + (ahead - mean) ** 2)))
-        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
-        return Exit(
+        facing = abs(heading[0] if way is ExitWay.NEAR_EDGE else heading[1])
+        return PredictedExit(
             way,
             self._origin[0] + mean,
             middle + gap * np.array(heading),
@@ -393,7 +395,7 @@ class Kalman:
         """Where the ball is expected (2,) m."""
         return np.asarray(self._ahead(time - self._time)[0][:2])
 
-    def exit(self) -> Exit | None:
+    def exit(self) -> PredictedExit | None:
         """How it leaves the table."""
         if self.count < 3:
             return None
@@ -401,7 +403,7 @@ class Kalman:
         speed = float(np.hypot(*velocity))
         heading = velocity / max(speed, 1e-9)
         gap, way = self._surface.gap(self._x[:2], heading)
-        ahead = self._arrival(gap, speed) if way is not Way.STAYS else float("inf")
+        ahead = self._arrival(gap, speed) if way is not ExitWay.STAYS else float("inf")
         if not np.isfinite(ahead):
             return _stays(self._x[:2].copy(), velocity.copy())
         state, covariance = self._ahead(ahead)
@@ -409,8 +411,8 @@ class Kalman:
         along = float(heading @ covariance[:2, :2] @ heading)
         normal = np.array([-heading[1], heading[0]])
         across = float(normal @ covariance[:2, :2] @ normal)
-        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
-        return Exit(
+        facing = abs(heading[0] if way is ExitWay.NEAR_EDGE else heading[1])
+        return PredictedExit(
             way,
             self._time + ahead,
             self._x[:2] + gap * heading,

@@ -12,8 +12,8 @@ import numpy as np
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
-from petrobot.services.vision.location import Window
-from petrobot.services.vision.prediction import Exit, Predictor, Surface, Way
+from petrobot.services.vision.location import BallWindow
+from petrobot.services.vision.prediction import ExitWay, PredictedExit, Predictor, Surface
 from petrobot.services.vision.specification import Specification
 
 HIDDEN = 0.20
@@ -90,8 +90,8 @@ class _Chase:
         self._predictor = predictor
         self._stream = stream
         self._specification = specification
-        self._window = Window(camera.view)
-        self._exit: Exit | None = None
+        self._window = BallWindow(camera.view)
+        self._exit: PredictedExit | None = None
         self._made: list[tuple[float, float, float]] = []
         self._latencies: list[float] = []
         """s from the middle of an exposure to the set point that it led to."""
@@ -133,7 +133,7 @@ class _Chase:
     def _left(self) -> bool:
         return (
             self._exit is not None
-            and self._exit.way is Way.NEAR_EDGE
+            and self._exit.way is ExitWay.NEAR_EDGE
             and self._exit.time <= self._ctx.now
         )
 
@@ -184,7 +184,7 @@ class _Chase:
         """Take a fresh prediction; a result when the ball will surely not come over the near
         edge."""
         exit_ = self._predictor.exit()
-        if exit_ is None or exit_.way is Way.NEAR_EDGE:
+        if exit_ is None or exit_.way is ExitWay.NEAR_EDGE:
             self._otherwise = 0
             if exit_ is not None:
                 self._exit = exit_
@@ -196,7 +196,7 @@ class _Chase:
             return None
         self._exit = exit_
         where = f"({exit_.point[0]:.3f}, {exit_.point[1]:.3f}) m"
-        if exit_.way is Way.SIDE:
+        if exit_.way is ExitWay.SIDE:
             return failure("side_exit", f"the ball leaves by the side at {where}", **self._values())
         return failure(
             "stays", f"the ball stops on the table or turns away at {where}", **self._values()
@@ -205,7 +205,7 @@ class _Chase:
     def _publish(self) -> None:
         """Stream the newest prediction; its time to go is right now, however old the image was."""
         exit_ = self._exit
-        if exit_ is None or exit_.way is not Way.NEAR_EDGE:
+        if exit_ is None or exit_.way is not ExitWay.NEAR_EDGE:
             return
         view = self._camera.view
         to_go = exit_.time - self._ctx.now

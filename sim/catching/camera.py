@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from petrobot.sim.catching.occluders import Box, Occluders, fill
-from petrobot.sim.catching.scenery import Chessboard, Table, floor_grey, stripes, supersampled
+from petrobot.sim.catching.scenery import Chessboard, TableArea, floor_grey, stripes, supersampled
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -38,7 +38,7 @@ LENS_STEPS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """The true camera and light, where they differ from the cell's nominal ones. None: nominal."""
 
     position: Sequence[float] | None = None
@@ -63,7 +63,7 @@ class View:
     """Grey levels, sigma."""
 
     @classmethod
-    def of(cls, truth: Mapping[str, Any]) -> View:
+    def of(cls, truth: Mapping[str, Any]) -> CameraView:
         """Read from a mapping with these names as keys. An unknown key raises ValueError."""
         unknown = sorted(set(truth) - set(cls.__slots__))
         if unknown:
@@ -80,10 +80,10 @@ class PinholeCamera:
     def __init__(
         self, cell: Mapping[str, Any], truth: Mapping[str, Any], rng: np.random.Generator
     ) -> None:
-        camera, view = cell["camera"], View.of(truth)
+        camera, view = cell["camera"], CameraView.of(truth)
         self.view = view
         self.width, self.height = int(camera["width"]), int(camera["height"])
-        self.table = Table.of(cell, view.table_top, view.near_edge)
+        self.table = TableArea.of(cell, view.table_top, view.near_edge)
         self.ball_radius = float(cell["ball"]["radius"])
         self.cup_radius, self.cup_depth = float(cell["cup"]["radius"]), float(cell["cup"]["depth"])
         self.exposure = float(camera["exposure"])

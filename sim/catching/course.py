@@ -10,7 +10,7 @@ from petrobot.sim.catching.ball import BallState
 from petrobot.sim.catching.thrower import Throw
 
 
-class Outcome(StrEnum):
+class ThrowOutcome(StrEnum):
     """What became of a throw."""
 
     ROLLING = "rolling"
@@ -22,13 +22,13 @@ class Outcome(StrEnum):
 
 
 @dataclass(slots=True)
-class Course:
+class ThrowCourse:
     """What was seen of one throw so far. Times are seconds after its release, lengths m, base
     frame."""
 
     throw: Throw
     released_at: float
-    outcome: Outcome = Outcome.ROLLING
+    outcome: ThrowOutcome = ThrowOutcome.ROLLING
     exit_time: float = math.inf
     """When the centre left the near edge; inf if it did not."""
     exit_state: BallState | None = None
@@ -49,7 +49,7 @@ class Course:
 
 
 @dataclass(slots=True)
-class Barrier:
+class LightBarrier:
     """A light barrier with a filter: its output follows what it sees after `delay` seconds without
     a change."""
 

@@ -131,7 +131,7 @@ def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
     )
 
 
-class Drive(PowerDrive):
+class ServoDrive(PowerDrive):
     """One joint's drive: cyclic synchronous position mode around a `JointServo`."""
 
     mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
@@ -378,7 +378,7 @@ class DriveBus:
         """The set points of the newest cycle that found and left the arm at rest, and the answers,
         one a drive."""
         self.drives = tuple(
-            Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
+            ServoDrive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
         )
         self.inputs = DigitalInputs(INPUTS_NODE)
         self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)

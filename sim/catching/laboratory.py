@@ -21,20 +21,20 @@ from petrobot.sim.catching.drives import DriveBus
 from petrobot.sim.catching.oracle import Oracle
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.puma_model import Frame3
-from petrobot.sim.catching.referee import Referee
+from petrobot.sim.catching.referee import CatchReferee
 from petrobot.sim.catching.site import CupMount, Site, site_of
 from petrobot.sim.catching.thrower import Thrower
 from petrobot.sim.catching.truth import Truth
-from petrobot.sim.catching.world import World
+from petrobot.sim.catching.world import BallWorld
 from petrobot.sim.exposures import camera_of
-from petrobot.sim.faults import Fault, FaultPlan, read_fault
+from petrobot.sim.faults import FaultPlan, InjectedFault, read_fault
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
 
 _NOISE, _FAULTS = 0x6361, 0x6661
 """Keep the draws of camera noise and of faults apart from other draws of the same seed."""
 
 
-class Laboratory(LaboratoryParty):
+class CatchingLaboratory(LaboratoryParty):
     """The party of the simulated node `name`. `where` gives the party of an endpoint
     (`Directory.party`)."""
 
@@ -63,7 +63,7 @@ class Laboratory(LaboratoryParty):
         )
         self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = DriveBus(self.plant, site.drives)
-        self._world: World | None = None
+        self._world: BallWorld | None = None
         self._prepare(self.now, seed, truth, throws)
 
     def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
@@ -74,9 +74,9 @@ class Laboratory(LaboratoryParty):
         self.truth = truth
         self._mount = CupMount(self._site.arm, truth)
         self._arm_dt = float(truth.settings["step"]["arm"])
-        self._world = self.world = World(self._site.cell, truth)
+        self._world = self.world = BallWorld(self._site.cell, truth)
         self.thrower = Thrower(self._site.cell, truth, seed, throws)
-        self.referee = Referee(
+        self.referee = CatchReferee(
             seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now
         )
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
@@ -206,7 +206,7 @@ class Laboratory(LaboratoryParty):
         if self._faults.active("arm_power") is not powerless:
             self.bus.power(powerless)
 
-    def _strike(self, fault: Fault) -> None:
+    def _strike(self, fault: InjectedFault) -> None:
         if fault.kind == "drive_fault":
             self.bus.trip(int(fault.value) - 1)
         elif fault.kind == "slow_arm":
@@ -239,9 +239,9 @@ class Laboratory(LaboratoryParty):
         self.plant.close()
 
 
-def make_laboratory(directory: Directory, name: str) -> Laboratory:
+def make_laboratory(directory: Directory, name: str) -> CatchingLaboratory:
     """The laboratory of the simulated node `name` of services.toml. Raises LaboratoryError."""
     boot = f"{name} in lock step"
-    return Laboratory(
+    return CatchingLaboratory(
         name, site_of(directory), directory.party, boot=boot, directory=directory.hash
     )

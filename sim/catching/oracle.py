@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.sim.catching.ball import BallModel, TableMotion
-from petrobot.sim.catching.puma_model import ArmModel
+from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth, Vector
 
@@ -40,7 +40,7 @@ _PLACE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class OracleVerdict:
     """`margin` (s) is how much earlier than the ball the cup can be there, at best; negative: too
     late; -inf: no pose."""
 
@@ -52,20 +52,20 @@ class Verdict:
     """s after release, when the ball comes to it."""
 
 
-_NEVER = Verdict(False, -math.inf, None, math.inf)
+_NEVER = OracleVerdict(False, -math.inf, None, math.inf)
 
 
 class Oracle:
     """Judges throws for one truth. Rules stand in `[oracle]` of the laboratory file."""
 
-    def __init__(self, model: ArmModel, truth: Truth, cell: Mapping[str, Any]) -> None:
+    def __init__(self, model: PumaModel, truth: Truth, cell: Mapping[str, Any]) -> None:
         self._arm = model
         self._truth = truth
         self._ball = BallModel.of(cell["ball"], truth.settings["ball"]["friction"])
         self._rules = truth.settings["oracle"]
         self._rim = truth.cup.radius + float(cell["cup"]["wall"])
 
-    def judge(self, throw: Throw, q: Sequence[float]) -> Verdict:
+    def judge(self, throw: Throw, q: Sequence[float]) -> OracleVerdict:
         """Verdict on a throw with the arm at encoder angles `q` (six, rad) at release."""
         motion = TableMotion(self._ball, throw.start, throw.rolling_resistance)
         table = self._truth.table
@@ -90,7 +90,7 @@ class Oracle:
             best = int(np.argmax(margins))
             if margins[best] > verdict.margin:
                 margin, pose = float(margins[best]), poses[best] - self._truth.joint_zero
-                verdict = Verdict(margin >= 0.0, margin, pose, leaves + float(fall[best]))
+                verdict = OracleVerdict(margin >= 0.0, margin, pose, leaves + float(fall[best]))
             if verdict.reachable:
                 break
         return verdict

@@ -25,7 +25,7 @@ from petrobot.sim.catching.arm_motion import (
     stepped,
     stepped_packed,
 )
-from petrobot.sim.catching.puma_model import JOINTS, ArmModel, Link
+from petrobot.sim.catching.puma_model import JOINTS, PrincipalInertia, PumaModel
 from petrobot.sim.catching.truth import Vector
 
 # Writes the arm as URDF, so that PyBullet computes its mass matrix and its gravity, Coriolis and centrifugal torques.
@@ -34,12 +34,12 @@ _LEAST_MASS = 1e-9
 _ZERO = (0.0, 0.0, 0.0)
 
 
-def urdf(model: ArmModel, flange_load: Link | None = None) -> str:
+def urdf(model: PumaModel, flange_load: PrincipalInertia | None = None) -> str:
     """The arm as URDF text: links base, link1 to link6; `flange_load`: what is bolted to link 6, in
     frame 6."""
     parts = [
         '<robot name="arm">',
-        f'<link name="base">{_inertial_text(Link(0.0, _ZERO, _ZERO), _ZERO, 0.0)}</link>',
+        f'<link name="base">{_inertial_text(PrincipalInertia(0.0, _ZERO, _ZERO), _ZERO, 0.0)}</link>',
     ]
     for i, link in enumerate(model.links):
         x, y, z = model.base if i == 0 else (model.a[i - 1], 0.0, model.d[i - 1])
@@ -65,7 +65,7 @@ def urdf(model: ArmModel, flange_load: Link | None = None) -> str:
     return "\n".join(parts)
 
 
-def _inertial(model: ArmModel, i: int, link: Link) -> str:
+def _inertial(model: PumaModel, i: int, link: PrincipalInertia) -> str:
     """The link's inertial element: its centre moved from DH frame i + 1 to the URDF link frame,
     turned by the twist."""
     c, s = model.twists[i]
@@ -75,7 +75,7 @@ def _inertial(model: ArmModel, i: int, link: Link) -> str:
     )
 
 
-def _inertial_text(link: Link, centre: tuple[float, float, float], roll: float) -> str:
+def _inertial_text(link: PrincipalInertia, centre: tuple[float, float, float], roll: float) -> str:
     ixx, iyy, izz = _physical(link.inertia)
     x, y, z = centre
     return (
@@ -121,7 +121,9 @@ class RigidBody:
     """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics
     client of its own."""
 
-    def __init__(self, model: ArmModel, gravity: float, flange_load: Link | None = None) -> None:
+    def __init__(
+        self, model: PumaModel, gravity: float, flange_load: PrincipalInertia | None = None
+    ) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
         pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self._client)
         with tempfile.TemporaryDirectory() as folder:
@@ -177,11 +179,11 @@ class ArmPlant:
 
     def __init__(
         self,
-        model: ArmModel,
+        model: PumaModel,
         gravity: float,
         start: Sequence[float],
         speed_factor: float = 1.0,
-        load: Link | None = None,
+        load: PrincipalInertia | None = None,
     ) -> None:
         """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what
         the flange carries."""

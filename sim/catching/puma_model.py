@@ -55,7 +55,7 @@ class Frame3(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class PrincipalInertia:
     """Mass (kg), centre of mass (m) and principal inertia about it (kg m^2) in the link's own DH
     frame."""
 
@@ -65,7 +65,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class ArmModel:
+class PumaModel:
     """One entry a joint, base to flange. `rotor`, `viscous`, `coulomb` are seen at the joint (kg
     m^2, N m s/rad, N m)."""
 
@@ -83,7 +83,7 @@ class ArmModel:
     rotor: Vector
     viscous: Vector
     coulomb: Vector
-    links: tuple[Link, ...]
+    links: tuple[PrincipalInertia, ...]
     flange: float
     radii: Mapping[str, float]
     """m, of the capsules that stand for the arm's solid parts: base, upper_arm, forearm, wrist."""
@@ -138,7 +138,7 @@ class ArmModel:
         )
 
 
-def read_arm(path: Path) -> ArmModel:
+def read_arm(path: Path) -> PumaModel:
     """The arm of a file like services/motion/puma560.toml. Raises LaboratoryError naming file, key
     and remedy."""
     table = read_toml(path)
@@ -162,14 +162,14 @@ def read_arm(path: Path) -> ArmModel:
 
 def _model(
     table: Mapping[str, Any], joints: list[dict[str, Any]], links: list[dict[str, Any]]
-) -> ArmModel:
+) -> PumaModel:
     def column(key: str) -> Vector:
         return np.array([float(joint[key]) for joint in joints])
 
     gear = column("gear")
     limits = np.array([joint["limits"] for joint in joints], dtype=float) * _DEGREE
     x, y, z = table["frame"]["base"]
-    return ArmModel(
+    return PumaModel(
         base=(float(x), float(y), float(z)),
         d=tuple(column("d").tolist()),
         a=tuple(column("a").tolist()),
@@ -186,7 +186,10 @@ def _model(
         rotor=gear**2 * column("rotor_inertia"),
         viscous=gear**2 * column("viscous"),
         coulomb=gear * column("coulomb"),
-        links=tuple(Link(float(n["mass"]), tuple(n["centre"]), tuple(n["inertia"])) for n in links),
+        links=tuple(
+            PrincipalInertia(float(n["mass"]), tuple(n["centre"]), tuple(n["inertia"]))
+            for n in links
+        ),
         flange=float(table["frame"]["flange"]),
         radii={key: float(value) for key, value in table["body"].items()},
         poses={

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from petrobot.sim.catching.course import Course, Outcome
-from petrobot.sim.catching.oracle import Oracle, Verdict
+from petrobot.sim.catching.course import ThrowCourse, ThrowOutcome
+from petrobot.sim.catching.oracle import Oracle, OracleVerdict
 
 PLOTS: Final = {
     "catch_map": {
@@ -47,11 +47,11 @@ PLOTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    course: Course
-    verdict: Verdict
+    course: ThrowCourse
+    verdict: OracleVerdict
 
 
-class Referee:
+class CatchReferee:
     """Writes down each throw from its release on. `began` is the simulated time (s) from which
     releases are counted."""
 
@@ -62,7 +62,7 @@ class Referee:
         self._began = began
         self._entries: list[_Entry] = []
 
-    def enter(self, course: Course, q: Sequence[float]) -> Verdict:
+    def enter(self, course: ThrowCourse, q: Sequence[float]) -> OracleVerdict:
         """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again
         for the score."""
         verdict = self._oracle.judge(course.throw, q)
@@ -70,7 +70,7 @@ class Referee:
         return verdict
 
     @property
-    def last(self) -> Verdict | None:
+    def last(self) -> OracleVerdict | None:
         """Verdict on the newest throw."""
         return self._entries[-1].verdict if self._entries else None
 
@@ -83,7 +83,7 @@ class Referee:
         released in none.
         """
         rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
-        over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
+        over = [row for row in rows if row["outcome"] != ThrowOutcome.ROLLING]
         return {
             "seed": self._seed,
             "regime": self._regime,
@@ -100,7 +100,7 @@ class Referee:
         }
 
 
-def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _status(course: ThrowCourse, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     age = now - course.released_at
     for cycle in cycles:
         if cycle["begun_ago"] >= age >= cycle["ended_ago"]:
@@ -119,7 +119,7 @@ def _row(entry: _Entry) -> dict[str, Any]:
     return {
         "n": course.throw.n,
         "speed": course.throw.speed,
-        "caught": course.outcome is Outcome.CAUGHT,
+        "caught": course.outcome is ThrowOutcome.CAUGHT,
         "outcome": str(course.outcome),
         "miss_mm": _finite(1000.0 * course.miss),
         "reachable": verdict.reachable,

@@ -37,7 +37,7 @@ that looks for circles."""
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class TableArea:
     """The table of the cell: height of its top, x of the near edge, length along x, width along y
     (m)."""
 
@@ -49,7 +49,7 @@ class Table:
     @classmethod
     def of(
         cls, cell: Mapping[str, Any], top: float | None = None, near_edge: float | None = None
-    ) -> Table:
+    ) -> TableArea:
         """Read from the cell's `[table]`; `top` and `near_edge` (m) replace the nominal ones."""
         table = cell["table"]
         return cls(

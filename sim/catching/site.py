@@ -13,7 +13,7 @@ from petrobot.services.comm.location_file import Directory
 from petrobot.services.host.numba_kernels import kernel, packed
 from petrobot.sim.catching.arm_motion import Six
 from petrobot.sim.catching.drives import ratings
-from petrobot.sim.catching.puma_model import ArmModel, Frame3, Link, read_arm
+from petrobot.sim.catching.puma_model import Frame3, PrincipalInertia, PumaModel, read_arm
 from petrobot.sim.catching.servo import DriveRating
 from petrobot.sim.catching.truth import (
     LABORATORY_FILE,
@@ -33,7 +33,7 @@ def carried(q: Six, numbers: Sequence[float]) -> tuple[Triple, Triple, Triple, T
 
     `numbers` (see `numbers_of`): five a joint (zero of its encoder in rad, d and a in m, cosine and
     sine of alpha), the base (m), then the frame's axes and origin in the flange's frame. The same
-    sums in the same order as `ArmModel.flange_frame` and `Frame3.point`, which say what they mean.
+    sums in the same order as `PumaModel.flange_frame` and `Frame3.point`, which say what they mean.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     ox, oy, oz = numbers[30], numbers[31], numbers[32]
@@ -80,7 +80,7 @@ def carried(q: Six, numbers: Sequence[float]) -> tuple[Triple, Triple, Triple, T
 
 
 def numbers_of(
-    arm: ArmModel, zero: Sequence[float], axes: Sequence[Triple], origin: Triple
+    arm: PumaModel, zero: Sequence[float], axes: Sequence[Triple], origin: Triple
 ) -> Sequence[float]:
     """What `carried` reads: an arm with encoders that show `zero` (six, rad) too little, and a
     frame mounted on its flange."""
@@ -99,7 +99,7 @@ class Site:
     disturbances."""
 
     cell: Mapping[str, Any]
-    arm: ArmModel
+    arm: PumaModel
     drives: tuple[DriveRating, ...]
     laboratory: Path = LABORATORY_FILE
 
@@ -145,7 +145,7 @@ def site_of(directory: Directory) -> Site:
 class CupMount:
     """Where the cup really is for encoder angles: the arm's flange and the true mount."""
 
-    def __init__(self, arm: ArmModel, truth: Truth) -> None:
+    def __init__(self, arm: PumaModel, truth: Truth) -> None:
         self._arm = arm
         self._zero: list[float] = truth.joint_zero.tolist()
         axis, mouth = truth.cup.axis, truth.cup.mouth
@@ -168,12 +168,14 @@ class CupMount:
         frame."""
         return self._arm.solid_parts(self._true(q), self._bottom)
 
-    def load(self, mass: float, radius: float, depth: float) -> Link:
+    def load(self, mass: float, radius: float, depth: float) -> PrincipalInertia:
         """The cup as a body on the flange (kg, m): a thin tube around its axis."""
         middle = tuple(0.5 * (m + b) for m, b in zip(self._mouth, self._bottom, strict=True))
         along, across = mass * radius**2, mass * (0.5 * radius**2 + depth**2 / 12.0)
         inertia = tuple(along * a * a + across * (1.0 - a * a) for a in self._z)
-        return Link(mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2]))
+        return PrincipalInertia(
+            mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2])
+        )
 
     def _true(self, q: Sequence[float]) -> list[float]:
         return [angle + zero for angle, zero in zip(q, self._zero, strict=True)]

@@ -16,7 +16,7 @@ from typing import Any
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
 from petrobot.sim.catching.contact import ContactSpace
-from petrobot.sim.catching.course import Barrier, Course, Outcome
+from petrobot.sim.catching.course import LightBarrier, ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth
@@ -51,7 +51,7 @@ class Where(StrEnum):
     """Lying still in the cup."""
 
 
-class World:
+class BallWorld:
     """One ball at most, where it is and what became of it. Times `now` are simulated seconds.
 
     Each tick: `begin`; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at
@@ -66,10 +66,10 @@ class World:
         self._settings = settings
         self._cup_wall = float(cell["cup"]["wall"])
         self._space = ContactSpace(self.model, truth.table, truth.cup, self._cup_wall, settings)
-        self._barrier = Barrier(float(settings["cup"]["barrier_delay"]))
+        self._barrier = LightBarrier(float(settings["cup"]["barrier_delay"]))
         self.where = Where.ABSENT
         self.ball: BallState | None = None
-        self.course: Course | None = None
+        self.course: ThrowCourse | None = None
         self._cup: Frame3 | None = None
         self._look_at = -math.inf
         self._rest: tuple[Frame3, tuple[float, float, float]] | None = None
@@ -100,12 +100,12 @@ class World:
         """Length of a fine step (s)."""
         return self._space.dt
 
-    def release(self, now: float, throw: Throw) -> Course:
+    def release(self, now: float, throw: Throw) -> ThrowCourse:
         """A ball enters the world. Raises RuntimeError while another one is there."""
         if self.ball is not None:
             raise RuntimeError("a ball is in play: one at a time")
         self.ball = throw.start
-        self.course = Course(throw, now)
+        self.course = ThrowCourse(throw, now)
         self._height = self._aside = math.inf
         self._last = (throw.start.position[0], now)
         self._roll(now, throw.start)
@@ -113,8 +113,8 @@ class World:
 
     def take_away(self, now: float) -> None:
         """Somebody takes the ball out of play."""
-        if self.course is not None and self.course.outcome is Outcome.ROLLING:
-            self.course.outcome = Outcome.MISSED
+        if self.course is not None and self.course.outcome is ThrowOutcome.ROLLING:
+            self.course.outcome = ThrowOutcome.MISSED
         if self.course is not None:
             self.course.ended_at = now - self.course.released_at
         self.where, self.ball, self.course = Where.ABSENT, None, None
@@ -288,19 +288,19 @@ class World:
         interrupted = -self._truth.cup.depth < height < 0.0 and aside < self._truth.cup.radius
         self._barrier.see(now, interrupted)
         self._note_exit(now, ball, course)
-        if course.outcome is Outcome.ROLLING:
+        if course.outcome is ThrowOutcome.ROLLING:
             course.approach = min(course.approach, math.hypot(height, aside))
             if math.inf > self._height > 0.0 >= height and course.exit_state is not None:
                 share = self._height / (self._height - height)
                 course.crossing = min(course.crossing, self._aside + share * (aside - self._aside))
             if self._barrier.output:
-                course.outcome = Outcome.CAUGHT
+                course.outcome = ThrowOutcome.CAUGHT
                 course.caught_at = now - course.released_at
-        elif course.outcome is Outcome.CAUGHT and not self._barrier.output and cup.z[2] > 0.5:
-            course.outcome = Outcome.DROPPED
+        elif course.outcome is ThrowOutcome.CAUGHT and not self._barrier.output and cup.z[2] > 0.5:
+            course.outcome = ThrowOutcome.DROPPED
         self._height, self._aside = height, aside
 
-    def _note_exit(self, now: float, ball: BallState, course: Course) -> None:
+    def _note_exit(self, now: float, ball: BallState, course: ThrowCourse) -> None:
         """The ball went over the near edge while the contact space moved it, cup at hand."""
         x, edge = ball.position[0], self._truth.table.near_edge
         if course.exit_state is None and x < edge:

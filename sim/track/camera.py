@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from petrobot.sim.track.floor import COARSE, FINE, Floor, Picture, Window
+from petrobot.sim.track.floor import COARSE, FINE, Floor, FloorWindow, Picture
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ class Motion(NamedTuple):
     turn: float
 
 
-class FloorCamera:
+class RoverCamera:
     """Takes images of a `Floor`; noise from `rng`."""
 
     def __init__(
@@ -122,12 +122,12 @@ class FloorCamera:
         field = np.random.default_rng(_NOISE_SIZE).standard_normal((_NOISE_SIZE, _NOISE_SIZE))
         self._noise = np.asarray(np.clip(np.rint(_NOISE_ZERO + noise * field), 0, 255), np.uint8)
         self._parts = [
-            _Part(self._to_floor, 0, self._split, Window(COARSE, self._farthest(0.0))),
+            _Part(self._to_floor, 0, self._split, FloorWindow(COARSE, self._farthest(0.0))),
             _Part(
                 self._to_floor,
                 self._split,
                 mount.rows,
-                Window(FINE, self._farthest(float(self._split))),
+                FloorWindow(FINE, self._farthest(float(self._split))),
             ),
         ]
 
@@ -204,7 +204,7 @@ class _Part:
     """Some rows of the image: their homography to the body frame's floor, and the window of the
     picture that they look at."""
 
-    def __init__(self, to_floor: Array, top: int, bottom: int, window: Window) -> None:
+    def __init__(self, to_floor: Array, top: int, bottom: int, window: FloorWindow) -> None:
         self.top, self.bottom, self.window = top, bottom, window
         self.to_floor: Array = to_floor @ np.array(
             [[1.0, 0.0, 0.0], [0.0, 1.0, float(top)], [0.0, 0.0, 1.0]]

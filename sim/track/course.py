@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from petrobot.sim.track.elements import BAR_MARGIN, SQUARE, Element, Kind, Pose, Square
+from petrobot.sim.track.elements import BAR_MARGIN, SQUARE, Element, ElementKind, FloorPose, Square
 
 BOARD: Final = 8
 """Squares along each side of the board."""
@@ -83,7 +83,7 @@ class Track:
         start = 0.0
         for number, letter in enumerate(kinds):
             try:
-                kind = Kind(letter)
+                kind = ElementKind(letter)
             except ValueError as fault:
                 raise TrackError(
                     f"element {letter!r}: there are S (straight), L (left) and R (right)"
@@ -181,12 +181,12 @@ class Track:
         )
 
     @property
-    def start(self) -> Pose:
+    def start(self) -> FloorPose:
         """Entrance of the first element."""
         return self.elements[0].at(0.0)
 
     @property
-    def end(self) -> Pose:
+    def end(self) -> FloorPose:
         """The T: the far side of its crossbar."""
         return self.at(self.length)
 
@@ -199,7 +199,7 @@ class Track:
         number = int(np.searchsorted(self._starts, s, side="right")) - 1
         return min(max(number, 0), len(self.elements) - 1)
 
-    def at(self, s: float) -> Pose:
+    def at(self, s: float) -> FloorPose:
         """Pose of the centre line at arc length s (m); outside the track it goes on straight."""
         element = self.elements[self.element_at(s)]
         return element.at(s - element.start)
@@ -266,10 +266,14 @@ def _check_wish(elements: int, interruptions: int, kinds: str, arcs: float) -> N
         raise TrackError(f"a share of arcs of {arcs}: ask for 0 to 1")
 
 
-def _orders(rng: np.random.Generator, arcs: float) -> list[Kind]:
+def _orders(rng: np.random.Generator, arcs: float) -> list[ElementKind]:
     """The three kinds in the order in which they are tried."""
-    turns = [Kind.LEFT, Kind.RIGHT] if rng.random() < 0.5 else [Kind.RIGHT, Kind.LEFT]
-    return [*turns, Kind.STRAIGHT] if rng.random() < arcs else [Kind.STRAIGHT, *turns]
+    turns = (
+        [ElementKind.LEFT, ElementKind.RIGHT]
+        if rng.random() < 0.5
+        else [ElementKind.RIGHT, ElementKind.LEFT]
+    )
+    return [*turns, ElementKind.STRAIGHT] if rng.random() < arcs else [ElementKind.STRAIGHT, *turns]
 
 
 def _walk(
@@ -277,15 +281,17 @@ def _walk(
 ) -> str | None:
     """A way of so many elements over the board that uses no square twice and has a free square
     after its end; depth first."""
-    first = Element(Kind.STRAIGHT, square, heading, 0.0)
+    first = Element(ElementKind.STRAIGHT, square, heading, 0.0)
     way, used = [first], {square}
-    tries: list[Iterator[Kind]] = [iter(())]
+    tries: list[Iterator[ElementKind]] = [iter(())]
     for _ in range(_BACKTRACKS):
         if len(way) == elements:
             return "".join(element.kind for element in way)
         last = way[-1]
         if len(tries) == len(way):
-            tries.append(iter(_orders(rng, arcs) if len(way) < elements - 1 else [Kind.STRAIGHT]))
+            tries.append(
+                iter(_orders(rng, arcs) if len(way) < elements - 1 else [ElementKind.STRAIGHT])
+            )
         added = _step(last, tries[-1], used)
         if added is not None:
             way.append(added)
@@ -298,7 +304,7 @@ def _walk(
     return None
 
 
-def _step(last: Element, kinds: Iterator[Kind], used: set[Square]) -> Element | None:
+def _step(last: Element, kinds: Iterator[ElementKind], used: set[Square]) -> Element | None:
     """The next element after `last` of the first kind that leads on to a free square; None when no
     kind is left."""
     square, heading = last.next_square, last.next_heading

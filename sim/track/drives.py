@@ -20,7 +20,7 @@ from petrobot.services.comm.canopen.cia402 import (
 )
 from petrobot.sim.bus.canopen_node import CanopenNode
 from petrobot.sim.bus.power_drive import POWERED, PowerDrive
-from petrobot.sim.track.rover import SLOT, Rover
+from petrobot.sim.track.rover import SLOT, RoverBody
 from petrobot.sim.track.sensor import ReflectorSensor
 
 SYNC_PATIENCE: Final = 5
@@ -51,7 +51,7 @@ class WheelDrive(PowerDrive):
 
     mode = Mode.CYCLIC_SYNCHRONOUS_VELOCITY
 
-    def __init__(self, side: int, rover: Rover) -> None:
+    def __init__(self, side: int, rover: RoverBody) -> None:
         """`side`: 0 left, 1 right; the node id is one more."""
         super().__init__(side + 1, "wheel_drive.eds", SYNC_PATIENCE)
         self.side = side
@@ -153,7 +153,7 @@ class RoverBus:
     seconds on the caller's clock.
     """
 
-    def __init__(self, rover: Rover, sensor: ReflectorSensor, now: float = 0.0) -> None:
+    def __init__(self, rover: RoverBody, sensor: ReflectorSensor, now: float = 0.0) -> None:
         self.rover = rover
         self.drives = (WheelDrive(0, rover), WheelDrive(1, rover))
         self.sensor = sensor

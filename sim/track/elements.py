@@ -30,7 +30,7 @@ _DIRECTIONS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Unit vectors of the headings 0, 90, 180, 270 degrees."""
 
 
-class Kind(StrEnum):
+class ElementKind(StrEnum):
     """What an element is, seen by who enters it."""
 
     STRAIGHT = "S"
@@ -40,15 +40,15 @@ class Kind(StrEnum):
     @property
     def length(self) -> float:
         """Of the centre line, m."""
-        return SQUARE if self is Kind.STRAIGHT else 0.5 * math.pi * RADIUS
+        return SQUARE if self is ElementKind.STRAIGHT else 0.5 * math.pi * RADIUS
 
     @property
     def turn(self) -> int:
         """Quarter turns to the left from its entrance to its exit."""
-        return {Kind.STRAIGHT: 0, Kind.LEFT: 1, Kind.RIGHT: -1}[self]
+        return {ElementKind.STRAIGHT: 0, ElementKind.LEFT: 1, ElementKind.RIGHT: -1}[self]
 
 
-class Pose(NamedTuple):
+class FloorPose(NamedTuple):
     """A point of the floor (m) and a heading (rad, counter-clockwise from x)."""
 
     x: float
@@ -61,7 +61,7 @@ class Element:
     """One element. `heading` counts quarter turns from x; `start` is its entrance's arc length
     (m)."""
 
-    kind: Kind
+    kind: ElementKind
     square: Square
     heading: int
     start: float
@@ -80,7 +80,7 @@ class Element:
             self.square[1] + 0.5 * (1 - dy)
         ) * SQUARE
 
-    def at(self, way: float) -> Pose:
+    def at(self, way: float) -> FloorPose:
         """The pose `way` metres after the entrance; before the entrance and after the exit the line
         goes on straight."""
         turn, inside = self.kind.turn, min(max(way, 0.0), self.kind.length)
@@ -92,7 +92,7 @@ class Element:
         beyond = way - inside
         u, w = u + beyond * math.cos(angle), w + beyond * turn * math.sin(angle)
         (x, y), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
-        return Pose(
+        return FloorPose(
             x + u * dx - w * dy, y + u * dy + w * dx, self.heading * 0.5 * math.pi + turn * angle
         )
 
@@ -101,7 +101,7 @@ class Element:
         of a point."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
-        if self.kind is Kind.STRAIGHT:
+        if self.kind is ElementKind.STRAIGHT:
             way = min(max(u, 0.0), SQUARE)
             return way, w, math.hypot(u - way, w)
         turn = self.kind.turn
@@ -117,7 +117,9 @@ class Element:
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
         aside = (
-            w if self.kind is Kind.STRAIGHT else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
+            w
+            if self.kind is ElementKind.STRAIGHT
+            else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
         )
         inside: Array = HALF_WIDTH - np.abs(aside)
         return inside

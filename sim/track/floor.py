@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.sim.track.course import BOARD, Track, white
-from petrobot.sim.track.elements import SQUARE, Element, Kind, Square
+from petrobot.sim.track.elements import SQUARE, Element, ElementKind, Square
 
 Picture = NDArray[np.uint8]
 
@@ -63,7 +63,7 @@ class Floor:
             picture[bottom : bottom + side, left : left + side] = grey
 
 
-class Window:
+class FloorWindow:
     """The part of a picture that a rover sees, copied whenever it has gone so far that it could see
     beyond: small enough to stay in a processor's cache, where the whole floor (23 MB) does not."""
 
@@ -111,7 +111,7 @@ def _chessboard(side: int) -> Picture:
 
 
 @lru_cache
-def _tile(kind: Kind, heading: int, tee: bool) -> Picture:
+def _tile(kind: ElementKind, heading: int, tee: bool) -> Picture:
     """A white track on a black square, which ends in a T or goes on."""
     element = Element(kind, (0, 0), heading, 0.0)
     middles = (np.arange(_SIDE) + 0.5) * FINE

@@ -18,15 +18,15 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.truth import LaboratoryError
-from petrobot.sim.faults import Fault, FaultKinds, FaultPlan
+from petrobot.sim.faults import FaultKinds, FaultPlan, InjectedFault
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
-from petrobot.sim.track.camera import FloorCamera, Motion
+from petrobot.sim.track.camera import Motion, RoverCamera
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.drives import RoverBus
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.floor import Floor, Picture
-from petrobot.sim.track.referee import Referee
-from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.referee import TrackReferee
+from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import LightTruth, RoverTruth, TrackSite, TrackTruth, track_site_of
 
@@ -47,7 +47,7 @@ ROVER_FAULTS: Final = FaultKinds(
 )
 
 
-def read_rover_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
+def read_rover_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
     """A fault as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
     return ROVER_FAULTS.read(now, kind, arguments)
 
@@ -121,9 +121,9 @@ class TrackLaboratory(LaboratoryParty):
         cv2.setNumThreads(1)  # cores are shared with other nodes
         self._site = site
         self._floor = Floor()
-        self._cameras: dict[str, FloorCamera] = {}
+        self._cameras: dict[str, RoverCamera] = {}
         truth = site.truth(regime)
-        self.rover = Rover(truth.rover, np.random.default_rng((seed, _SLIP)))
+        self.rover = RoverBody(truth.rover, np.random.default_rng((seed, _SLIP)))
         self._echo_draws = np.random.default_rng((seed, _ECHO))
         self.bus = RoverBus(self.rover, ReflectorSensor(self._measure))
         self._prepare(seed, truth, truth.course.track(seed))
@@ -150,15 +150,15 @@ class TrackLaboratory(LaboratoryParty):
         self.rover.move_to(self.now)
         draws = np.random.default_rng((seed, _SLIP))
         self.rover.place(truth.rover, _put_down(track.start, truth.rover, draws), draws)
-        self.referee = Referee(track, seed, truth.regime, self.now, hangs.tolist())
+        self.referee = TrackReferee(track, seed, truth.regime, self.now, hangs.tolist())
         self._watch_due = self.now
 
-    def _camera_of(self, truth: TrackTruth) -> FloorCamera:
+    def _camera_of(self, truth: TrackTruth) -> RoverCamera:
         """The camera as it is mounted; kept, since its noise field takes some milliseconds."""
         key = repr(truth.camera)
         if key not in self._cameras:
             nominal = self._site.nominal["camera"]
-            self._cameras[key] = FloorCamera(
+            self._cameras[key] = RoverCamera(
                 truth.camera,
                 float(nominal["exposure"]),
                 (float(nominal["black"]), float(nominal["white"])),
@@ -222,7 +222,7 @@ class TrackLaboratory(LaboratoryParty):
             self.bus.power(powerless)
         self.bus.sensor.dead = self._faults.active("dead_sensor")
 
-    def _strike(self, fault: Fault) -> None:
+    def _strike(self, fault: InjectedFault) -> None:
         if fault.kind == "drive_fault":
             self.bus.trip(int(fault.value) - 1)
 
@@ -258,11 +258,11 @@ class TrackLaboratory(LaboratoryParty):
         """Nothing is held outside of memory."""
 
 
-def _put_down(start: Pose, rover: RoverTruth, draws: np.random.Generator) -> Pose:
+def _put_down(start: FloorPose, rover: RoverTruth, draws: np.random.Generator) -> FloorPose:
     """Where a hand puts the rover that is to stand at `start`."""
     dx, dy, turn = draws.standard_normal(3).tolist()
     aside, heading = rover.settings["placed"], rover.settings["placed_heading"]
-    return Pose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
+    return FloorPose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
 
 
 def _check_speed(speed: object, rover: RoverTruth) -> None:

@@ -16,7 +16,7 @@ from enum import StrEnum
 from typing import Any, Final
 
 from petrobot.sim.track.course import BOARD, Gap, Near, Track
-from petrobot.sim.track.elements import SQUARE, Pose
+from petrobot.sim.track.elements import SQUARE, FloorPose
 
 LEFT: Final = 0.30
 """m off the centre line at which the track counts as left."""
@@ -41,7 +41,7 @@ _BEHIND, _AHEAD = 0.6, 1.2
 another part of the track."""
 
 
-class Phase(StrEnum):
+class RunPhase(StrEnum):
     """Where a run stands."""
 
     ON = "on"
@@ -65,7 +65,7 @@ class _Crossing:
 
 
 @dataclass(slots=True)
-class Referee:
+class TrackReferee:
     """Watches one run. `watch` it often; `score` gives plain data at any time."""
 
     track: Track
@@ -74,7 +74,7 @@ class Referee:
     began: float
     reflectors: Sequence[bool] = ()
     """Whether the reflector of each interruption hangs; all do if nothing is said."""
-    phase: Phase = Phase.ON
+    phase: RunPhase = RunPhase.ON
     s: float = 0.0
     """Arc length reached (m)."""
     penalties: list[dict[str, Any]] = field(default_factory=list)
@@ -89,8 +89,8 @@ class Referee:
     _squares: float = 0.0
     _most: float = 0.0
     _removed: bool = False
-    _first: Pose | None = None
-    _last: Pose | None = None
+    _first: FloorPose | None = None
+    _last: FloorPose | None = None
     _still_since: float | None = None
     _crossings: list[_Crossing] = field(default_factory=list)
 
@@ -102,7 +102,7 @@ class Referee:
             for gap, kind, there in zip(self.track.gaps, kinds, hang, strict=True)
         ]
 
-    def watch(self, now: float, pose: Pose, speed: float) -> bool:
+    def watch(self, now: float, pose: FloorPose, speed: float) -> bool:
         """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover
         has just left the board, where somebody presses its emergency stop."""
         if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
@@ -118,29 +118,29 @@ class Referee:
                 return False
             self.departed = now
         self._way += step
-        if step > 0.0 and self.phase is not Phase.END:
+        if step > 0.0 and self.phase is not RunPhase.END:
             self._locate(now, pose, step)
-        if self.phase is Phase.END:
+        if self.phase is RunPhase.END:
             self._await_stop(now, pose, speed)
         if not all(-OFF_BOARD <= at <= BOARD * SQUARE + OFF_BOARD for at in (pose.x, pose.y)):
             self._removed = True
             self._penalize(now, "left_board", pose)
         return self._removed
 
-    def _locate(self, now: float, pose: Pose, step: float) -> None:
+    def _locate(self, now: float, pose: FloorPose, step: float) -> None:
         near = self.track.nearest(pose.x, pose.y)
-        if self.phase is Phase.ON:
+        if self.phase is RunPhase.ON:
             self._follow(now, pose, near, step)
-        elif self.phase is Phase.GAP:
+        elif self.phase is RunPhase.GAP:
             self._cross(now, pose, near)
         elif self._painted(near) and near.distance <= REGAINED and near.s >= self.s - _BEHIND:
             self._go_on(now, pose, near)
-        if self.phase is Phase.ON and self.s >= self.track.length - BEFORE_END:
-            self.phase, self.finished = Phase.END, True
+        if self.phase is RunPhase.ON and self.s >= self.track.length - BEFORE_END:
+            self.phase, self.finished = RunPhase.END, True
 
-    def _follow(self, now: float, pose: Pose, near: Near, step: float) -> None:
+    def _follow(self, now: float, pose: FloorPose, near: Near, step: float) -> None:
         if near.distance > LEFT or not -_BEHIND <= near.s - self.s <= _AHEAD:
-            self.phase = Phase.LOST
+            self.phase = RunPhase.LOST
             self._penalize(now, "track_left", pose)
             return
         self.s = max(self.s, near.s)
@@ -149,12 +149,12 @@ class Referee:
             self._squares += step * near.distance * near.distance
             self._most = max(self._most, near.distance)
             return
-        self.phase = Phase.GAP
+        self.phase = RunPhase.GAP
         for crossing in self._crossings:
             if crossing.gap.start <= near.s <= crossing.gap.end and crossing.entered is None:
                 crossing.entered = now
 
-    def _cross(self, now: float, pose: Pose, near: Near) -> None:
+    def _cross(self, now: float, pose: FloorPose, near: Near) -> None:
         open_gaps = [
             each for each in self._crossings if each.entered is not None and each.ended is None
         ]
@@ -163,7 +163,7 @@ class Referee:
         if self._painted(near) and near.distance <= REGAINED and near.s >= self.s:
             self._go_on(now, pose, near)
 
-    def _go_on(self, now: float, pose: Pose, near: Near) -> None:
+    def _go_on(self, now: float, pose: FloorPose, near: Near) -> None:
         """The track is regained: every interruption before it is recovered or missed."""
         for crossing in self._crossings:
             if crossing.ended is None and crossing.gap.end <= near.s + 1e-9:
@@ -173,12 +173,12 @@ class Referee:
                 )
                 if not crossing.recovered:
                     self._penalize(now, "interruption_missed", pose, crossing.gap.end)
-        self.phase, self.s = Phase.ON, max(self.s, near.s)
+        self.phase, self.s = RunPhase.ON, max(self.s, near.s)
 
     def _painted(self, near: Near) -> bool:
         return self.track.elements[near.element].painted
 
-    def _await_stop(self, now: float, pose: Pose, speed: float) -> None:
+    def _await_stop(self, now: float, pose: FloorPose, speed: float) -> None:
         end = self.track.end
         c, s = math.cos(end.heading), math.sin(end.heading)
         ahead = (pose.x - end.x) * c + (pose.y - end.y) * s
@@ -194,7 +194,7 @@ class Referee:
         if still and not beyond and ahead >= -BEFORE_END:
             self.stopped = self._still_since
 
-    def _penalize(self, now: float, kind: str, pose: Pose, s: float | None = None) -> None:
+    def _penalize(self, now: float, kind: str, pose: FloorPose, s: float | None = None) -> None:
         begun = self.began if self.departed is None else self.departed
         row = {"s": self.s if s is None else s, "x": pose.x, "y": pose.y, "after": now - begun}
         self.penalties.append(

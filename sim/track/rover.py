@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.truth import RoverTruth
 
 SLOT: Final = 0.02
@@ -57,7 +57,7 @@ class Wheel:
         return turned
 
 
-class Rover:
+class RoverBody:
     """Wheels 0 (left) and 1 (right) and the body on them. `move_to` brings it up to a moment; times
     are the caller's clock (s)."""
 
@@ -65,9 +65,9 @@ class Rover:
         """`rng` draws the slip."""
         self.wheels = (Wheel(0.0, 1.0), Wheel(0.0, 1.0))
         self.now = now
-        self.place(truth, Pose(0.0, 0.0, 0.0), rng)
+        self.place(truth, FloorPose(0.0, 0.0, 0.0), rng)
 
-    def place(self, truth: RoverTruth, pose: Pose, rng: np.random.Generator) -> None:
+    def place(self, truth: RoverTruth, pose: FloorPose, rng: np.random.Generator) -> None:
         """Put this rover somewhere, standing; its encoders go on from where they are."""
         self.truth = truth
         self.x, self.y, self.heading = pose
@@ -87,9 +87,9 @@ class Rover:
         self._fresh = truth.slip * math.sqrt(1.0 - self._keep * self._keep)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> FloorPose:
         """Where it is."""
-        return Pose(self.x, self.y, self.heading)
+        return FloorPose(self.x, self.y, self.heading)
 
     @property
     def standing(self) -> bool:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from petrobot.sim.bus.canopen_node import CanopenNode
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.truth import SensorTruth
 
 SENSOR_NODE: Final = 3
@@ -31,7 +31,7 @@ class Echo(NamedTuple):
 
 def look(
     truth: SensorTruth,
-    pose: Pose,
+    pose: FloorPose,
     reflectors: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> list[Echo]:

@@ -87,7 +87,7 @@ class LightTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class TrackCourse:
     """Which track a regime lays."""
 
     kinds: str
@@ -114,7 +114,7 @@ class TrackTruth:
     """The simulated truth of one regime."""
 
     regime: str
-    course: Course
+    course: TrackCourse
     rover: RoverTruth
     camera: Mount
     sensor: SensorTruth
@@ -139,7 +139,7 @@ class TrackSite:
         try:
             return TrackTruth(
                 regime,
-                Course(str(base["kinds"]), int(base["elements"]), int(base["interruptions"])),
+                TrackCourse(str(base["kinds"]), int(base["elements"]), int(base["interruptions"])),
                 _rover(nominal, self.settings["rover"], errors, values, rng),
                 _camera(nominal["camera"], errors, values, rng),
                 _sensor(nominal, self.settings["sensor"], errors, values, rng),

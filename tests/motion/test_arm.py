@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.canopen.cia402 import Fault
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 ARM = nominal_arm()
 PUMA = Puma.of(ARM)
-TOUCH = Guard(PUMA, ARM, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
+TOUCH = CollisionGuard(PUMA, ARM, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
 """Says what is really touched, without margins."""
 CYCLE = 0.004
 AWAY = [math.radians(angle) for angle in (-60.0, 63.0, -205.0, 40.0, 70.0, 90.0)]

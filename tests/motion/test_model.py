@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import (
-    ModelError,
+    ArmFileError,
     nominal_arm,
     nominal_cell,
     read_arm,
@@ -48,7 +48,7 @@ def test_the_nominal_arm_is_the_published_one() -> None:
 )
 def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
     assert old in ARM
-    with pytest.raises(ModelError, match=r"puma560\.toml") as caught:
+    with pytest.raises(ArmFileError, match=r"puma560\.toml") as caught:
         read_arm(ARM.replace(old, new, 1))
     assert says in str(caught.value)
 
@@ -63,7 +63,7 @@ def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
 )
 def test_a_bad_cell_is_refused_by_name(old: str, new: str, says: str) -> None:
     assert old in CELL
-    with pytest.raises(ModelError, match=says):
+    with pytest.raises(ArmFileError, match=says):
         read_cell(CELL.replace(old, new, 1))
 
 
@@ -94,7 +94,7 @@ def test_the_accelerations_can_be_had_for_the_torques() -> None:
 
 def test_named_poses_are_clear_and_the_cup_is_at_the_edge() -> None:
     arm, cell = nominal_arm(), nominal_cell()
-    guard = Guard(Puma.of(arm), arm, cell)
+    guard = CollisionGuard(Puma.of(arm), arm, cell)
     for name, pose in arm.poses.items():
         assert guard.violation(pose) == "", name
     home, empty = guard.place(arm.poses["home"]), guard.place(arm.poses["empty"])

@@ -16,7 +16,7 @@ import pytest
 from petrobot.services.comm.lockstep.channels import images_wanted
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Executed
-from petrobot.sim.catching.course import Outcome
+from petrobot.sim.catching.course import ThrowOutcome
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.thrower import draw_throw
 from petrobot.sim.exposures import Exposures
@@ -306,4 +306,4 @@ def test_the_same_seed_gives_the_same_bits_here_and_in_a_fresh_process(digests: 
 
 
 def test_outcomes_are_plain_words() -> None:
-    assert {str(outcome) for outcome in Outcome} == {"rolling", "caught", "missed", "dropped"}
+    assert {str(outcome) for outcome in ThrowOutcome} == {"rolling", "caught", "missed", "dropped"}

@@ -20,7 +20,7 @@ from petrobot.services.comm.location_file import load
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Answer, Call, Command, Hello, Outcome
 from petrobot.services.comm.streams.camera import StreamImages
-from petrobot.sim.catching.laboratory import Laboratory
+from petrobot.sim.catching.laboratory import CatchingLaboratory
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
 from tests.ports import free_ports
@@ -107,7 +107,7 @@ async def test_drives_answer_on_the_bus(
         return bool(master.enabled)
 
     await until(exchange)
-    assert isinstance(lab, Laboratory)
+    assert isinstance(lab, CatchingLaboratory)
     assert master.position == pytest.approx(lab.plant.q, abs=1e-3)
     port.close()
 
