@@ -1,7 +1,11 @@
-"""From image to image: goes on where the line was last, and believes an end only when several
-images show the same.
+"""From image to image: continue where the line was last, and believe an end only when several
+images show the same. Pure.
 
-Pure: images in, sights out.
+A line ends at the edge of a square without a track, or in the crossbar of the T. Both are searched
+in a patch of floor around the line's last point, in columns beside the line: a crossbar is a stripe
+across it with the square's colour on both sides; the edge of a square is a step along one straight
+line, farther out than a bar reaches. The colours do not matter, nor does a small error in the
+direction of the line: stripe and edge may be askew.
 """
 
 from __future__ import annotations
@@ -31,13 +35,14 @@ from petrobot.services.mobile.sight import (
 BACK, ON, STEP = 0.16, 0.26, 0.01
 """m before and after the last point of the line that are searched, and the step."""
 AT_LEAST, AT_MOST = -0.06, 0.20
-"""m from the line's last point to its end: rows are centimetres apart, and the last ones may have
-been missed."""
+"""Least and greatest distance (m) from the line's last point to its end: rows are centimetres
+apart, and the last ones may have been missed."""
 SURE = 0.012
 """m, root mean square, that a stripe or an edge may be off a straight line."""
 ASKEW = 0.45
-"""Slope of stripe or edge against the square to the line's direction."""
+"""Greatest slope of stripe or edge against the perpendicular of the line."""
 LEAST_CONTRAST = 14.0
+"""Least grey levels of an edge or a stripe."""
 CONTRAST_SHARE = 0.3
 """Share of the patch's range of grey that an edge or a stripe must have."""
 COLUMNS_NEEDED = 3
@@ -59,8 +64,8 @@ class EndFinder:
         self._s = np.arange(-BACK, ON + 1e-9, STEP)
 
     def judge(self, image: NDArray[np.uint8], sight: Sight) -> LineEnd | None:
-        """How a line that broke off ends; None when it is neither, or too little is in view to
-        tell."""
+        """Return how a line that broke off ends; None when it is neither kind, or too little is in
+        view."""
         if not (sight.seen and sight.broke_off):
             return None
         x, y, direction = _last(sight)
@@ -82,7 +87,7 @@ class EndFinder:
         return LineEnd(kind, x + at * math.cos(direction), y + at * math.sin(direction))
 
     def _patch(self, image: NDArray[np.uint8], x: float, y: float, direction: float) -> Grey:
-        """Grey levels (columns beside the line, places along its direction)."""
+        """Return grey levels (columns beside the line, samples along its direction)."""
         cos, sin = math.cos(direction), math.sin(direction)
         s, t = self._s[None, :], self._aside[:, None]
         return self._view.sample(image, x + s * cos - t * sin, y + s * sin + t * cos)
@@ -90,8 +95,8 @@ class EndFinder:
     def _stripe(
         self, grey: Grey, valid: NDArray[np.bool_], least: float
     ) -> tuple[float | None, bool]:
-        """Where a crossbar's middle meets the line (m from its last point), None without one; and
-        whether much looks like one."""
+        """Return where a crossbar's middle meets the line (m from its last point), None without
+        one; and whether much looks like a bar."""
         side = round(self._bar / STEP)
         core = (grey[:, :-2] + grey[:, 1:-1] + grey[:, 2:]) / np.float32(3.0)
         left, right = (
@@ -111,8 +116,8 @@ class EndFinder:
         return (line[0] if fits else None), striped
 
     def _edge(self, grey: Grey, valid: NDArray[np.bool_], least: float) -> float | None:
-        """Where the edge of the square meets the line (m from its last point), None if there is
-        none."""
+        """Return where the edge of the square meets the line (m from its last point), None if there
+        is none."""
         size = np.where(valid[:, None], np.abs(grey[:, 3:] - grey[:, :-3]), np.float32(0.0))
         best, place = _peaks(size, self._s[0] + 1.5 * STEP)
         shows = (best > least) & valid
@@ -127,8 +132,8 @@ class EndFinder:
 
 
 def _peaks(size: Grey, first: float) -> tuple[Grey, Vector]:
-    """Each row's greatest value and its place (m), to a fraction of a step; column 0 lies at
-    `first` (m)."""
+    """Return each row's greatest value and its position (m), to a fraction of a step; column 0 lies
+    at `first` (m)."""
     row = np.arange(size.shape[0])
     best = np.clip(size.argmax(axis=1), 1, size.shape[1] - 2)
     before, at, after = size[row, best - 1], size[row, best], size[row, best + 1]
@@ -137,8 +142,8 @@ def _peaks(size: Grey, first: float) -> tuple[Grey, Vector]:
 
 
 def _straight(aside: Vector, place: Vector) -> tuple[list[float], float]:
-    """The straight line through points but for the worst one (at 0 and slope), and how far the rest
-    is off it (m, rms)."""
+    """Return the straight line through all points except the worst one (value at 0, slope), and how
+    far the rest is off it (m, rms)."""
     line = polynomial(aside, place, 1)
     off = np.abs(place - line[0] - line[1] * aside)
     keep = np.arange(place.size) != int(off.argmax())
@@ -148,7 +153,7 @@ def _straight(aside: Vector, place: Vector) -> tuple[list[float], float]:
 
 
 def _last(sight: Sight) -> tuple[float, float, float]:
-    """The line's last point and its direction there (m, rad)."""
+    """Return the line's last point and its direction there (m, rad)."""
     x, y = sight.x, sight.y
     near = x >= x[-1] - 0.25
     px, py = x[near] - x[-1], y[near]
@@ -162,7 +167,7 @@ def _last(sight: Sight) -> tuple[float, float, float]:
 # --- From image to image -------------------------------------------------------------------------
 
 FOLLOW_FAR, FIND_FAR = 1.2, 1.5
-"""m ahead up to which scan rows lie while the line is followed, and while it is looked for."""
+"""m ahead up to which scan rows lie while the line is followed, and while it is searched."""
 NEAR = 0.6
 """m ahead within which a line must begin for the rows of following to suffice."""
 FORGET = 3
@@ -182,11 +187,11 @@ class FloorWatch:
     wide: ScanGrid
     """Rows for finding."""
     width: float
-    """m, of the track."""
+    """m, width of the track."""
 
     @staticmethod
     def of(rover: RoverModel) -> FloorWatch:
-        """For the numbers of a rover."""
+        """Compute geometry and rows from the numbers of a rover."""
         view = FloorView(rover.camera)
         near, wide = ScanGrid.of(view, FOLLOW_FAR), ScanGrid.of(view, FIND_FAR)
         return FloorWatch(view, EndFinder(view, rover.track), near, wide, rover.track.width)
@@ -214,7 +219,7 @@ class LineWatcher:
 
     @property
     def end(self) -> TrackEnd:
-        """What the latest images agree on."""
+        """The end on which the latest images agree."""
         for kind in (TrackEnd.T, TrackEnd.INTERRUPTION):
             count = sum(vote is kind for vote in self._votes)
             if count >= NEEDED and 2 * count > len(self._votes):
@@ -222,7 +227,7 @@ class LineWatcher:
         return TrackEnd.NONE
 
     def look(self, image: NDArray[np.uint8]) -> Sight:
-        """What the image shows; its `end` is set only once it is believed."""
+        """Return what the image shows; its `end` is set only once it is believed."""
         self.images += 1
         grid = self._floor.near if self._is_near and not self._find else self._floor.wide
         sight = self._detect(grid, grid.sample(image), self._floor.width, self._expected)
@@ -237,8 +242,7 @@ class LineWatcher:
 
     @property
     def _is_near(self) -> bool:
-        """Whether the line begins where the image does: then rows far ahead tell nothing that
-        matters yet."""
+        """Whether the line begins where the image does: then rows far ahead do not matter yet."""
         return self._expected is not None and self._expected.near < NEAR
 
     def _believed(self, image: NDArray[np.uint8], sight: Sight) -> LineEnd | None:
@@ -246,5 +250,5 @@ class LineWatcher:
         if end is not None:
             self._votes.append(end.kind)
         elif not sight.broke_off and self._votes:
-            self._votes.popleft()  # a line that goes on speaks against an end
+            self._votes.popleft()  # A line that continues contradicts an end.
         return end if end is not None and end.kind is self.end else None

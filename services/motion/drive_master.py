@@ -1,8 +1,8 @@
-"""The CANopen master of the arm's bus: six drives and the digital inputs, on
-`services.comm.canopen_master`.
+"""CANopen master of the arm's bus: six drives and the digital inputs, on top of
+`services.comm.canopen.master`.
 
-A machine: frames in, frames out, times passed in. It knows neither trajectories nor actions: each
-cycle it is given six targets (rad) and says what the drives say.
+Sans-I/O: frames in, frames out, times passed in. It knows neither trajectories nor actions: each
+cycle it receives six target angles (rad) and reports what the drives report.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from petrobot.services.comm.canopen.master import (
 # --- One drive -----------------------------------------------------------------------------------
 
 HEARTBEAT_PATIENCE: Final = 0.2
-"""s of silence after which a node counts as lost (both ways)."""
+"""Seconds of silence after which a node counts as lost (both ways)."""
 RESET_CYCLES: Final = 10
 """Cycles between two fault resets."""
 STOP_CYCLES: Final = 125
-"""Cycles that a drive is given to stop quickly and stand, before its power is taken away and its
-brake holds."""
+"""Cycles that a drive has for its quick stop, before its power is switched off and its brake
+holds."""
 SPEED_POLL: Final = 1.0
-"""Seconds between two looks at a drive's greatest speed."""
+"""Seconds between two reads of a drive's greatest speed."""
 LIMITED_POLL: Final = 0.02
-"""The same while a drive says that it is too slow for its set points."""
+"""The same while a drive reports that it is too slow for its set points."""
 
 _MODE: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION
 _U8, _U16, _U32, _I8, _I32 = (
@@ -67,7 +67,7 @@ _RPDO: Final = canopen.pdo_struct(RECEIVED)
 
 @dataclass(frozen=True, slots=True)
 class DriveSettings:
-    """What a drive is configured with: SI units."""
+    """Configuration of one drive, in SI units."""
 
     lower: float
     upper: float
@@ -77,7 +77,8 @@ class DriveSettings:
 
 
 class JointDriveLink:
-    """What the master knows of one drive."""
+    """The master's view of one drive: its configuration, what its TPDO reports, and the RPDO sent
+    to it."""
 
     def __init__(self, node: int, settings: DriveSettings) -> None:
         self.node = node
@@ -86,7 +87,7 @@ class JointDriveLink:
         self.state = State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         self.limited = False
-        """Whether the drive cuts its set points because they are faster than it goes."""
+        """Whether the drive cuts its set points because they are faster than it can move."""
         self.position = 0.0
         self.torque = 0.0
         self.silent = 0
@@ -94,7 +95,7 @@ class JointDriveLink:
         self.max_speed = 0.0
         self.error_code = 0
         self.controlword = 0
-        self._asked = 0.2 * node  # not all at once
+        self._asked = 0.2 * node  # Spread the reads of the six drives.
         self._reading = False
         self._taken = b""
         self._rpdo = canopen.RPDO1_BASE + node
@@ -102,8 +103,8 @@ class JointDriveLink:
         self._power = Power(RESET_CYCLES, STOP_CYCLES)
 
     def transfers(self, cycle: float) -> list[Transfer]:
-        """The configuration of this drive for a bus cycle of so many seconds, and what is read from
-        it."""
+        """Return the SDO transfers that configure this drive for a bus cycle (s), and read what the
+        master must know."""
         settings = self.settings
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
@@ -119,7 +120,7 @@ class JointDriveLink:
         ]
 
     def wrong(self) -> str:
-        """What makes the device at this node unfit, in words; empty if nothing. Takes over its
+        """Return in words why the device at this node does not fit; empty if it does. Stores its
         greatest speed."""
         wrong = unfit(self.node, self.sdo.results, _MODE)
         if not wrong:
@@ -127,8 +128,8 @@ class JointDriveLink:
         return wrong
 
     def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
-        """Read the drive's greatest speed again when it is time, sooner in a hurry: drives may slow
-        down by themselves."""
+        """Read the drive's greatest speed again when it is due, more often in a hurry: drives may
+        slow down by themselves."""
         if self._reading:
             if self.sdo.busy:
                 return self.sdo.advance(now)
@@ -143,14 +144,14 @@ class JointDriveLink:
         return self.sdo.advance(now)
 
     def take(self, data: bytes) -> bool:
-        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes
-        that are none."""
-        if data == self._taken and self.spoken:  # a drive at rest
+        """Process the drive's TPDO; return whether its status has changed. Raises ValueError for
+        bytes of another length."""
+        if data == self._taken and self.spoken:  # A drive at rest repeats itself.
             self.silent = 0
             return False
         if len(data) != _TPDO.size:
             raise ValueError(
-                f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}"
+                f"TPDO of node {self.node}: expected {_TPDO.size} bytes, got {len(data)}"
             )
         statusword, position, torque = _TPDO.unpack(data)
         other = statusword != self.statusword or not self.spoken
@@ -162,8 +163,8 @@ class JointDriveLink:
         return other
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
-        """The RPDO: a controlword that leads to where the master wants the drive, and the target
-        position (rad)."""
+        """Return the RPDO: the controlword that leads to the state that the master wants, and the
+        target position (rad)."""
         if wanted and self.state is State.OPERATION_ENABLED:
             self._power.stopping = 0
             self.controlword = _GO_ON
@@ -172,7 +173,7 @@ class JointDriveLink:
         return self._frame(self.controlword, target)
 
     def _frame(self, controlword: int, target: float) -> Frame:
-        """The RPDO; the same object as before while neither of both changes."""
+        """Return the RPDO; the same object as before while neither value has changed."""
         sent = self._sent
         if sent is None or target != sent[1] or controlword != sent[0]:
             frame = Frame(self._rpdo, _RPDO.pack(controlword, to_units(target)))
@@ -181,25 +182,25 @@ class JointDriveLink:
 
 
 _GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
-"""Controlword to a drive that follows its set points."""
+"""Controlword for a drive that follows its set points."""
 
 
 # --- The master ----------------------------------------------------------------------------------
 
 SILENT_CYCLES: Final = 10
-"""Cycles without a drive's TPDO after which it counts as lost."""
+"""Cycles without a drive's TPDO after which the drive counts as lost."""
 INPUT_TIMER_MS: Final = 100
 INPUT_OBJECTS: Final = (Mapped(0x6000, 1, Type.UNSIGNED8),)
 
 
 class DriveMaster(CanopenMaster[JointDriveLink]):
-    """Master of nodes 1 to 6 (drives, base to flange) and `inputs` (digital inputs)."""
+    """Master of nodes 1 to 6 (drives, base to flange) and of the node `inputs` (digital inputs)."""
 
     def __init__(
         self, settings: Sequence[DriveSettings], cycle: float, inputs: int = 7, enable: bool = True
     ) -> None:
-        """`cycle` in seconds; with `enable` the drives are enabled as soon as they are there for
-        the first time."""
+        """`cycle` in seconds; with `enable` the drives are enabled as soon as all of them are
+        present for the first time."""
         self.inputs: int | None = None
         drives = {
             f"joint {node}": JointDriveLink(node, each) for node, each in enumerate(settings, 1)
@@ -212,24 +213,24 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
 
     @property
     def positions(self) -> list[float]:
-        """Joint angles as the drives last said (rad)."""
+        """Joint angles that the drives last reported (rad)."""
         return [drive.position for drive in self.drives]
 
     @property
     def speeds(self) -> tuple[float, ...]:
-        """Greatest speeds as the drives last said (rad/s)."""
+        """Greatest speeds that the drives last reported (rad/s)."""
         return tuple([drive.max_speed for drive in self.drives])
 
     def give_up(
         self, why: str, cause: str = "drive_fault", code: int = Fault.FOLLOWING_ERROR
     ) -> None:
-        """The servo itself stops the drives quickly, with the next cycle: they do not follow, or in
-        an emergency."""
+        """Stop the drives quickly in the next cycle: the joints do not follow, or in an
+        emergency."""
         super().give_up(why, cause, code)
 
     def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
-        """Frames of one cycle: configuration, or set points (rad), SYNC and now and then the
-        question how fast a drive goes."""
+        """Return the frames of one cycle: configuration, or set points (rad) and SYNC, and now and
+        then a read of a drive's greatest speed."""
         configuring = self.phase is Phase.CONFIGURING
         frames = super().advance(now, targets)
         if not configuring:
@@ -243,4 +244,3 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
     def _take_inputs(self, data: bytes) -> None:
         if data:
             self.inputs = data[0]
-

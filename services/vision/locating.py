@@ -1,5 +1,10 @@
-"""Locating: reads images until candidates of a detector are confirmed as a ball that rolls towards
-the near edge."""
+"""Locating: reads images until a detector's candidates are confirmed as a ball that rolls toward
+the near edge.
+
+Candidates are a rolling ball if, image after image, they lie on one straight line at one plausible
+speed. Stickers, glare and the arm also produce candidates, but they do not roll towards the near
+edge.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +27,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class BallTrack:
-    """A ball that was seen to roll: `times` (n,) s, `places` (n, 2) m, `velocity` (2,) m/s and the
-    `residual` (m, rms) of the places about the straight line of even speed through them."""
+    """A ball that was seen to roll.
+
+    `times` (n,) s, `places` (n, 2) m, `velocity` (2,) m/s, and the `residual` (m, rms) of the
+    places about the straight line of constant speed through them.
+    """
 
     times: Array
     places: Array
@@ -36,34 +44,37 @@ class Rolling:
     """What counts as a ball that rolls towards the near edge (m, s)."""
 
     slowest: float = 0.25
+    """Slowest and fastest ball (m/s)."""
     fastest: float = 3.5
     towards: float = -0.15
-    """m/s, x velocity at most: towards the near edge."""
+    """m/s, greatest x velocity: negative, towards the near edge."""
     gate: float = 0.015
-    """How far a candidate may lie from where the track expects it."""
+    """m that a candidate may lie from where the track expects it."""
     spread: float = 0.008
-    """Largest rms residual of a confirmed track."""
+    """m, largest rms residual of a confirmed track."""
     shortest: float = 0.03
-    """Way that a confirmed track covers at least."""
+    """m that a confirmed track must cover."""
 
 
 class Confirmation:
-    """Joins candidates of successive images to tracks, and confirms one that has `count` of
+    """Joins candidates of successive images to tracks, and confirms a track that has `count` of
     them."""
 
     MOST = 40
+    """Most tracks kept; the oldest go first."""
     MISSED = 3
+    """Images in a row in which a track may find no candidate."""
 
     def __init__(self, count: int, rolling: Rolling | None = None) -> None:
-        """`count` >= 3 consistent detections confirm a ball."""
+        """`count` consistent detections, at least 3, confirm a ball."""
         self._count = max(3, count)
         self._rolling = rolling or Rolling()
         self._tracks: list[list[tuple[float, float, float]]] = []
         self._missed: list[int] = []
 
     def add(self, time: float, places: Sequence[Sequence[float]] | Array) -> BallTrack | None:
-        """Take the candidates (n, 2) m of the image of `time` (s, rising); a track as soon as one
-        is confirmed."""
+        """Take the candidates (n, 2) m of the image at `time` (s, rising); return a track as soon
+        as one is confirmed."""
         free = [(time, float(x), float(y)) for x, y in places]
         kept, missed = [], []
         for track, misses in zip(self._tracks, self._missed, strict=True):
@@ -86,7 +97,7 @@ class Confirmation:
     def _extension(
         self, track: list[tuple[float, float, float]], free: list[tuple[float, float, float]]
     ) -> tuple[float, float, float] | None:
-        """The candidate that goes on with a track best, None if none does."""
+        """Return the candidate that continues a track best, None if none does."""
         best, least = None, np.inf
         for candidate in free:
             away = self._misfit(track, candidate)
@@ -97,7 +108,7 @@ class Confirmation:
     def _misfit(
         self, track: list[tuple[float, float, float]], candidate: tuple[float, float, float]
     ) -> float:
-        """How badly a candidate goes on with a track (m); inf when not at all."""
+        """Return how badly a candidate continues a track (m); inf when it does not."""
         t, x, y = track[-1]
         step = candidate[0] - t
         vx, vy = (candidate[1] - x) / step, (candidate[2] - y) / step
@@ -129,8 +140,8 @@ class Confirmation:
 
 
 def _line(rows: Array) -> tuple[Array, Array]:
-    """Place at time 0 (2,) and velocity (2,) of the straight line of even speed through rows t, x,
-    y."""
+    """Return position at time 0 (2,) and velocity (2,) of the least-squares line of constant speed
+    through rows t, x, y."""
     middle = rows.mean(axis=0)
     off = rows - middle
     velocity = off[:, 0] @ off[:, 1:] / max(float(off[:, 0] @ off[:, 0]), 1e-12)
@@ -140,25 +151,26 @@ def _line(rows: Array) -> tuple[Array, Array]:
 # --- Searching -----------------------------------------------------------------------------------
 
 LEARN_EVERY = 10
-"""Images: the stored background takes in every so manieth one."""
+"""The stored background learns from every so many images."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocateSpecification(Specification):
-    """When a ball counts as located, and how well (s, m)."""
+    """When a ball counts as located, and how accurately (s, m)."""
 
     timeout: float = 5.0
-    """s until no ball is an error."""
+    """s after which no ball is an error."""
     confirmations: float = 4.0
     """Consistent detections that confirm a ball."""
     rate: float = 0.0
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.8
-    """s without an image until the camera counts as dead."""
+    """s without an image after which the camera counts as dead."""
     max_residual: float = 0.0015
-    """m, rms of the places about a straight line of even speed: above it FAILURE `inaccurate`."""
+    """m, rms of the places about a straight line of constant speed; above it FAILURE
+    `inaccurate`."""
     min_ahead: float = 1.0
-    """m before the near edge at least: below it FAILURE `late`."""
+    """m that the ball must still be before the near edge; below it FAILURE `late`."""
 
 
 async def locate(
@@ -168,10 +180,10 @@ async def locate(
     sigma: float,
     specification: LocateSpecification,
 ) -> Result:
-    """Locate with the detector that `make` makes, kept by the camera under `name`; `sigma`: its
+    """Locate with the detector that `make` makes; the camera keeps it under `name`. `sigma` is its
     accuracy (m).
 
-    Images go on after SUCCESS and FAILURE, for the tracker; they end with ERROR.
+    The images continue after SUCCESS and FAILURE, for the tracker; they end with ERROR.
     """
     camera: Camera = ctx.device
     search = _Search(ctx, camera, camera.detector(name, lambda: make(camera)), specification)
@@ -205,7 +217,7 @@ class _Search:
         self._images = 0
 
     async def run(self, sigma: float) -> Result:
-        """Read images until a ball is confirmed, or the time is over."""
+        """Read images until a ball is confirmed, or the time is up."""
         asked = self._specification
         if self._camera.start(asked.rate) and isinstance(self._detector, MixtureOfGaussians):
             self._detector.forget()
@@ -238,7 +250,7 @@ class _Search:
         return self._confirmation.add(image.time, places)
 
     def _judge(self, track: BallTrack, image: Image, sigma: float) -> Result:
-        """The confirmed ball as plain data, SUCCESS when it meets the specification."""
+        """Return the confirmed ball as plain data; SUCCESS when it meets the specification."""
         asked = self._specification
         ahead = float(track.places[-1, 0]) - self._camera.view.near_edge
         ball = {

@@ -1,5 +1,5 @@
-"""Keeps the score: what was thrown, what could have been caught, what was, and how far off the rest
-went by."""
+"""Keeps the score: what was thrown, what could have been caught, what was caught, and how far off
+the others passed."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class _Entry:
 
 
 class CatchReferee:
-    """Writes down each throw from its release on. `began` is the simulated time (s) from which
-    releases are counted."""
+    """Records each throw from its release on. `began` is the simulated time (s) from which releases
+    are counted."""
 
     def __init__(self, seed: int, regime: str, oracle: Oracle, began: float) -> None:
         self._seed = seed
@@ -63,8 +63,8 @@ class CatchReferee:
         self._entries: list[_Entry] = []
 
     def enter(self, course: ThrowCourse, q: Sequence[float]) -> OracleVerdict:
-        """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again
-        for the score."""
+        """Record a ball that was released with the arm's encoders at `q` (six, rad); its `course`
+        is read again for the score."""
         verdict = self._oracle.judge(course.throw, q)
         self._entries.append(_Entry(course, verdict))
         return verdict
@@ -75,8 +75,8 @@ class CatchReferee:
         return self._entries[-1].verdict if self._entries else None
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        """All throws so far in plain data: `throws` (see `_row`) and, for those who look closer,
-        `courses` (see `_course`); counts are of throws that are over.
+        """Return all throws so far as plain data: `throws` (see `_row`) and, with more detail,
+        `courses` (see `_course`); counts are of finished throws.
 
         `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and
         `cause`. A throw takes the status of the cycle in which it was released, None if it was
@@ -113,7 +113,7 @@ def _status(course: ThrowCourse, now: float, cycles: Sequence[Mapping[str, Any]]
 
 
 def _row(entry: _Entry) -> dict[str, Any]:
-    """One throw: its speed at release (m/s), what became of it, how far from the middle of the
+    """Return one throw: its speed at release (m/s), its outcome, how far from the middle of the
     mouth it came (mm)."""
     course, verdict = entry.course, entry.verdict
     return {
@@ -127,8 +127,8 @@ def _row(entry: _Entry) -> dict[str, Any]:
 
 
 def _course(entry: _Entry, began: float, run: int | None) -> dict[str, Any]:
-    """How one throw went, in m, m/s and s; durations count from its release, None: it did not
-    happen."""
+    """Return the details of one throw in m, m/s and s; durations count from its release, None: it
+    did not happen."""
     course, exit_state = entry.course, entry.course.exit_state
     return {
         "n": course.throw.n,

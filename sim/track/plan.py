@@ -117,9 +117,9 @@ def _paint(track: Track) -> list[str]:
             continue
         colour = _DARK if white(element.square) else _LIGHT
         last = number == len(track.elements) - 1
+        line = _line(element, track.length - element.start if last else element.kind.length)
         lines.append(
-            f'<path d="{_line(element, track.length - element.start if last else element.kind.length)}" fill="none" '
-            f'stroke="{colour}" stroke-width="{2 * HALF_WIDTH:g}"/>'
+            f'<path d="{line}" fill="none" stroke="{colour}" stroke-width="{2 * HALF_WIDTH:g}"/>'
         )
         if last:
             x, y, heading = track.at(track.length - 0.5 * BAR_WIDTH)

@@ -1,10 +1,10 @@
-"""Keeps the score of a run on the track: how far off the centre line, interruptions recovered,
+"""Keeps the score of a run on the track: distance from the centre line, interruptions recovered,
 where and when it stopped.
 
-The rules (docs/decisions/mobile-contract.md): what counts is the body's origin. It is *on* the
-track until it is more than `LEFT` off; over an interruption it is in a *gap* until it is within
-`REGAINED` of the centre line behind it; *lost* after it has left the track, until it is back on a
-painted element no farther back than it was; and at the *end* once it has come to the T.
+The rules (docs/decisions/mobile-contract.md) apply to the body's origin. It is *on* the track until
+it is more than `LEFT` off; over an interruption it is in a *gap* until it is within `REGAINED` of
+the centre line behind it; *lost* after it has left the track, until it is back on a painted element
+no farther back than it was; and at the *end* once it has reached the T.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ REGAINED: Final = 0.10
 IN_TIME: Final = 1.0
 """m behind an interruption within which the track must be regained."""
 BEFORE_END, BEYOND_END, ASIDE_END = 0.10, 0.30, 0.30
-"""m before and beyond the T's far side, and aside of it, where the rover must stop."""
+"""m before and beyond the T's far side, and to the side of it, where the rover must stop."""
 STANDING: Final = 0.01
 """m/s below which the rover counts as standing ..."""
 STANDING_FOR: Final = 0.5
@@ -33,16 +33,16 @@ STANDING_FOR: Final = 0.5
 DEPARTED: Final = 0.01
 """m from where it was put down at which the clock starts."""
 OFF_BOARD: Final = 1.0
-"""m beyond the board's edge at which somebody stops the rover."""
+"""m beyond the board's edge at which a person stops the rover."""
 ROW_PERIOD: Final = 0.2
 """s between two rows of the path."""
 _BEHIND, _AHEAD = 0.6, 1.2
-"""m along the track by which the nearest point may have moved since the last look: farther is
+"""m along the track by which the nearest point may have moved since the last look; more means
 another part of the track."""
 
 
 class RunPhase(StrEnum):
-    """Where a run stands."""
+    """State of a run."""
 
     ON = "on"
     GAP = "gap"
@@ -52,8 +52,8 @@ class RunPhase(StrEnum):
 
 @dataclass(slots=True)
 class _Crossing:
-    """What became of one interruption. `aside` is the greatest distance from the line that would
-    have been there (m)."""
+    """What happened at one interruption. `aside` is the greatest distance from the line that is
+    missing there (m)."""
 
     gap: Gap
     kind: str
@@ -66,14 +66,14 @@ class _Crossing:
 
 @dataclass(slots=True)
 class TrackReferee:
-    """Watches one run. `watch` it often; `score` gives plain data at any time."""
+    """Watches one run. Call `watch` often; `score` returns plain data at any time."""
 
     track: Track
     seed: int
     regime: str
     began: float
     reflectors: Sequence[bool] = ()
-    """Whether the reflector of each interruption hangs; all do if nothing is said."""
+    """Whether the reflector of each interruption is present; all are if this is empty."""
     phase: RunPhase = RunPhase.ON
     s: float = 0.0
     """Arc length reached (m)."""
@@ -81,7 +81,7 @@ class TrackReferee:
     departed: float | None = None
     """When the rover first moved (s)."""
     stopped: float | None = None
-    """When it came to stand at the T (s)."""
+    """When it stopped at the T (s)."""
     finished: bool = False
     _path: list[tuple[float, float, float, float]] = field(default_factory=list)
     _way: float = 0.0
@@ -103,8 +103,8 @@ class TrackReferee:
         ]
 
     def watch(self, now: float, pose: FloorPose, speed: float) -> bool:
-        """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover
-        has just left the board, where somebody presses its emergency stop."""
+        """Process the body's pose and speed (m/s) at a moment (s). Return whether the rover has
+        just left the board, where a person presses its emergency stop."""
         if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
             self._path.append((now - self.began, *pose))
         if self.stopped is not None or self._removed:
@@ -164,7 +164,7 @@ class TrackReferee:
             self._go_on(now, pose, near)
 
     def _go_on(self, now: float, pose: FloorPose, near: Near) -> None:
-        """The track is regained: every interruption before it is recovered or missed."""
+        """Continue on the regained track: every interruption before it is recovered or missed."""
         for crossing in self._crossings:
             if crossing.ended is None and crossing.gap.end <= near.s + 1e-9:
                 crossing.ended = now
@@ -204,8 +204,8 @@ class TrackReferee:
     # The score
 
     def score(self, now: float) -> dict[str, Any]:
-        """How the run went, as plain data (docs/decisions/mobile-contract.md); the keys without a
-        unit are counts or flags."""
+        """Return the result of the run as plain data (docs/decisions/mobile-contract.md); keys
+        without a unit are counts or flags."""
         begun = now if self.departed is None else self.departed
         overrun = any(each["kind"] == "not_stopped" for each in self.penalties)
         stopped_at_t = self.stopped is not None and not overrun
@@ -238,7 +238,7 @@ class TrackReferee:
         }
 
     def _all_penalties(self, now: float, stopped_at_t: bool, overrun: bool) -> list[dict[str, Any]]:
-        """Those given, and those that a run that is over now has earned besides."""
+        """Return the penalties so far, plus those that a run that ends now has earned."""
         given, last = list(self.penalties), self._last or self.track.start
         for crossing in self._crossings:
             if crossing.entered is not None and crossing.ended is None:

@@ -24,7 +24,7 @@ def test_the_shipped_file_is_read() -> None:
         ("focal_px = 140.0", 'focal_px = "wide"', "[camera] focal_px"),
         ("principal_px = [79.5, 59.5]", "principal_px = [79.5]", "[camera] principal_px"),
         ("[track]", "[trak]", "[track]"),
-        ("[track]", "[track", "no TOML"),
+        ("[track]", "[track", "not valid TOML"),
     ],
 )
 def test_a_bad_one_is_refused_with_file_and_key(old: str, new: str, named: str) -> None:

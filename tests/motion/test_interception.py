@@ -163,11 +163,11 @@ def test_a_set_point_gets_older_while_it_lies() -> None:
     ],
 )
 def test_what_is_no_catch_point_is_refused(values: list[float]) -> None:
-    with pytest.raises(ValueError, match="a catch point has"):
+    with pytest.raises(ValueError, match="catch point: expected"):
         Prediction.parse(values)
 
 
 def test_a_cup_along_the_flange_is_refused() -> None:
     cup = replace(CELL.cup, axis=(0.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match="axis must not lie along"):
+    with pytest.raises(ValueError, match="expected an axis across"):
         Interceptor(PUMA, replace(CELL, cup=cup), GUARD, HOME, branch_of(PUMA, np.array(HOME)))

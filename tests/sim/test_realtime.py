@@ -231,7 +231,7 @@ def test_an_address_that_is_taken_is_told_by_file_address_and_remedy(
     assert (
         f"python -m petrobot.sim: {file}: " in said
         and str(port) in said
-        and "or give another port" in said
+        and "or use another port" in said
     )
 
 
