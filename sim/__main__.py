@@ -1,4 +1,4 @@
-"""Launches the simulated laboratory: `python -m petrobot.sim [--services FILE] [--lockstep]`."""
+"""Start the simulated laboratory: `python -m petrobot.sim [--services FILE] [--lockstep]`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EXAMPLE = "example:\n  python -m petrobot.sim --services services.toml"
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     commands = argparse.ArgumentParser(
         prog="python -m petrobot.sim",
         description="Launches the simulated laboratory: the node of services.toml with a key sim.",
@@ -43,7 +43,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def read(path: Path) -> tuple[Directory, str]:
-    """The location file and the name of its simulated node. Raises DirectoryError."""
+    """Return the location file and the name of its simulated node. Raises DirectoryError."""
     try:
         directory = load(path)
     except OSError as fault:
@@ -61,7 +61,7 @@ def read(path: Path) -> tuple[Directory, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the laboratory; gives the exit code."""
+    """Run the laboratory; return the exit code."""
     options = parser().parse_args(arguments)
     try:
         directory, name = read(options.services)

@@ -1,5 +1,5 @@
-"""When the simulated camera exposes, when an image leaves it, and the cameras themselves: each is
-built once a process."""
+"""When the simulated camera exposes, when an image leaves it, and the cameras themselves, each
+built once per process."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from petrobot.sim.catching.camera import Picture, PinholeCamera
 from petrobot.sim.catching.truth import Truth
 
 _ON_TIME = 1e-9
-"""s of rounding."""
+"""s by which rounding may change a time."""
 _NOISE_FIELD = 0x6361
-"""Seed of a camera's noise field: the same one whichever run comes first."""
+"""Seed of a camera's noise field: the same whichever run comes first."""
 _BUILT: dict[str, PinholeCamera] = {}
 
 
 class Exposed(NamedTuple):
-    """An image on its way out of the camera: leaves at `ready`, its exposure's middle was at `time`
-    (s)."""
+    """An image on its way out of the camera: it leaves at `ready`; `time` is the middle of its
+    exposure (s)."""
 
     ready: float
     time: float
@@ -30,7 +30,7 @@ class Exposed(NamedTuple):
 
 
 class Exposures:
-    """The camera's clock. One wish for images at a time."""
+    """The camera's clock. One request for images at a time."""
 
     def __init__(self) -> None:
         self.rate = 0.0
@@ -40,30 +40,30 @@ class Exposures:
         self._waiting: list[Exposed] = []
 
     def want(self, now: float, rate: float, generation: int) -> None:
-        """From now on `rate` images a second (0: none); what was exposed for an earlier wish is not
-        sent."""
+        """Take `rate` images per second from now on (0: none); images exposed for an earlier
+        request are not sent."""
         if rate > 0.0 and self.rate <= 0.0:
             self._next = now
         self.rate, self.generation = rate, generation
         self._waiting.clear()
 
     def due(self, now: float) -> bool:
-        """Whether an exposure has its middle at `now`; its clock goes on whether the image is used
-        or not."""
+        """Return whether an exposure has its middle at `now`; its clock advances whether the image
+        is used or not."""
         if self.rate <= 0.0 or now < self._next - _ON_TIME:
             return False
         self._next = max(self._next, now - 1.0 / self.rate) + 1.0 / self.rate
         return True
 
     def put(self, now: float, ready: float, pixels: Picture) -> None:
-        """An image exposed at `now` leaves the camera at `ready` (s); nobody writes to it any
-        more."""
+        """Queue an image exposed at `now` that leaves the camera at `ready` (s); it must not be
+        written any more."""
         pixels.flags.writeable = False
         self._waiting.append(Exposed(ready, now, self._sequence, self.generation, pixels))
         self._sequence += 1
 
     def take(self, until: float) -> list[Exposed]:
-        """Images that leave up to `until` (s), in order."""
+        """Return the images that leave up to `until` (s), in order."""
         count = 0
         while count < len(self._waiting) and self._waiting[count].ready <= until + _ON_TIME:
             count += 1
@@ -72,9 +72,9 @@ class Exposures:
 
 
 def camera_of(cell: Mapping[str, Any], truth: Truth, rng: np.random.Generator) -> PinholeCamera:
-    """The camera as it hangs in `truth`, its noise chosen by `rng` until the next call.
+    """Return the camera as it is mounted in `truth`; `rng` chooses its noise until the next call.
 
-    Drawing the still scene takes seconds, so cameras are kept; between two calls nothing of the
+    Drawing the static scene takes seconds, so cameras are cached; between two calls nothing of the
     last user stays in them.
     """
     true = truth.camera

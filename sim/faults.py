@@ -1,15 +1,15 @@
-"""Faults that the laboratory can be asked for: which there are, when they come, how long they stay.
+"""Faults that the laboratory can inject: their kinds, when they begin, how long they last.
 
 | kind | keys | what happens |
 |---|---|---|
 | drop_images | share, duration | that share of the images is lost |
 | dead_camera | duration | no image at all |
-| can_errors | share, duration | that share of the frames is lost, both ways |
+| can_errors | share, duration | that share of the frames is lost, in both directions |
 | bus_off | duration | no frame passes |
 | drive_fault | joint | drive 1 to 6 trips (overcurrent) |
 | slow_arm | factor | the joints reach this share of their speeds, until another factor comes |
 | arm_power | duration | the arm-power chain is open |
-| clear | | all faults that last are over |
+| clear | | all lasting faults end |
 
 `after` (s, default 0) delays each; a `duration` left out means until `clear`.
 """
@@ -27,7 +27,7 @@ from petrobot.services.comm.canopen.bus import Frame
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class InjectedFault:
     """One fault: from `start` to `end` (s on the laboratory's clock); `value` is its share, factor
     or joint (from 1)."""
 
@@ -36,25 +36,27 @@ class Fault:
     end: float
     value: float
     lasts: bool = True
-    """Whether it goes on until its end, or happens once."""
+    """Whether it lasts until its end, or happens once."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultKinds:
-    """The faults of one laboratory: which keys each takes, and how many drives there are."""
+    """The faults of one laboratory: the keys of each, and the number of drives."""
 
     keys: Mapping[str, tuple[str, ...]]
     drives: int
 
-    def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
-        """A fault as a caller asks for it. Raises ValueError that says what is wrong and what
-        fits."""
+    def read(self, now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
+        """Return the fault that a caller asks for. Raises ValueError that says what is wrong and
+        what is expected."""
         if kind not in self.keys:
-            raise ValueError(f"no fault is called {kind!r}; there are {', '.join(self.keys)}")
+            raise ValueError(f"unknown fault {kind!r}; the faults are {', '.join(self.keys)}")
         keys = self.keys[kind]
         unknown = sorted(set(arguments) - {*keys, "after"})
         if unknown:
-            raise ValueError(f"{kind} takes no {unknown[0]!r}, but {', '.join((*keys, 'after'))}")
+            raise ValueError(
+                f"{kind}: unknown key {unknown[0]!r}; the keys are {', '.join((*keys, 'after'))}"
+            )
         after = _number(arguments, "after", 0.0, 0.0, math.inf)
         duration = _number(arguments, "duration", math.inf, 0.0, math.inf)
         value = 1.0
@@ -65,8 +67,10 @@ class FaultKinds:
         elif "joint" in keys:
             value = _number(arguments, "joint", None, 1.0, float(self.drives))
             if value != int(value):
-                raise ValueError(f"joint is {value!r}: give a whole number from 1 to {self.drives}")
-        return Fault(kind, now + after, now + after + duration, value, "duration" in keys)
+                raise ValueError(
+                    f"joint: expected a whole number from 1 to {self.drives}, got {value!r}"
+                )
+        return InjectedFault(kind, now + after, now + after + duration, value, "duration" in keys)
 
 
 ARM_FAULTS: Final = FaultKinds(
@@ -84,9 +88,9 @@ ARM_FAULTS: Final = FaultKinds(
 )
 
 
-def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
-    """A fault of the catching cell's as a caller asks for it. Raises ValueError that says what is
-    wrong and what fits."""
+def read_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
+    """Return the fault of the catching cell that a caller asks for. Raises ValueError that says
+    what is wrong and what is expected."""
     return ARM_FAULTS.read(now, kind, arguments)
 
 
@@ -95,27 +99,27 @@ def _number(
 ) -> float:
     value = arguments.get(key, default)
     if value is None:
-        raise ValueError(f"{key} is missing: give a number from {low:g} to {high:g}")
+        raise ValueError(f"{key} is missing; give a number from {low:g} to {high:g}")
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise ValueError(f"{key} is {value!r}: give a number from {low:g} to {high:g}")
+        raise ValueError(f"{key}: expected a number from {low:g} to {high:g}, got {value!r}")
     return float(value)
 
 
 class FaultPlan:
-    """Faults to come and faults that last. Draws of what is lost come from the generator given."""
+    """Planned faults and lasting faults. The given generator draws what is lost."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
-        self._coming: list[Fault] = []
-        self._lasting: list[Fault] = []
+        self._coming: list[InjectedFault] = []
+        self._lasting: list[InjectedFault] = []
 
-    def add(self, fault: Fault) -> None:
+    def add(self, fault: InjectedFault) -> None:
         """Plan a fault."""
         self._coming.append(fault)
 
-    def begin(self, now: float) -> list[Fault]:
-        """The faults whose time has come since the last call, in the order of their time; those
-        over are forgotten."""
+    def begin(self, now: float) -> list[InjectedFault]:
+        """Return the faults that have begun since the last call, in the order of their time;
+        finished ones are forgotten."""
         begun = sorted((f for f in self._coming if f.start <= now), key=lambda f: f.start)
         if begun:
             self._coming = [f for f in self._coming if f.start > now]
@@ -134,19 +138,19 @@ class FaultPlan:
         return not (self._coming or self._lasting)
 
     def active(self, kind: str) -> bool:
-        """Whether a lasting fault of this kind goes on."""
+        """Return whether a lasting fault of this kind is active."""
         return any(fault.kind == kind for fault in self._lasting)
 
     def image_lost(self) -> bool:
-        """Whether the image taken now is lost."""
+        """Return whether the image taken now is lost."""
         return bool(self._lasting) and (self.active("dead_camera") or self._lost("drop_images"))
 
     def frame_lost(self) -> bool:
-        """Whether the frame sent now is lost."""
+        """Return whether the frame sent now is lost."""
         return bool(self._lasting) and (self.active("bus_off") or self._lost("can_errors"))
 
     def passed(self, frames: Sequence[Frame]) -> Sequence[Frame]:
-        """The frames sent now that are not lost."""
+        """Return the frames sent now that are not lost."""
         return [frame for frame in frames if not self.frame_lost()] if self._lasting else frames
 
     def _lost(self, kind: str) -> bool:

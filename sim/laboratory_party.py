@@ -1,8 +1,8 @@
-"""What every simulated laboratory has in common: a party with a bus, a camera and services, that
-lock step and real time drive.
+"""Common part of all simulated laboratories: a party with a bus, a camera and services, driven by
+lock step or by real time.
 
-A subclass is a world: it moves on by `tick`, takes and gives frames, exposes images, answers its
-services. Nothing here knows wall-clock time.
+A subclass is a world: it advances by `tick`, receives and sends frames, exposes images, and answers
+its services. Nothing here uses wall-clock time.
 """
 
 from __future__ import annotations
@@ -28,26 +28,27 @@ PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "l
 
 
 def answer_command(now: float, callee: Callee, order: Order) -> None:
-    """Answer an operator's command: a laboratory is up, and has no device that could be held or
-    stopped."""
+    """Answer an operator's command: a laboratory is running, and has no device that could be held
+    or stopped."""
     if isinstance(order, Commanded):
         callee.answer(now, order.command.id, True, {"answers": {}, "devices": {}, "emergency": []})
 
 
 class LaboratoryParty(ABC):
-    """The party of a simulated node. `where` gives the party of an endpoint (`Directory.party`)."""
+    """The party of a simulated node. `where` returns the party of an endpoint
+    (`Directory.party`)."""
 
     services: ClassVar[Sequence[str]] = SERVICES
-    """What it answers."""
+    """Services that it answers."""
     between_ticks: ClassVar[str] = PREPARE
     """The service that may take longer than a tick: in real time the world waits for it, not the
     callers."""
 
     def __init__(self, name: str, where: Callable[[str], str], boot: str, directory: str) -> None:
-        """`boot`, `directory`: as in services.comm.callee."""
+        """`boot`, `directory`: as in services.comm.calls.callee."""
         self.name = name
         self.now = 0.0
-        """How far the world has gone (s)."""
+        """Time of the world (s)."""
         offers = {
             service: Offer(inline=lambda _, call: self.answer(call)) for service in self.services
         }
@@ -62,33 +63,33 @@ class LaboratoryParty(ABC):
 
     @abstractmethod
     def tick(self, now: float) -> None:
-        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
 
     @abstractmethod
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """Frames of the master's."""
+        """Process frames of the master."""
 
     @abstractmethod
     def take_frames(self) -> Sequence[Frame]:
-        """Frames of the simulated devices since the last call."""
+        """Return the frames of the simulated devices since the last call."""
 
     @abstractmethod
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `services`. Raises ValueError for arguments that cannot be."""
+        """Answer one of `services`. Raises ValueError for bad arguments."""
 
     @abstractmethod
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Do beforehand, in any thread, what a preparation with these arguments would take long
-        for. Raises ValueError."""
+        """Do in advance, in any thread, what takes long in a preparation with these arguments.
+        Raises ValueError."""
 
     @abstractmethod
     def close(self) -> None:
-        """Let go what the world holds."""
+        """Release what the world holds."""
 
     # The party
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Frames, wishes for images, and calls."""
+        """Process frames, requests for images, and calls."""
         if envelope.channel == "can":
             self.receive_frames(now, envelope.source, read_can(envelope.body))
         elif envelope.channel == "control":
@@ -100,7 +101,7 @@ class LaboratoryParty(ABC):
             self.callee.receive(now, self._where(envelope.source), envelope.body)
 
     def advance(self, now: float) -> None:
-        """One tick, then what leaves."""
+        """Run one tick, then send."""
         self.tick(now)
         self._send_frames()
         self._send_images(now)
@@ -111,12 +112,12 @@ class LaboratoryParty(ABC):
             self._out.append(Envelope(peer, self.name, peer, "call", message))
 
     def drain(self) -> Sequence[Envelope]:
-        """What was sent since the last call, in order."""
+        """Return what was sent since the last call, in order."""
         out, self._out = self._out, []
         return out
 
     def receive_frames(self, now: float, port: str, frames: Sequence[Frame]) -> None:
-        """Frames of the endpoint `port`, which from now on gets the bus's."""
+        """Process frames of the endpoint `port`, which receives the bus's frames from now on."""
         if port not in self._bus_ports:
             self._bus_ports.append(port)
         self.take_on_bus(now, frames)
@@ -140,8 +141,8 @@ class LaboratoryParty(ABC):
                 )
 
     def _send_images(self, now: float) -> None:
-        """An image arrives a tick after it is sent: it is sent a tick early, with the age that it
-        has on arrival."""
+        """Send images a tick early, with the age that they have on arrival: an image arrives one
+        tick after it is sent."""
         arrival = now + TICK
         for image in self.exposures.take(arrival):
             body = image_body(image.pixels, arrival - image.time, image.sequence, image.generation)
@@ -150,13 +151,14 @@ class LaboratoryParty(ABC):
 
 
 def whole_number(arguments: Mapping[str, Any], key: str, default: int | None) -> int | None:
-    """A whole number, 0 or more, among the arguments of a call. Raises ValueError."""
+    """Return a whole number, 0 or more, from the arguments of a call. Raises ValueError."""
     value = arguments.get(key, default)
     if value is None and default is None:
         return None
     if type(value) is not int or value < 0:
         raise ValueError(
-            f"{key} is {value!r}: give a whole number, 0 or more"
-            + (", or leave it out" if default is None else "")
+            f"{key}: expected a whole number of 0 or more"
+            + (" or none" if default is None else "")
+            + f", got {value!r}"
         )
     return value

@@ -1,14 +1,13 @@
-"""The laboratory on the wall clock: bus, camera and calls over sockets, the world paced by absolute
-deadlines.
+"""The laboratory on the wall clock: bus, camera and calls over sockets; the world is paced by
+absolute deadlines.
 
-A thread paces the world: it waits in the bus's sockets until the next deadline, answers frames as
-they come, and at each deadline moves the world on to it, so the world is never ahead of the clock.
-Calls are served by an asyncio loop in the main thread; both hold one lock while they touch the
-laboratory.
+A thread paces the world: it waits in the bus's sockets until the next deadline and answers frames
+as they arrive. At each deadline it advances the world, so the world is never ahead of the clock. An
+asyncio loop in the main thread serves calls; both hold one lock while they touch the laboratory.
 
-Catch-up: a tick that begins late is followed at once by the next ones until the world has caught
-up. A world more than `SLIP` behind (a stopped process, a machine out of breath) does not run after
-the clock: its time slips, and `slipped` says by how much in all.
+Catch-up: a late tick is followed at once by the next ones until the world has caught up. A world
+more than `SLIP` behind (a stopped process, an overloaded machine) does not chase the clock: its
+time slips, and `slipped` adds up by how much.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.laboratory_party import LaboratoryParty, answer_command
 
 SLIP: Final = 0.1
-"""s behind the clock from which on the world's time slips."""
+"""s behind the clock from which the world's time slips."""
 
 
 PRIORITY = 5
-"""Of the pacemaker's thread under SCHED_FIFO; below that of the drivers' processes."""
+"""Priority of the pacemaker's thread under SCHED_FIFO; below that of the driver processes."""
 
 
 class Pacemaker:
-    """Moves a laboratory along with the clock and carries frames and images. `run` until `stop`, in
+    """Advances a laboratory with the clock and transports frames and images. `run` until `stop`, in
     a thread of its own."""
 
     def __init__(
@@ -56,7 +55,7 @@ class Pacemaker:
         """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none."""
         self.lock = threading.Lock()
         self.slipped = 0.0
-        """s by which the world has fallen behind the clock for good."""
+        """s by which the world has permanently fallen behind the clock."""
         self._laboratory = laboratory
         self._hub = hub
         self._port = hub.port() if hub else None
@@ -69,12 +68,12 @@ class Pacemaker:
         self._begin = 0.0
 
     def stop(self) -> None:
-        """Let `run` end."""
+        """End `run`."""
         self._stopped.set()
 
     def run(self) -> None:
-        """Go on until stopped. Ahead of other processes where that is permitted: drives and world
-        do not wait for anybody."""
+        """Run until stopped, with real-time priority where that is permitted: drives and world must
+        not wait for other processes."""
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         self._begin = time.monotonic() - self._laboratory.now
@@ -91,8 +90,8 @@ class Pacemaker:
             self._do_jobs()
 
     def submit(self, job: Callable[[], Outcome]) -> Future[Outcome]:
-        """Have something done between two ticks, in the pacemaker's own thread: in another it could
-        keep the world waiting."""
+        """Run a job between two ticks, in the pacemaker's own thread: in another thread it could
+        make the world wait."""
         done: Future[Outcome] = Future()
         self._jobs.put((job, done))
         return done
@@ -107,7 +106,7 @@ class Pacemaker:
                 done.set_exception(fault)
 
     def _wait(self, deadline: float) -> None:
-        """Until the deadline, answering what comes from the bus."""
+        """Wait until the deadline, answering frames from the bus."""
         while True:
             left = deadline - time.monotonic()
             if self._hub is None or self._port is None:
@@ -143,12 +142,12 @@ class Pacemaker:
 
 
 class LaboratoryShell:
-    """A running laboratory of one simulated node of services.toml. Between `start` and `close` it
-    serves."""
+    """A running laboratory of one simulated node of services.toml. It serves between `start` and
+    `close`."""
 
     def __init__(self, directory: Directory, name: str) -> None:
-        """Raises LaboratoryError, ImportError for a `sim` that is not there, ValueError for an
-        address that cannot be."""
+        """Raises LaboratoryError, ImportError for a `sim` that does not exist, ValueError for an
+        impossible address."""
         self._directory = directory
         self._name = name
         self.laboratory = _made(directory, name)
@@ -174,16 +173,17 @@ class LaboratoryShell:
         self._thread = threading.Thread(target=self._pace, name="pacemaker", daemon=True)
         self._loop: asyncio.AbstractEventLoop | None = None
         self.over = asyncio.Event()
-        """Set when the pacemaker has ended by a fault; `close` raises that."""
+        """Set when a fault has ended the pacemaker; `close` raises that fault."""
         self._fault: BaseException | None = None
 
     async def start(self) -> None:
-        """Make all ready that takes long, start the world's clock, then listen. Raises
+        """Do all preparations that take long, start the world's clock, then listen. Raises
         DirectoryError, KeyNeededError."""
         if self._images is not None:
             self.laboratory.make_ready({})
         gc.collect()
-        gc.freeze()  # what is here stays: the collector need not look at it in mid-tick
+        # These objects stay, so the garbage collector need not scan them during a tick.
+        gc.freeze()
         self._loop = asyncio.get_running_loop()
         self._thread.start()
         try:
@@ -194,7 +194,7 @@ class LaboratoryShell:
             raise
 
     async def close(self) -> None:
-        """End in good order. Raises what ended the pacemaker."""
+        """Shut down in order. Raises what ended the pacemaker."""
         self.pacemaker.stop()
         await asyncio.to_thread(self._thread.join)
         await asyncio.gather(*self._preparing)
@@ -220,7 +220,8 @@ class LaboratoryShell:
             return self.laboratory.answer(call)
 
     def _obey(self, now: float, orders: list[Order]) -> None:
-        """Preparations alone are runs; they cannot be stopped, only waited for."""
+        """Start preparations, the only calls that are runs; they cannot be stopped, only
+        awaited."""
         for order in orders:
             answer_command(now, self.server.callee, order)
             if isinstance(order, StartRun):
@@ -229,9 +230,9 @@ class LaboratoryShell:
                 task.add_done_callback(self._preparing.discard)
 
     async def _prepare(self, call: Call) -> None:
-        """What takes long comes first (a camera that hangs elsewhere needs seconds to draw its
-        still scene): not in the loop, not in a tick."""
-        with contextlib.suppress(ValueError):  # the answer says what is wrong with the arguments
+        """Do first, outside the loop and outside a tick, what takes long: the static scene of a
+        camera in another pose takes seconds to draw."""
+        with contextlib.suppress(ValueError):  # The answer says what is wrong with the arguments.
             await asyncio.to_thread(self.laboratory.make_ready, call.arguments)
         outcome = await asyncio.wrap_future(
             self.pacemaker.submit(lambda: self.laboratory.answer(call))
@@ -249,7 +250,7 @@ class LaboratoryShell:
 
 
 def _made(directory: Directory, name: str) -> LaboratoryParty:
-    """The laboratory that the node's `sim` makes. Raises LaboratoryError for one that is no
+    """Return the laboratory that the node's `sim` makes. Raises LaboratoryError if it is not a
     `LaboratoryParty`."""
     made = resolve(directory.nodes[name].sim)(directory, name)
     if not isinstance(made, LaboratoryParty):
@@ -263,19 +264,19 @@ def _made(directory: Directory, name: str) -> LaboratoryParty:
 
 @contextlib.contextmanager
 def _had(what: str) -> Iterator[None]:
-    """Raises LaboratoryError in place of OSError: whoever reads it knows no errno."""
+    """Raise LaboratoryError instead of OSError, with a message for the operator."""
     try:
         yield
     except OSError as fault:
         why = os.strerror(fault.errno) if fault.errno else str(fault)
         raise LaboratoryError(
-            f"{what}: {why}; end the process that listens there, or give another port"
+            f"{what}: {why}; end the process that listens there, or use another port"
         ) from fault
 
 
 def bus_channel(directory: Directory) -> str:
-    """Channel of the simulated bus: that of the device that speaks `petrobot_stream`; empty without
-    one."""
+    """Return the channel of the simulated bus: that of the device that uses `petrobot_stream`;
+    empty without one."""
     channels = set()
     for device in directory.devices.values():
         can = device.config.get("can") or device.config
@@ -290,8 +291,8 @@ def bus_channel(directory: Directory) -> str:
 
 
 def camera_address(directory: Directory) -> tuple[str, int] | None:
-    """Where the simulated camera listens: the `address` of the device with `source = "sim"`; None
-    without one."""
+    """Return where the simulated camera listens: the `address` of the device with `source = "sim"`;
+    None without one."""
     addresses = {
         str(d.config.get("address", ""))
         for d in directory.devices.values()
@@ -312,10 +313,10 @@ def camera_address(directory: Directory) -> tuple[str, int] | None:
 
 
 async def serve(directory: Directory, name: str) -> None:
-    """Run the laboratory until SIGTERM or SIGINT; prints one line with `ready` when it serves."""
+    """Run the laboratory until SIGTERM or SIGINT; print one line with `ready` when it serves."""
     refuse_unusable(
         directory, name
-    )  # a second laboratory is told of its node's address, not of its bus's
+    )  # A second laboratory should be reported at its node's address, not at that of its bus.
     shell = LaboratoryShell(directory, name)
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):

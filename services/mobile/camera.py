@@ -1,4 +1,4 @@
-"""The driver of the camera that looks at the floor ahead: starts and stops images, hands them to
+"""Driver of the camera that looks at the floor ahead: starts and stops images and passes them to
 actions."""
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from petrobot.services.mobile.model import NOMINAL, nominal_rover, read_rover
 from petrobot.services.mobile.watching import FloorWatch
 
 
-class CameraError(ValueError):
-    """The camera's config or its images cannot be used; the text says what to change."""
+class FloorCameraError(ValueError):
+    """The camera's configuration or its images cannot be used; the message says what to change."""
 
 
 class FloorCamera:
-    """A device without cyclic duty. Its keys in services.toml, all optional but those of its
+    """A device without cyclic work. Its keys in services.toml, all optional except those of its
     source:
 
     `rover`: file of numbers beside services.toml (default: the shipped one); `rate`: images/s
-    (default: the file's); `threads`: for OpenCV (default 1: cores are shared with other nodes).
+    (default: the file's); `threads`: for OpenCV (default 1: other nodes share the cores).
     """
 
     period: float | None = None
@@ -37,9 +37,9 @@ class FloorCamera:
         self.floor = FloorWatch.of(rover)
         self.usual_rate = float(config.get("rate", rover.camera.rate))
         if not 0.0 < self.usual_rate <= 1000.0:
-            raise CameraError(
-                f"camera: rate = {self.usual_rate} images/s; give one between 0 and 1000, "
-                "such as 25"
+            raise FloorCameraError(
+                "camera: rate: expected images/s above 0 and at most 1000, such as 25, got "
+                f"{self.usual_rate}"
             )
         self._rate = 0.0
         self._count = 0
@@ -49,11 +49,11 @@ class FloorCamera:
 
     @property
     def rate(self) -> float:
-        """Images/s asked for now, 0 when none."""
+        """Images/s requested now, 0 when none."""
         return self._rate
 
     def start(self) -> None:
-        """Have images taken. Raises ConnectionError when the source cannot be opened."""
+        """Request images. Raises ConnectionError when the source cannot be opened."""
         if not self._rate:
             self._newest = None
             self._images.start(self.usual_rate)
@@ -66,8 +66,8 @@ class FloorCamera:
         self._rate, self._newest = 0.0, None
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
-        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError
-        for one of another size."""
+        """Return the newest image that was not read yet, None when none arrives for `timeout` s.
+        Raises FloorCameraError for an image of another size."""
         await ctx.wait(self._arrived, timeout)
         image, self._newest = self._newest, None
         if image is None:
@@ -75,7 +75,7 @@ class FloorCamera:
         view = self.floor.view
         if image.pixels.shape != (view.height, view.width):
             high, wide = image.pixels.shape
-            raise CameraError(
+            raise FloorCameraError(
                 f"the camera gives {wide}x{high} images, its numbers say "
                 f"{view.width}x{view.height}: "
                 f"change [camera] of {NOMINAL} or the camera's settings"
@@ -92,14 +92,14 @@ class FloorCamera:
     # For the node
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Cyclic drivers take commands; this one's actions use its methods."""
+        """Refuse: actions call the methods above instead."""
         raise ValueError("the camera takes no commands; its actions read images")
 
     def step(self, now: float) -> None:
-        """Nothing is due between images."""
+        """Do nothing: nothing is due between images."""
 
     def state(self) -> Mapping[str, Any]:
-        """Plain data for operator and report."""
+        """Return plain data for operator and report."""
         return {"rate": self._rate, "images": self._count}
 
     def stop(self, now: float) -> None:
@@ -107,17 +107,17 @@ class FloorCamera:
         self.end()
 
     def stopped(self) -> bool:
-        """Whether no images are taken; a camera never moves."""
+        """Return whether no images are taken; a camera never moves."""
         return self._rate == 0.0
 
     def hold(self, now: float) -> str:
-        """The floor waits: images may go on being taken, the rover holds by itself."""
+        """Accept a pause: images may continue, since the rover itself stops."""
         return "held"
 
     def release(self, now: float) -> None:
-        """Nothing was held."""
+        """Do nothing: nothing was held."""
 
     def close(self) -> None:
-        """Let the source go."""
+        """Stop the images and close the source."""
         self.end()
         self._images.close()

@@ -1,61 +1,172 @@
-"""Finding the track in an image, four ways of different cost and reliability.
+"""Finding the track in an image, in four ways of different cost and reliability.
 
-All look at scan rows of the floor (see `ScanGrid`) and give the centre line as points of the body
-frame. `expected` is the line of the image before, if there was one: then only what goes on with it
+All look at scan rows of the floor (see `ScanGrid`) and return the centre line as points of the body
+frame. `expected` is the line of the image before, if there was one: then only what continues it
 counts.
+
+First come candidates: spots in scan rows that look like the track. They ignore polarity, since the
+track's colour changes from square to square. A candidate is a pair of opposite edges a track's
+width apart, or a ridge, bright or dark, of that width. A single edge, of a square or a shadow, is
+neither.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.services.mobile.candidates import (
-    Candidates,
-    contrast_threshold,
-    edge_pairs,
-    ridge_strength,
-    ridges,
-)
 from petrobot.services.mobile.floor import Grey, ScanGrid
-from petrobot.services.mobile.sight import UNSEEN, Line, Sight, Vector, polynomial
+from petrobot.services.mobile.sight import UNSEEN, Parabola, Sight, Vector, polynomial
+
+# --- Candidates in one scan row ------------------------------------------------------------------
+
+LEAST_CONTRAST = 14.0
+"""Grey levels that noise alone does not reach."""
+CONTRAST_SHARE = 0.22
+"""Share of an image's range of grey that an edge must have."""
+NARROWEST, WIDEST = 0.6, 2.1
+"""Least and greatest distance between the edges of a pair, in track widths: a track crossed at an
+angle is wider."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Spots by row: `row` ascending, `y` (m), `strength` (grey levels), all (n,)."""
+
+    row: NDArray[np.intp]
+    y: Vector
+    strength: Vector
+
+
+def contrast_threshold(samples: Grey) -> float:
+    """Return the grey levels from which a difference counts in this image."""
+    some = samples[::3, ::5]
+    return max(LEAST_CONTRAST, CONTRAST_SHARE * float(some.max() - some.min()))
+
+
+def edge_pairs(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
+    """Return the middles of pairs of opposite edges about `width` (m) apart."""
+    gradient = (
+        samples[:, 4:] - samples[:, :-4]
+    )  # The rise over 25 mm (4 samples): edges are blurred by optics and motion.
+    size = np.abs(gradient)
+    size[~(grid.seen[:, 4:] & grid.seen[:, :-4])] = 0.0
+    middle = size[:, 1:-1]
+    peak = (
+        (middle > contrast_threshold(samples)) & (middle >= size[:, :-2]) & (middle > size[:, 2:])
+    )
+    row, column = np.nonzero(peak)
+    if row.size < 2:
+        return Candidates(row[:0], np.empty(0), np.empty(0))
+    before, at, after = size[row, column], size[row, column + 1], size[row, column + 2]
+    # The vertex of the parabola through three samples gives the edge to a fraction of a step.
+    shift = 0.5 * (before - after) / np.minimum(before - 2.0 * at + after, -1e-6)
+    place = grid.y[column + 3] + shift * grid.step
+    sign = gradient[row, column + 1] > 0.0
+    pairs = [_paired(row, place, sign, at, gap, width) for gap in (1, 2)]
+    rows = np.concatenate([p[0] for p in pairs])
+    order = np.argsort(rows, kind="stable")
+    y, strength = (np.concatenate([p[i] for p in pairs])[order] for i in (1, 2))
+    return Candidates(rows[order], y, strength)
+
+
+def _paired(
+    row: NDArray[np.intp],
+    place: Vector,
+    sign: NDArray[np.bool_],
+    size: Grey,
+    gap: int,
+    width: float,
+) -> tuple[NDArray[np.intp], Vector, Vector]:
+    """Return the edges that are `gap` apart in the list and may be the two sides of a track."""
+    apart = place[gap:] - place[:-gap]
+    fits = (row[gap:] == row[:-gap]) & (sign[gap:] != sign[:-gap])
+    fits &= (apart > NARROWEST * width) & (apart < WIDEST * width)
+    index = np.nonzero(fits)[0]
+    strength = np.minimum(size[index], size[index + gap]).astype(float)
+    return row[index], 0.5 * (place[index] + place[index + gap]), strength
+
+
+def ridge_strength(grid: ScanGrid, samples: Grey, width: float) -> Grey:
+    """Return by how much (grey levels) each spot differs from both its sides: the lesser of the two
+    differences, 0 where their signs are opposite.
+
+    This is the absolute second difference of a row, made blind to steps: at a step one of the two
+    differences vanishes.
+    """
+    side = round(width / grid.step)
+    core = max(1, round(0.3 * width / grid.step))
+    sums = np.cumsum(np.pad(samples, ((0, 0), (core + 1, core)), mode="edge"), axis=1)
+    mean = (sums[:, 2 * core + 1 :] - sums[:, : -2 * core - 1]) * np.float32(1.0 / (2 * core + 1))
+    left = mean[:, side:-side] - mean[:, : -2 * side]
+    right = mean[:, side:-side] - mean[:, 2 * side :]
+    strength = np.zeros_like(samples)
+    lesser = np.minimum(np.abs(left), np.abs(right))
+    strength[:, side:-side] = np.where(left * right > 0.0, lesser, np.float32(0.0))
+    strength[~grid.seen] = 0.0
+    return strength
+
+
+def ridges(grid: ScanGrid, samples: Grey, width: float) -> Candidates:
+    """Return the middles of ridges of about `width` (m): peaks of `ridge_strength`, each at its
+    centre of gravity."""
+    strength = ridge_strength(grid, samples, width)
+    reach = max(1, round(0.5 * width / grid.step))
+    middle = strength[:, reach:-reach]
+    peak = middle > contrast_threshold(samples)
+    for shift in range(1, reach + 1):
+        end = strength.shape[1] - reach
+        peak &= (middle >= strength[:, reach - shift : end - shift]) & (
+            middle > strength[:, reach + shift :][:, : middle.shape[1]]
+        )
+    row, column = np.nonzero(peak)
+    around = strength[row[:, None], column[:, None] + np.arange(2 * reach + 1)[None, :]]
+    offsets = (np.arange(2 * reach + 1) - reach) * grid.step
+    y = grid.y[column + reach] + (around @ offsets) / np.maximum(around.sum(axis=1), 1e-6)
+    return Candidates(row, y.astype(float), strength[row, column + reach].astype(float))
+
+
+# --- From candidates to the line -----------------------------------------------------------------
 
 GATE = 0.07
-"""m that the line may be off the one expected."""
+"""m that the line may be off the expected one."""
 STEP_GATE = 0.016
-"""m that a point may be off the line drawn through those before it, and STEP_SLOPE m more for each
-metre onwards."""
+"""m that a point may be off the line through the points before it, plus `STEP_SLOPE` m per metre of
+distance."""
 STEP_SLOPE = 0.55
 GAP = 0.13
-"""m without a sight after which a line counts as broken off: square edges and glare hide less."""
+"""m without a sight after which a line counts as broken off; square edges and glare hide less."""
 STEEPEST = 1.6
-"""Slope against straight ahead beyond which rows cut the line too slantingly."""
+"""Slope against straight ahead beyond which rows cut the line too obliquely."""
 FIRST_SLOPE = 0.9
-"""Steepest slope that a line that was not expected may begin with."""
+"""Steepest slope with which a line that was not expected may begin."""
 SURELY = 0.45
-"""m of line from an expected beginning after which no other is tried."""
+"""m of line from an expected beginning after which no other beginning is tried."""
 SHORTEST = 0.16
-"""m of line that count as one."""
+"""m that a line must be long."""
 
 
-class Detector(Protocol):
-    """Gives the line in samples of an image (rows, columns) of a grid."""
+class TrackDetector(Protocol):
+    """Finds the line in samples of an image (rows, columns) of a grid."""
 
-    def __call__(self, grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
-        """Find the line; `UNSEEN` if there is none."""
+    def __call__(
+        self, grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None
+    ) -> Sight:
+        """Return the line; `UNSEEN` if there is none."""
 
 
-def detect_edges(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
-    """Pairs of opposite edges, chained from near to far: the cheapest and most accurate on clean
-    paint."""
+def detect_edges(grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None) -> Sight:
+    """Chain pairs of opposite edges from near to far: the cheapest way, and the most accurate on
+    clean paint."""
     return chain(grid, edge_pairs(grid, samples, width), expected)
 
 
-def detect_ridge(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
-    """Ridges of the absolute second difference, chained from near to far: averages noise over the
+def detect_ridge(grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None) -> Sight:
+    """Chain ridges of the absolute second difference from near to far: averages noise over the
     track's width."""
     return chain(grid, ridges(grid, samples, width), expected)
 
@@ -69,12 +180,11 @@ class _Chain:
         self.x, self.y, self.slope, self.strength = [x], [y], slope, strength
 
     def ahead(self, x: float) -> float:
-        """Where it should be at a distance x (m)."""
+        """Return where the line should be at a distance x (m)."""
         return self.y[-1] + self.slope * (x - self.x[-1])
 
     def add(self, x: float, y: float) -> None:
-        """Take a point; the slope follows the points of the last tenth of a metre and turns on with
-        them."""
+        """Append a point; the slope follows the points of the last tenth of a metre."""
         self.x.append(x)
         self.y.append(y)
         back = len(self.x) - 1
@@ -85,13 +195,13 @@ class _Chain:
 
     @property
     def length(self) -> float:
-        """How far it reaches (m along x)."""
+        """Length along x (m)."""
         return self.x[-1] - self.x[0]
 
 
-def chain(grid: ScanGrid, candidates: Candidates, expected: Line | None) -> Sight:
-    """The best line through candidates: each row's nearest to where the line should be, from the
-    nearest rows on."""
+def chain(grid: ScanGrid, candidates: Candidates, expected: Parabola | None) -> Sight:
+    """Return the best line through candidates: in each row the candidate nearest to where the line
+    should be, starting from the nearest rows."""
     rows = _by_row(grid, candidates)
     begun = _seeds(grid, rows, expected)
     best: _Chain | None = None
@@ -112,9 +222,9 @@ def _by_row(grid: ScanGrid, candidates: Candidates) -> list[list[float]]:
 
 
 def _seeds(
-    grid: ScanGrid, rows: list[list[float]], expected: Line | None
+    grid: ScanGrid, rows: list[list[float]], expected: Parabola | None
 ) -> list[tuple[_Chain, int]]:
-    """Beginnings of lines with the row after which each goes on."""
+    """Return beginnings of lines, each with the row after which it continues."""
     seeds: list[tuple[_Chain, int]] = []
     x = grid.rows
     if expected is not None:
@@ -140,7 +250,7 @@ def _seeds(
 def _pairs_on(
     x: tuple[float, ...], rows: list[list[float]], i: int, y: float
 ) -> list[tuple[_Chain, int]]:
-    """Lines from a place to each place of the next rows that is not too far aside."""
+    """Return lines from a spot to each spot of the next rows that is not too far to the side."""
     for j in range(i + 1, min(i + 4, len(x))):
         slopes = [(other - y) / (x[j] - x[i]) for other in rows[j]]
         fit = sorted((s for s in slopes if abs(s) < FIRST_SLOPE), key=abs)[:2]
@@ -163,7 +273,7 @@ def _grow(line: _Chain, first: int, x: tuple[float, ...], rows: list[list[float]
 
 
 def _worth(line: _Chain) -> float:
-    """Long lines first, near ones before far ones, those ahead before those aside."""
+    """Prefer long lines, then near ones, then those straight ahead."""
     return len(line.x) - 12.0 * line.x[0] - 8.0 * abs(line.y[0])
 
 
@@ -175,7 +285,7 @@ def _sight(grid: ScanGrid, line: _Chain) -> Sight:
 
 
 def _broke_off(grid: ScanGrid, line: _Chain) -> bool:
-    """Whether the rows beyond the last point should show the line, and do not."""
+    """Return whether the rows beyond the last point should show the line and do not."""
     if abs(line.slope) > STEEPEST * 0.75:
         return False
     end = line.x[-1] + GAP
@@ -187,25 +297,25 @@ def _broke_off(grid: ScanGrid, line: _Chain) -> bool:
     return 0 < column < grid.y.size and bool(grid.seen[min(row, grid.x.size - 1), column])
 
 
-# --- whole-line fits --------------------------------------------------------------------------
+# --- Whole-line fits ------------------------------------------------------------------------------
 
 WINDOW = 0.55
 """m of line to which a parabola is fitted as a whole."""
 INLIER = 0.018
 """m off the parabola within which a candidate belongs to it."""
 DRAWS = 60
-"""Triples that are tried."""
+"""Triples of points that are tried."""
 
 
-def consensus(random: Callable[[], np.random.Generator]) -> Detector:
-    """A detector that fits a parabola to edge pairs by random sample consensus (Fischler and Bolles
-    1981).
+def consensus(random: Callable[[], np.random.Generator]) -> TrackDetector:
+    """Return a detector that fits a parabola to edge pairs by random sample consensus (RANSAC,
+    Fischler and Bolles 1981).
 
-    It finds the line among many false pairs, where a chain may take a wrong one; `random` gives the
-    generator to draw from.
+    It finds the line among many false pairs, where a chain may follow a wrong one; `random` returns
+    the generator to draw from.
     """
 
-    def detect(grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
+    def detect(grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None) -> Sight:
         found = edge_pairs(grid, samples, width)
         keep = _plausible(grid, found, expected)
         x, y = grid.x[found.row[keep]], found.y[keep]
@@ -222,8 +332,8 @@ def consensus(random: Callable[[], np.random.Generator]) -> Detector:
     return detect
 
 
-def _plausible(grid: ScanGrid, found: Candidates, expected: Line | None) -> NDArray[np.bool_]:
-    """Candidates within the window, and near the expected line if there is one."""
+def _plausible(grid: ScanGrid, found: Candidates, expected: Parabola | None) -> NDArray[np.bool_]:
+    """Return which candidates lie within the window, and near the expected line if there is one."""
     x = grid.x[found.row]
     keep: NDArray[np.bool_] = x <= (x.min() + WINDOW if x.size else 0.0)
     if expected is not None:
@@ -236,8 +346,8 @@ def _plausible(grid: ScanGrid, found: Candidates, expected: Line | None) -> NDAr
 
 
 def _through(x: Vector, y: Vector, picks: NDArray[np.int64]) -> Vector:
-    """Parabolas [c0, c1, c2] through triples of points that are apart, not too steep and not too
-    bent (k, 3)."""
+    """Return parabolas [c0, c1, c2] through triples of points that are apart, not too steep and not
+    too bent (k, 3)."""
     px, py = x[picks], y[picks]
     apart = np.minimum(
         np.minimum(np.abs(px[:, 0] - px[:, 1]), np.abs(px[:, 1] - px[:, 2])),
@@ -256,15 +366,15 @@ def _through(x: Vector, y: Vector, picks: NDArray[np.int64]) -> Vector:
 
 
 def chain_about(grid: ScanGrid, found: Candidates, curve: Vector) -> Sight:
-    """The line that goes on from a parabola's inliers: they seed a chain, so that it is followed
-    beyond the window."""
+    """Return the line that continues from a parabola's inliers: they seed a chain, so that the line
+    is followed beyond the window."""
     x = grid.x[found.row]
     inlier = np.abs(curve[0] + curve[1] * x + curve[2] * x * x - found.y) < INLIER
     if int(inlier.sum()) < 5:
         return UNSEEN
     near = float(x[inlier].min())
     slope, bend = float(curve[1] + 2.0 * curve[2] * near), float(2.0 * curve[2])
-    line = Line(
+    line = Parabola(
         near, near + WINDOW, float(curve[0] + curve[1] * near + curve[2] * near * near), slope, bend
     )
     return chain(grid, found, line)
@@ -279,15 +389,17 @@ class TemplateBank:
     """A detector that tries whole lines: parabolas on a lattice of offset, slope and bend, scored
     by ridge strength.
 
-    Every row votes, so noise and dim light matter least; it costs most, and bends between the
-    lattice's are refined by a weighted fit around the best one.
+    Every row votes, so noise and dim light matter least; it costs most. Bends between those of the
+    lattice are refined by a weighted fit around the best parabola.
     """
 
     def __init__(self) -> None:
         self._grid: ScanGrid | None = None
 
-    def __call__(self, grid: ScanGrid, samples: Grey, width: float, expected: Line | None) -> Sight:
-        """Find the line."""
+    def __call__(
+        self, grid: ScanGrid, samples: Grey, width: float, expected: Parabola | None
+    ) -> Sight:
+        """Return the line; `UNSEEN` if there is none."""
         if self._grid is not grid:
             self._lay_out(grid)
         strength = ridge_strength(grid, samples, width)
@@ -303,7 +415,7 @@ class TemplateBank:
         return self._refined(grid, strength, best)
 
     def _lay_out(self, grid: ScanGrid) -> None:
-        """Columns of each parabola in each row, for this grid."""
+        """Compute the column of each parabola in each row, for this grid."""
         self._grid, self._rows = grid, int(np.searchsorted(grid.x, grid.x[0] + WINDOW))
         d = grid.x[: self._rows] - grid.x[0]
         offset, slope, bend = (
@@ -317,8 +429,8 @@ class TemplateBank:
         self._at = np.arange(self._rows, dtype=np.intp)[None, :] * grid.y.size + column
 
     def _refined(self, grid: ScanGrid, strength: Grey, best: int) -> Sight:
-        """Centres of gravity around the best parabola, smoothed by a weighted fit, and the line
-        beyond it."""
+        """Return centres of gravity around the best parabola, smoothed by a weighted fit, and the
+        line beyond it."""
         rows = np.arange(self._rows)
         half = round(0.04 / grid.step)
         columns = np.rint((self._lines[best] - grid.y[0]) / grid.step).astype(np.intp)
@@ -334,13 +446,13 @@ class TemplateBank:
         x = grid.x[: self._rows][heavy]
         c = polynomial(x - x[0], y, 2, mass[heavy])
         found = Candidates(rows[heavy], y, mass[heavy])
-        line = Line(float(x[0]), float(x[-1]), c[0], c[1], 2.0 * c[2])
+        line = Parabola(float(x[0]), float(x[-1]), c[0], c[1], 2.0 * c[2])
         beyond = _beyond(grid, strength, self._rows)
         return chain(grid, _joined(found, beyond), line)
 
 
 def _beyond(grid: ScanGrid, strength: Grey, first: int) -> Candidates:
-    """The strongest spot of each row from `first` on."""
+    """Return the strongest spot of each row from `first` on."""
     rest = strength[first:]
     column = rest.argmax(axis=1)
     value = rest[np.arange(rest.shape[0]), column].astype(float)
@@ -349,7 +461,7 @@ def _beyond(grid: ScanGrid, strength: Grey, first: int) -> Candidates:
 
 
 LEAST_RIDGE = 20.0
-"""Grey levels of a ridge beyond the window of the template."""
+"""Grey levels that a ridge must have beyond the window of the template."""
 
 
 def _joined(a: Candidates, b: Candidates) -> Candidates:

@@ -1,9 +1,9 @@
-"""The rover's primitive actions: enable the drives, follow the track, recover it across an
+"""Primitive actions of the rover: enable the drives, follow the track, recover it across an
 interruption, search, stop at the T.
 
-All are coroutines that see the driver only through `ctx.device`, a `Remote` of
-`petrobot.services.mobile.rover:Rover`. Error causes: `drive_fault`, `power`, `bus` (as the driver
-says), `stale_set_point`, `no_line`, `refused`, `timeout`.
+All are coroutines that reach the driver only through `ctx.device`, a `Remote` of
+`petrobot.services.mobile.rover:Rover`. Error causes: `drive_fault`, `power`, `bus` (reported by the
+driver), `stale_set_point`, `no_line`, `refused`, `timeout`.
 """
 
 from __future__ import annotations
@@ -18,41 +18,41 @@ from petrobot.services.mobile.odometry import Pose, turned
 from petrobot.services.mobile.sight import TrackEnd
 
 RENEW: Final = 0.1
-"""s between repeated motion commands: a driver that hears none for 0.4 s rests."""
+"""Seconds between repeated motion commands; the driver rests if it receives none for 0.4 s."""
 ANSWER: Final = 0.5
-"""s within which the driver takes a command."""
+"""Seconds within which the driver must accept a command."""
 TAKE_OVER: Final = 0.34
-"""m before the end of the line at which following has done its part: what comes next begins on the
+"""m before the end of the line at which following is finished: the next action begins on the
 move."""
 BEYOND: Final = 0.6
-"""m that a plan goes on straight where the track should have been found."""
+"""m that a plan continues straight on where the track should have been found."""
 ROLLED: Final = 0.3
 """m that must have been followed for a line to count as one that has ceased."""
 SILENT: Final = 1.0
-"""s of standing without a set point after which the stream counts as ceased."""
+"""Seconds of standing without a set point after which the stream counts as ceased."""
 STUCK: Final = 0.5
-"""s of standing without a line after which it counts as lost."""
+"""Seconds of standing without a line after which the line counts as lost."""
 NEAR_GATE: Final = 0.40
-"""m off where a track can resume within which a reflector is taken to mark it."""
+"""m from where a track can resume within which a reflector is taken to mark it."""
 STALENESS: Final = 0.1
-"""m/s: what a reflector's place is worth less for each second since its last echo."""
+"""m/s by which a reflector's position loses value per second since its last echo."""
 REFLECTOR_PATIENCE: Final = 1.2
-"""s that a reflector is waited for at the line's end."""
+"""Seconds to wait for a reflector at the line's end."""
 LOOKS: Final = ((0.8, (0.0, 1.4, -1.4, 0.7, -0.7)), (0.2, (0.0, 0.8, -0.8)))
-"""Where a search looks around: m beyond the line's end, and headings against it (rad)."""
+"""Where a search looks around: m beyond the line's end, and headings relative to it (rad)."""
 LOOK: Final = 0.35
-"""s of looking after each turn of a search."""
+"""Seconds of looking after each turn of a search."""
 STANDS_FOR: Final = 0.6
-"""s that the rover must have stood at the T: the rules ask for half a second."""
+"""Seconds that the rover must have stood at the T: the rules require half a second."""
 STOP_AT: Final = 0.10
-"""m beyond the T's bar where the axle comes to stand: the middle of what the rules allow."""
+"""m beyond the T's bar where the axle stops: the middle of what the rules allow."""
 
 Judge = Callable[[Mapping[str, Any]], Result | None]
 
 
 async def enable_drives(ctx: Context, *, timeout: float = 8.0, forget: bool = False) -> Result:
-    """Reset faults and enable both drives; the rover stands. ERROR as the driver says if they stay
-    in fault.
+    """Reset faults and enable both drives; the rover stands. ERROR as the driver reports if they
+    stay in fault.
 
     With `forget` the map of the track is emptied: the rover has been carried elsewhere.
     """
@@ -81,7 +81,7 @@ async def follow_feed_forward(
 async def follow_pursuit(
     ctx: Context, *, speed: float = 0.5, timeout: float = 240.0, patience: float = 6.0
 ) -> Result:
-    """Follow the track to its end by pure pursuit of a point of it ahead. See `_follow`."""
+    """Follow the track to its end by pure pursuit of a point ahead on it. See `_follow`."""
     return await _follow(ctx, "pursuit", speed, timeout, patience)
 
 
@@ -93,7 +93,7 @@ async def home_on_reflector(
     timeout: float = 25.0,
 ) -> Result:
     """Recover the track by the reflector above the point where it resumes: drive the circle through
-    it. See `_recover`.
+    that point. See `_recovered`.
 
     FAILURE `no_reflector` when none answers from where the track can resume.
     """
@@ -128,9 +128,9 @@ async def dead_reckon(
     timeout: float = 25.0,
 ) -> Result:
     """Recover the track by driving on along the curve that the missing element is expected to have.
-    See `_recover`.
+    See `_recovered`.
 
-    `curvature` (1/m, to the left positive): 0 expects a straight, 1 or -1 a quarter arc.
+    `curvature` (1/m, positive to the left): 0 expects a straight, 1 or -1 a quarter arc.
     """
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
@@ -153,11 +153,11 @@ async def search_pattern(
     rate: float = 1.2,
     timeout: float = 60.0,
 ) -> Result:
-    """Recover the track by going into the empty square and looking straight on, to the left and to
-    the right.
+    """Recover the track by driving into the empty square and looking straight on, to the left and
+    to the right.
 
     Needs no sensor and no guess, and finds the way back from a wrong guess; takes longest. A rover
-    that stands looks around where it is first: the line may be in view. See `_recover`.
+    that stands looks around where it is first: the line may be in view. See `_recovered`.
     """
     end, gates = _geometry(ctx, line_end)
     drive = _Drive(ctx, "feed_forward", speed, timeout)
@@ -176,8 +176,8 @@ async def search_pattern(
 async def stop_at_t(
     ctx: Context, *, line_end: Sequence[float], speed: float = 0.35, timeout: float = 12.0
 ) -> Result:
-    """Come to stand with the axle just behind the T's bar. SUCCESS when standing within 0.3 m of
-    it; ERROR as the driver says."""
+    """Stop with the axle just behind the T's bar. SUCCESS when the rover stands within 0.3 m of it;
+    ERROR as the driver reports."""
     end = Pose(*map(float, line_end))
     drive = _Drive(ctx, "feed_forward", speed, timeout)
     stuck = await drive.start((), look=False)
@@ -206,12 +206,12 @@ def _stands(state: Mapping[str, Any]) -> bool:
 
 
 async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience: float) -> Result:
-    """Follow the streamed track until its end is near; the rover rolls on for what comes next.
+    """Follow the streamed track until its end is near; the rover keeps rolling for the next action.
 
     SUCCESS: `at_t` says whether the T or an interruption ends it, `line_end` where (pose in the
     odometry frame). FAILURE `unannounced_end` (same values) when the line just ceased. ERROR:
     `no_line` when none was seen within `patience` s, `stale_set_point` when the stream ceased, or
-    as the driver says.
+    as the driver reports.
     """
     drive = _Drive(ctx, law, speed, timeout)
     begun, way = ctx.now, ctx.device.state["way"]
@@ -251,7 +251,7 @@ async def _follow(ctx: Context, law: str, speed: float, timeout: float, patience
 
 
 async def _along(drive: _Drive, plan: paths.Points) -> Result:
-    """Drive along a plan until the track is seen again and near, or the plan is at its end."""
+    """Drive along a plan until the track is seen again and near, or the plan is finished."""
     await _command(drive.ctx, {"do": "plan", "points": plan})
     result = await drive.until(_recovered, drive.left())
     if not result.cause:
@@ -261,7 +261,11 @@ async def _along(drive: _Drive, plan: paths.Points) -> Result:
 
 
 def _recovered(state: Mapping[str, Any]) -> Result | None:
-    """What recovering has come to; None while it goes on."""
+    """Return the result of recovering; None while it is in progress.
+
+    SUCCESS when the driver has regained the track; FAILURE `no_track` when the plan is finished
+    without it. Both set `recovered`.
+    """
     if state["regained"]:
         return success(recovered=True)
     if state["standing"] and (state["ahead"] < 0.08 or state["reason"] == "no_line"):
@@ -274,8 +278,8 @@ def _recovered(state: Mapping[str, Any]) -> Result | None:
 
 
 async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
-    """Go to a place by turning towards it and driving straight; None when there, else how the run
-    ends."""
+    """Go to a point by turning towards it and driving straight; return None on arrival, else the
+    result of the run."""
     ctx = drive.ctx
     x, y, heading = ctx.device.state["pose"]
     away = math.hypot(to.x - x, to.y - y)
@@ -289,7 +293,7 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
         x, y, _ = ctx.device.state["pose"]
         await _command(
             ctx, {"do": "forget"}
-        )  # the way leads off the line: what was seen of it would pull the rover back
+        )  # The path leads off the line: what was seen of the line would pull the rover back.
     await _command(ctx, {"do": "plan", "points": [(x, y), *paths.straight((x, y), (to.x, to.y))]})
 
     def judge(state: Mapping[str, Any]) -> Result | None:
@@ -304,8 +308,8 @@ async def _go(drive: _Drive, to: Pose, rate: float) -> Result | None:
 
 
 async def _turn(drive: _Drive, heading: float, rate: float, *, look: bool = False) -> Result | None:
-    """Turn on the spot to a heading (rad, odometry frame), with `look` until the track is seen;
-    None when done."""
+    """Turn on the spot to a heading (rad, odometry frame), with `look` only until the track is
+    seen; return None when done."""
     ended = await drive.until(
         lambda state: success() if _turned(state) or (look and state["sights"] > 1) else None,
         min(8.0, drive.left()),
@@ -319,7 +323,7 @@ def _turned(state: Mapping[str, Any]) -> bool:
 
 
 async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
-    """Turn to a heading and look; drive to the track if it is there. None when it is not."""
+    """Turn to a heading and look; drive to the track if it is there. Return None when it is not."""
     ctx = drive.ctx
     ended = await _turn(drive, heading, rate, look=True)
     if ended is not None:
@@ -329,8 +333,8 @@ async def _look(drive: _Drive, heading: float, rate: float) -> Result | None:
 
 
 async def _where_it_stands(drive: _Drive) -> Result | None:
-    """Look without a move; drive to the track if it is there. None when it is not, or the rover
-    still rolls."""
+    """Look without moving; drive to the track if it is there. Return None when it is not, or the
+    rover still rolls."""
     ctx = drive.ctx
     if not ctx.device.state["standing"]:
         return None
@@ -339,8 +343,8 @@ async def _where_it_stands(drive: _Drive) -> Result | None:
 
 
 async def _join(drive: _Drive) -> Result | None:
-    """Drive to the track where it was seen to begin; None if it was not seen, or is not there after
-    all."""
+    """Drive to where the track was seen to begin; return None if it was not seen, or is not there
+    after all."""
     state = drive.ctx.device.state
     if not state["sights"]:
         return None
@@ -353,8 +357,7 @@ async def _join(drive: _Drive) -> Result | None:
 
 
 class _Drive:
-    """Repeats the motion command as the driver asks for, and looks at its state whenever there is
-    something new."""
+    """Repeats the motion command as the driver requires, and judges each new state."""
 
     def __init__(self, ctx: Context, law: str, speed: float, timeout: float) -> None:
         self.ctx = ctx
@@ -363,17 +366,17 @@ class _Drive:
         self._stretch: dict[str, Any] = {"do": "stretch"}
 
     def left(self) -> float:
-        """s that the run may still take."""
+        """Return the seconds that the run may still take."""
         return max(0.0, self._until - self.ctx.now)
 
     async def start(self, gates: Sequence[Pose], *, look: bool = True) -> Result | None:
-        """Begin a new stretch that leads through one of the gates; how the run ends if the driver
-        refuses."""
+        """Begin a new stretch that leads through one of the gates; return the result of the run if
+        the driver refuses."""
         self._stretch |= {"gates": [tuple(gate) for gate in gates], "look": look}
         return await self.again()
 
     async def again(self) -> Result | None:
-        """Begin it once more: what was seen of it was something else."""
+        """Begin the stretch once more: what was seen of it was something else."""
         why = await _command(self.ctx, self._stretch)
         return error("refused", why) if why else None
 
@@ -384,8 +387,8 @@ class _Drive:
     async def until(
         self, judge: Judge, timeout: float, body: Mapping[str, Any] | None = None
     ) -> Result:
-        """Go on until `judge(state)` gives a result, the driver is in trouble, or `timeout` s are
-        over."""
+        """Keep moving until `judge(state)` returns a result, the driver reports a fault, or
+        `timeout` s have passed."""
         ctx, wanted = self.ctx, body or self._follow
         until, renewed = ctx.now + timeout, -math.inf
         while ctx.now <= until:
@@ -399,14 +402,17 @@ class _Drive:
             if result is not None:
                 return result
             seen = state["cycles"]
-            await ctx.wait(lambda seen=seen: ctx.device.state["cycles"] != seen, RENEW)  # type: ignore[misc]
+            await ctx.wait(
+                lambda seen=seen: ctx.device.state["cycles"] != seen,  # type: ignore[misc]
+                RENEW,
+            )
         return error("timeout", f"nothing came of it in {timeout:.1f} s")
 
 
 def _geometry(
     ctx: Context, line_end: Sequence[float] | None
 ) -> tuple[Pose, tuple[Pose, Pose, Pose]]:
-    """The line's end (where the rover is, if none was ever known) and where the track can
+    """Return the line's end (where the rover is, if none was ever known) and where the track can
     resume."""
     state = ctx.device.state
     end = Pose(*map(float, state["pose"] if line_end is None else line_end))
@@ -416,8 +422,8 @@ def _geometry(
 def _marked(
     reflectors: Sequence[Sequence[float]], gates: Sequence[Pose]
 ) -> tuple[float, float] | None:
-    """The reflector above one of the places where the track can resume: the one nearest to such a
-    place and heard of late."""
+    """Return the reflector above one of the points where the track can resume: the one nearest to
+    such a point that answered recently."""
     best: tuple[float, float, float] | None = None
     for x, y, _, age in reflectors:
         off = min(math.hypot(x - gate.x, y - gate.y) for gate in gates) + STALENESS * age
@@ -427,7 +433,7 @@ def _marked(
 
 
 def _trouble(state: Mapping[str, Any]) -> Result | None:
-    """The driver's first fault as an action's end."""
+    """Return the driver's first fault as the result of an action."""
     if state["faults"]:
         cause, wheel, code, text = state["faults"][0]
         return error(cause, text, wheel=wheel, code=code)
@@ -435,8 +441,8 @@ def _trouble(state: Mapping[str, Any]) -> Result | None:
 
 
 async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
-    """Send a command and wait until the driver has taken it; gives why it was refused, empty if it
-    was not."""
+    """Send a command and wait until the driver has processed it; return why it was refused, empty
+    if it was not."""
     number = ctx.device.send(body)
     if not await ctx.wait(lambda: ctx.device.handled >= number, ANSWER):
         return "the driver does not answer"

@@ -2,7 +2,7 @@
 lines of the floor.
 
 Body frame: origin on the floor below the middle of the axle, x forward, y to the left (m). The
-camera looks along x and is only pitched, so an image row shows the floor at one distance x, and
+camera looks along x and is only pitched. So an image row shows the floor at one distance x, and
 along a row y is linear in the column: no image has to be warped to see the floor from above.
 """
 
@@ -32,7 +32,7 @@ class FloorView:
         self._cx, self._cy = camera.principal_px
 
     def pixels(self, x: Vector, y: Vector) -> tuple[Vector, Vector]:
-        """Columns and rows (px) of floor points (m) ahead of the camera."""
+        """Return columns and rows (px) of floor points (m) ahead of the camera."""
         ahead = np.asarray(x) - self._forward
         depth = ahead * self._cos + self._above * self._sin
         u = self._cx - self._focal * np.asarray(y) / depth
@@ -40,14 +40,14 @@ class FloorView:
         return u, v
 
     def points(self, u: Vector, v: Vector) -> tuple[Vector, Vector]:
-        """Floor points (m) of pixels below the horizon."""
+        """Return the floor points (m) of pixels below the horizon."""
         t = (np.asarray(v) - self._cy) / self._focal
         ahead = self._above * (self._cos - t * self._sin) / (t * self._cos + self._sin)
         depth = ahead * self._cos + self._above * self._sin
         return ahead + self._forward, -(np.asarray(u) - self._cx) * depth / self._focal
 
     def distances(self) -> Vector:
-        """How far ahead (m) each image row shows the floor; inf at and above the horizon."""
+        """Return how far ahead (m) each image row shows the floor; inf at and above the horizon."""
         rows = np.arange(self.height, dtype=float)
         t = (rows - self._cy) / self._focal
         under = t * self._cos + self._sin > 1e-3
@@ -55,12 +55,13 @@ class FloorView:
         return np.where(under, x, np.inf)
 
     def half_width(self, x: float) -> float:
-        """How far to each side (m) the image shows the floor at a distance `x` (m)."""
+        """Return how far to each side (m) the image shows the floor at a distance `x` (m)."""
         depth = (x - self._forward) * self._cos + self._above * self._sin
         return min(self._cx, self.width - 1 - self._cx) * depth / self._focal
 
     def sample(self, image: NDArray[np.uint8], x: Vector, y: Vector) -> Grey:
-        """Grey levels at floor points, bilinear; NaN out of the image. Of the shape of x and y."""
+        """Return grey levels at floor points, bilinear, in the shape of x and y; NaN outside the
+        image."""
         u, v = self.pixels(x, y)
         inside = (u >= 0.0) & (u <= self.width - 1.001) & (v >= 0.0) & (v <= self.height - 1.001)
         u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
@@ -74,7 +75,7 @@ class FloorView:
 
 @dataclass(frozen=True)
 class ScanGrid:
-    """Where scan rows are sampled: distances `x` (rows,) and sideways places `y` (columns,) in m,
+    """Where scan rows are sampled: distances `x` (rows,) and lateral positions `y` (columns,) in m,
     ascending."""
 
     x: Vector
@@ -94,7 +95,7 @@ class ScanGrid:
         step: float = 0.00625,
         reach: float = 0.6,
     ) -> ScanGrid:
-        """Image rows about `spacing` apart on the floor up to `far`, sampled every `step` to
+        """Choose image rows about `spacing` apart on the floor up to `far`, sampled every `step` to
         `reach` on both sides (m)."""
         distances = view.distances()
         rows, last = [], -math.inf
@@ -120,8 +121,8 @@ class ScanGrid:
         return float(self.y[1] - self.y[0])
 
     def sample(self, image: NDArray[np.uint8]) -> Grey:
-        """Grey levels (rows, columns); the image's rim is repeated where it does not show the
-        spot."""
+        """Return grey levels (rows, columns); the image's edge is repeated where the image does not
+        show the spot."""
         flat = image.ravel()
         left = flat.take(self._at).astype(np.float32)
         right = flat.take(self._at + 1).astype(np.float32)
@@ -129,5 +130,5 @@ class ScanGrid:
 
 
 def _growth(distances: Vector, row: int) -> float:
-    """How much farther the next row up looks (m)."""
+    """Return how much farther the next row up looks (m)."""
     return float(distances[row - 1] - distances[row]) if row else 0.0

@@ -1,4 +1,4 @@
-"""Following a line: laws that give the curvature to drive, and the speed that goes with it.
+"""Following a line: control laws that return the curvature to drive, and the speed that fits it.
 Pure."""
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from typing import Final
 from petrobot.services.mobile.track_map import Fit
 
 Look = Callable[[float], Fit | None]
-"""Gives the line so many metres ahead, body frame; None where it is not known."""
+"""Function that returns the line so many metres ahead, body frame; None where it is not known."""
 
 TIGHTEST: Final = 4.0
-"""1/m: the most curved way that is driven."""
+"""1/m: the greatest curvature that is driven."""
 
 
 def capped(value: float, limit: float) -> float:
-    """A value brought within +-limit."""
+    """Return a value limited to +-limit."""
     return max(-limit, min(limit, value))
 
 
 @dataclass(frozen=True, slots=True)
 class PurePursuit:
     """Drive the circle, tangent to the heading, that leads to the point of the line `distance` m
-    away (Coulter 1992).
+    away (R. C. Coulter, "Implementation of the pure pursuit path tracking algorithm", 1992).
 
-    Needs neither direction nor curvature of the line, so it stands coarse sights; cuts where the
-    curvature changes.
+    Needs neither direction nor curvature of the line, so it tolerates coarse sights; it cuts
+    corners where the curvature changes.
     """
 
     distance: float = 0.34
 
     def curvature(self, look: Look, speed: float) -> float | None:
-        """1/m, None where the line is not known at that distance."""
+        """Return the curvature in 1/m, None where the line is not known at that distance."""
         x, fit = self.distance, look(self.distance)
         for _ in range(2):
             if fit is None:
@@ -48,27 +48,28 @@ class PurePursuit:
 
 @dataclass(frozen=True, slots=True)
 class FeedForward:
-    """The line's own curvature where the wheels will have answered, plus PD on the error at the
+    """The line's own curvature where the wheels will have responded, plus PD on the error at the
     axle.
 
     With kappa = kappa_line + p e + d sin(heading error) the error obeys e'' + d e' + p e = 0 along
-    the way: critically damped for d = 2 sqrt(p), for which the wheels' lag asks for a little more.
-    The way in which it dies out, 1 / sqrt(p) m, does not depend on the speed.
+    the path: critically damped for d = 2 sqrt(p), and the lag of the wheels needs a little more.
+    The distance over which the error decays, 1 / sqrt(p) m, does not depend on the speed.
     """
 
     gain: float = 60.0
     damping: float = 1.1
     lead: float = 0.09
-    """s from a set point until the wheels have answered."""
+    """s from a set point until the wheels have responded."""
     bent: float = 1.2
-    """1/m that a line is believed to be curved at most: the track's arcs have 1 m radius, what
+    """1/m, greatest curvature of the line that is believed: the track's arcs have 1 m radius, what
     seems tighter is a kink."""
     steepest: float = 0.5
-    """Sine of the angle at which a line far aside is approached at most: the camera must not lose
-    it."""
+    """Greatest sine of the angle at which a line far to the side is approached: the camera must not
+    lose it."""
 
     def curvature(self, look: Look, speed: float) -> float | None:
-        """1/m, None where the line is not known at the axle and just ahead of it."""
+        """Return the curvature in 1/m, None where the line is not known at the axle and just ahead
+        of it."""
         here, soon = look(0.0), look(self.lead * speed)
         if here is None or soon is None:
             return None
@@ -86,24 +87,25 @@ LAWS: Final[Mapping[str, PurePursuit | FeedForward]] = {
 
 @dataclass(frozen=True, slots=True)
 class SpeedProfile:
-    """How fast to go: as asked, slower in curves and towards the end of what is known."""
+    """How fast to drive: as asked, slower in curves and towards the end of what is known."""
 
     sideways: float = 0.7
-    """m/s^2 at most in a curve."""
+    """m/s^2, greatest lateral acceleration in a curve."""
     braking: float = 0.8
     """m/s^2 with which the end of the known line is approached."""
     raising: float = 0.8
-    """m/s^2 at most when speed is gained."""
+    """m/s^2, greatest acceleration."""
     margin: float = 0.02
     """m before the end of the known line at which to stand."""
 
     def speed(self, asked: float, curvature: float, ahead: float) -> float:
-        """m/s for a curvature (1/m) with the line known for `ahead` m."""
+        """Return the speed (m/s) for a curvature (1/m) with the line known for `ahead` m."""
+        # v^2 * curvature = lateral acceleration; v^2 = 2 * deceleration * distance.
         in_curve = math.sqrt(self.sideways / max(abs(curvature), 1e-3))
         at_end = math.sqrt(2.0 * self.braking * max(0.0, ahead - self.margin))
         return min(asked, in_curve, at_end)
 
     def towards(self, present: float, wanted: float, dt: float) -> float:
-        """The next set speed (m/s) on the way from the present one to the wanted one."""
+        """Return the next set speed (m/s) between the present and the wanted one."""
         up, down = self.raising * dt, 1.6 * self.braking * dt
         return min(max(wanted, present - down), present + up)

@@ -1,4 +1,4 @@
-"""The rover and its track as numbers: read from a file like `rover.toml`, SI units."""
+"""The rover and its track as numbers, read from a file like `rover.toml`; SI units."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any, Self
 NOMINAL = "rover.toml"
 
 
-class ModelError(ValueError):
-    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key
-    and remedy."""
+class RoverFileError(ValueError):
+    """A rover file lacks a key or has an impossible value; the message names file, key and what was
+    expected."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,11 @@ class _Table:
 
     @classmethod
     def of(cls, tables: Mapping[str, Any], name: str, source: str) -> Self:
-        """From a file's tables. Raises ModelError."""
+        """Read the table from a file's tables. Raises RoverFileError."""
         table = tables.get(name)
         if not isinstance(table, Mapping):
-            raise ModelError(
-                f"{source}: table [{name}] is missing; see the one that comes with petrobot, "
-                f"{NOMINAL}"
+            raise RoverFileError(
+                f"{source}: table [{name}] is missing; petrobot's own {NOMINAL} shows it"
             )
         return cls(
             **{field.name: _number(table, name, field.name, source) for field in fields(cls)}
@@ -36,7 +35,7 @@ class _Table:
 
 
 @dataclass(frozen=True)
-class Track(_Table):
+class FloorSizes(_Table):
     """The contest's floor (m)."""
 
     square: float
@@ -60,7 +59,7 @@ class Wheels(_Table):
 
 
 @dataclass(frozen=True)
-class Bus(_Table):
+class BusLayout(_Table):
     """The CAN bus: period of SYNC (s) and node ids."""
 
     period: float
@@ -71,7 +70,7 @@ class Bus(_Table):
 
 @dataclass(frozen=True)
 class CameraModel(_Table):
-    """The camera ahead of the axle: m, rad down from the horizon, pixels, images/s."""
+    """The camera in front of the axle: m, rad down from the horizon, pixels, images/s."""
 
     forward: float
     height: float
@@ -85,7 +84,7 @@ class CameraModel(_Table):
 
 @dataclass(frozen=True)
 class Sensor(_Table):
-    """The retroreflector sensor ahead of the axle: m, s, rad to each side."""
+    """The retroreflector sensor in front of the axle: m, s, rad to each side."""
 
     forward: float
     height: float
@@ -95,34 +94,34 @@ class Sensor(_Table):
 
 
 @dataclass(frozen=True)
-class Rover:
+class RoverModel:
     """All numbers of one rover."""
 
-    track: Track
+    track: FloorSizes
     wheels: Wheels
-    bus: Bus
+    bus: BusLayout
     camera: CameraModel
     sensor: Sensor
 
 
-def read_rover(text: str, source: str = NOMINAL) -> Rover:
-    """A rover from the text of a TOML file. Raises ModelError."""
+def read_rover(text: str, source: str = NOMINAL) -> RoverModel:
+    """Read a rover from the text of a TOML file. Raises RoverFileError."""
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as fault:
-        raise ModelError(f"{source}: no TOML ({fault}); mend that line") from fault
-    return Rover(
-        Track.of(tables, "track", source),
+        raise RoverFileError(f"{source}: not valid TOML ({fault}); correct it") from fault
+    return RoverModel(
+        FloorSizes.of(tables, "track", source),
         Wheels.of(tables, "rover", source),
-        Bus.of(tables, "bus", source),
+        BusLayout.of(tables, "bus", source),
         CameraModel.of(tables, "camera", source),
         Sensor.of(tables, "sensor", source),
     )
 
 
 @lru_cache(maxsize=1)
-def nominal_rover() -> Rover:
-    """The rover that comes with petrobot."""
+def nominal_rover() -> RoverModel:
+    """Return the rover that comes with petrobot."""
     return read_rover(
         files("petrobot.services.mobile").joinpath(NOMINAL).read_text(encoding="utf-8")
     )
@@ -133,12 +132,12 @@ def _number(table: Mapping[str, Any], name: str, key: str, source: str) -> Any:
     if key == "principal_px":
         if isinstance(value, list) and len(value) == 2 and all(_positive(v) for v in value):
             return float(value[0]), float(value[1])
-        raise ModelError(
-            f"{source}: [{name}] {key} = {value!r}: give two positive numbers, column and "
-            "row in pixels"
+        raise RoverFileError(
+            f"{source}: [{name}] {key}: expected two positive numbers (column and row in "
+            f"pixels), got {value!r}"
         )
     if value is None or not _positive(value):
-        raise ModelError(f"{source}: [{name}] {key} = {value!r}: a positive number is needed")
+        raise RoverFileError(f"{source}: [{name}] {key}: expected a positive number, got {value!r}")
     return float(value)
 
 

@@ -1,5 +1,5 @@
-"""Where the rover is, by its wheels: pose in a frame of its own (the odometry frame), and where it
-was a moment ago."""
+"""Odometry: the rover's pose from its wheels, in a frame of its own (the odometry frame), and where
+it was a moment ago."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections import deque
 from typing import NamedTuple
 
 HISTORY = 50
-"""Poses that are remembered: a second of cycles of 20 ms, far more than an image is old."""
+"""Poses that are remembered: one second of cycles of 20 ms, far longer than an image is old."""
 
 
 class Pose(NamedTuple):
@@ -19,37 +19,41 @@ class Pose(NamedTuple):
     heading: float
 
     def body(self, x: float, y: float) -> tuple[float, float]:
-        """A point of the odometry frame as seen from this pose (m ahead, m to the left)."""
+        """Return a point of the odometry frame relative to this pose (m ahead, m to the left)."""
         dx, dy = x - self.x, y - self.y
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return dx * cos + dy * sin, dy * cos - dx * sin
 
     def floor(self, ahead: float, left: float) -> tuple[float, float]:
-        """A point as seen from this pose in the odometry frame (m)."""
+        """Return a point given relative to this pose in the odometry frame (m)."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
         return self.x + ahead * cos - left * sin, self.y + ahead * sin + left * cos
 
 
 def turned(angle: float) -> float:
-    """An angle brought to (-pi, pi]."""
+    """Return an angle normalised to (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
 class Odometry:
-    """Integrates the ways of both wheels. `track_width` is the distance between their contact
+    """Integrates the distances of both wheels. `track_width` is the distance between their contact
     points (m)."""
 
     def __init__(self, track_width: float) -> None:
         self._width = track_width
         self.pose = Pose(0.0, 0.0, 0.0)
         self.way = 0.0
-        """m travelled, however curved; turning on the spot is none."""
+        """m travelled, however curved; turning on the spot adds nothing."""
         self._history: deque[tuple[float, Pose]] = deque(maxlen=HISTORY)
 
     def add(self, now: float, left: float, right: float) -> None:
-        """The wheels have rolled so far (m) since the last call; exact on arcs of circles."""
+        """Add the distances (m) that the wheels have rolled since the last call; exact on circular
+        arcs."""
         way, turn = 0.5 * (left + right), (right - left) / self._width
         x, y, heading = self.pose
+        # Between two calls both wheels are taken to turn evenly, so the rover moves on an arc:
+        # chord = 2 R sin(turn / 2), in the mean direction (J. Borenstein et al., "Where am I?",
+        # 1996, section 1.1).
         chord = way if abs(turn) < 1e-9 else 2.0 * way / turn * math.sin(0.5 * turn)
         middle = heading + 0.5 * turn
         self.pose = Pose(x + chord * math.cos(middle), y + chord * math.sin(middle), heading + turn)
@@ -57,8 +61,8 @@ class Odometry:
         self._history.append((now, self.pose))
 
     def at(self, time: float) -> Pose:
-        """The pose at a time (s) of the last second, interpolated; the oldest one known for earlier
-        ones."""
+        """Return the pose at a time (s) of the last second, interpolated; the oldest known pose for
+        earlier times."""
         later: tuple[float, Pose] | None = None
         for then, pose in reversed(self._history):
             if then <= time:

@@ -1,5 +1,5 @@
-"""Ways to plan where the track cannot be seen: arcs, straights and joins as points (m), and where a
-track may resume. Pure."""
+"""Paths to plan where the track cannot be seen: arcs, straights and joins as points (m), and where
+a track may resume. Pure."""
 
 from __future__ import annotations
 
@@ -14,18 +14,22 @@ Points = list[tuple[float, float]]
 
 
 def resume_poses(end: Pose, square: float, radius: float) -> tuple[Pose, Pose, Pose]:
-    """Where the track goes on beyond a square without one that is entered at `end`: straight on, to
-    the left, to the right.
+    """Return where the track can resume beyond an empty square that is entered at `end`: straight
+    on, to the left, to the right.
 
     By the rules every element leads from the middle of one edge of its square to the middle of
     another.
     """
     ways = ((square, 0.0, 0.0), (radius, radius, 0.5 * math.pi), (radius, -radius, -0.5 * math.pi))
-    return tuple(Pose(*end.floor(ahead, left), end.heading + turn) for ahead, left, turn in ways)  # type: ignore[return-value]
+    straight_on, to_left, to_right = (
+        Pose(*end.floor(ahead, left), end.heading + turn) for ahead, left, turn in ways
+    )
+    return straight_on, to_left, to_right
 
 
 def arc(begin: Pose, curvature: float, length: float) -> Points:
-    """A circle (1/m, to the left positive; 0: straight) from a pose on, `length` m long."""
+    """Return points of a circle (1/m, positive to the left; 0: straight) from a pose on, `length` m
+    long."""
     count = max(2, round(length / SPACING))
     return [_along(begin, curvature, length * i / count) for i in range(1, count + 1)]
 
@@ -38,11 +42,11 @@ def _along(begin: Pose, curvature: float, way: float) -> tuple[float, float]:
 
 
 def arc_through(begin: Pose, x: float, y: float, beyond: float) -> Points:
-    """The circle tangent to a pose that leads through a point ahead of it, and `beyond` m straight
-    on from there.
+    """Return the circle tangent to a pose that leads through a point ahead of it, and `beyond` m
+    straight on from there.
 
-    On a chessboard track it is the very element that is missing: whether straight or arc, it is
-    tangent to the line's end.
+    On a chessboard track this is exactly the missing element: straight or arc, it is tangent to the
+    line's end.
     """
     ahead, left = begin.body(x, y)
     squared = ahead * ahead + left * left
@@ -58,13 +62,13 @@ def arc_through(begin: Pose, x: float, y: float, beyond: float) -> Points:
 
 
 def straight(begin: tuple[float, float], end: tuple[float, float]) -> Points:
-    """Points from one place to another."""
+    """Return points from one place to another."""
     length = math.hypot(end[0] - begin[0], end[1] - begin[1])
     return arc(Pose(*begin, math.atan2(end[1] - begin[1], end[0] - begin[0])), 0.0, length)
 
 
 def join(begin: Pose, end: Pose, beyond: float) -> Points:
-    """A cubic Hermite curve from one pose to another, and `beyond` m straight on."""
+    """Return a cubic Hermite curve from one pose to another, and `beyond` m straight on."""
     size = math.hypot(end.x - begin.x, end.y - begin.y)
     count = max(4, round(size / SPACING))
     a, b = (
@@ -83,12 +87,12 @@ def join(begin: Pose, end: Pose, beyond: float) -> Points:
 
 
 def passes(points: Sequence[tuple[float, float]], gate: Pose, aside: float, turn: float) -> bool:
-    """Whether a line seen as points (near to far) leads through a gate: within `aside` m of it,
-    `turn` rad of its heading.
+    """Return whether a line seen as points (near to far) leads through a gate: within `aside` m of
+    it and `turn` rad of its heading.
 
-    The line counts as going on straight for half a metre before its first point and after its last.
-    One that is seen the other way round, by a rover that has gone too far and looks back, does not
-    count: it would be followed backwards.
+    The line counts as continuing straight for half a metre before its first point and after its
+    last. A line seen in the opposite direction, by a rover that has gone too far and looks back,
+    does not count: it would be followed backwards.
     """
     near, far = points[0], points[-1]
     direction = math.atan2(far[1] - near[1], far[0] - near[0])

@@ -1,9 +1,9 @@
-"""The rover's driver: every 20 ms it reads wheels and sensor, takes the newest sight of the track,
+"""Driver of the rover: every 20 ms it reads wheels and sensor, takes the newest sight of the track,
 and sets two wheel speeds.
 
 It follows its map of the track, whether the points in it were seen or are only planned; it turns on
-the spot; it rests. It never drives where the map does not reach, and rests when the stream is stale
-or the action that wanted the motion is silent.
+the spot; it rests. It never drives beyond the map, and it rests when the stream is stale or the
+action that wanted the motion stops repeating its command.
 
 Commands: {"do": "follow", "law", "speed"} (repeat it within `LEASE` s), {"do": "plan", "points"},
 {"do": "turn", "to", "rate"} (also repeated), {"do": "stretch"} (a new stretch begins), {"do":
@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from petrobot.services.device import Ports, Setpoint
 from petrobot.services.mobile.following import LAWS, PurePursuit, SpeedProfile, capped
-from petrobot.services.mobile.model import Rover as Numbers
+from petrobot.services.mobile.model import RoverModel as Numbers
 from petrobot.services.mobile.model import nominal_rover, read_rover
 from petrobot.services.mobile.odometry import Odometry, Pose, turned
 from petrobot.services.mobile.reflectors import ReflectorMap, parse_echoes
@@ -27,33 +27,36 @@ from petrobot.services.mobile.track_map import Fit, TrackMap
 from petrobot.services.mobile.wheel_drives import Phase, WheelMaster
 
 LEASE: Final = 0.4
-"""s after which a motion that nobody asks for again ends."""
+"""Seconds after which a motion ends unless its command is repeated."""
 STANDING: Final = 0.004
 """m/s below which the rover counts as standing."""
 STREAM: Final = "track_ahead"
 JOINING: Final = PurePursuit(0.6)
-"""Towards a line that is known ahead, but not yet at the axle."""
+"""Law towards a line that is known ahead, but not yet at the axle."""
 AT_END: Final = 0.04
-"""m before the end of all that is known at which there is no line any more."""
+"""m before the end of all that is known at which the line counts as finished."""
 TURN_GAIN: Final = 3.0
-"""1/s: turning speed for each radian that is left."""
+"""1/s: turning speed per radian that is left."""
 TURNED: Final = 0.02
 """rad within which a turn has arrived."""
 END_REACH: Final = 0.45
-"""m of line that tell its direction at its end."""
+"""m of line from which its direction at its end is computed."""
 REGAINED_SIGHTS: Final = 4
-"""Sights of a new stretch after which it can be followed, if it begins so many m ahead (not behind:
-the rover may have turned since), at most so many aside and so many rad askew."""
+"""Sights of a new stretch after which it can be followed."""
 REGAINED_AHEAD: Final = (0.2, 0.62)
+"""m ahead of the axle at which that stretch must begin; not behind, since the rover may have
+turned."""
 REGAINED_ASIDE: Final = 0.25
+"""m to the side at most."""
 REGAINED_TURN: Final = 0.6
+"""rad askew at most."""
 DRIVES_SHARE: Final = 0.95
-"""Part of the wheels' top speed that set points use: the rest is for the lead over their lag."""
+"""Share of the wheels' top speed that set points use; the rest is for the lead over their lag."""
 
 
 class Rover:
     """Driver of the rover (see `services.device.Driver`). Its keys in services.toml, all optional
-    but those of its bus:
+    except those of its bus:
 
     `rover`: file of numbers beside services.toml (default: the shipped one).
     """
@@ -99,7 +102,7 @@ class Rover:
     # Driver contract
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed
+        """Accept a command. Raises ValueError if it is unknown, malformed, or cannot be obeyed
         now."""
         act = self._commands.get(str(body.get("do")))
         if act is None:
@@ -109,7 +112,7 @@ class Rover:
         act(now, body)
 
     def step(self, now: float) -> None:
-        """One cycle."""
+        """Run one cycle."""
         self._cycles += 1
         self._now = now
         self._fits.clear()
@@ -126,7 +129,7 @@ class Rover:
             self._master.bus_lost(now, str(reason))
 
     def state(self) -> Mapping[str, Any]:
-        """What actions, operator and report see; docs/mobile.md explains the keys."""
+        """Return what actions, operator and report see; docs/mobile.md explains the keys."""
         pose, end = self._odometry.pose, self._map.end
         fit = self._fit(0.0)
         return {
@@ -164,16 +167,16 @@ class Rover:
         self._rest("stopped")
 
     def stopped(self) -> bool:
-        """Whether the rover stands, or its drives are off and so its brakes hold."""
+        """Return whether the rover stands, held by its drives or by its brakes."""
         return self._standing() and self._mode in ("off", "rest")
 
     def hold(self, now: float) -> str:
-        """Operator's pause: brake, and go on with the same after `release`."""
+        """Pause for the operator: brake, and resume the same motion after `release`."""
         self._paused = True
         return "held"
 
     def release(self, now: float) -> None:
-        """End of the pause."""
+        """End the pause."""
         self._paused = False
         self._leased_until = max(self._leased_until, now + LEASE)
 
@@ -195,21 +198,26 @@ class Rover:
         self._ready("turn")
         to = body.get("to")
         if not isinstance(to, int | float) or not math.isfinite(to):
-            raise ValueError(f"turn: to = {to!r}: give a heading in rad, odometry frame")
+            raise ValueError(
+                f"turn: to: expected a finite heading (rad, odometry frame), got {to!r}"
+            )
         self._heading, self._rate = float(to), _positive(body, "rate", 1.0)
         self._lease(now, "turn")
 
     def _plan(self, body: Mapping[str, Any]) -> None:
         points = body.get("points", ())
         if any(len(p) != 2 or not all(math.isfinite(c) for c in p) for p in points):
-            raise ValueError("plan: points are pairs of finite numbers (m, odometry frame)")
+            raise ValueError(
+                "plan: points: expected pairs of finite numbers (m, odometry frame), got others"
+            )
         self._map.plan(points)
 
     def _stretch(self, body: Mapping[str, Any]) -> None:
         gates = body.get("gates", ())
         if any(len(gate) != 3 or not all(math.isfinite(c) for c in gate) for gate in gates):
             raise ValueError(
-                "stretch: gates are poses of three finite numbers (m, m, rad, odometry frame)"
+                "stretch: gates: expected poses of three finite numbers (m, m, rad, odometry "
+                "frame), got others"
             )
         self._map.begin(
             [Pose(*map(float, gate)) for gate in gates], look=bool(body.get("look", True))
@@ -253,7 +261,7 @@ class Rover:
             self._master.receive(now, frame)
 
     def _measure(self, now: float) -> None:
-        """Odometry and echoes."""
+        """Update odometry and reflectors."""
         radius = self.numbers.wheels.wheel_radius
         left, right = (wheel.turned() * radius for wheel in self._master.drives)
         self._odometry.add(now, left, right)
@@ -265,7 +273,7 @@ class Rover:
             self._master.echoes.clear()
 
     def _look(self, now: float) -> None:
-        """Take the newest sight of the track into the map."""
+        """Put the newest sight of the track into the map."""
         setpoint = self._setpoint
         if setpoint.count == self._taken or setpoint.values is None:
             return
@@ -278,7 +286,7 @@ class Rover:
         self._fits.clear()
 
     def _drive(self, now: float) -> tuple[float, float]:
-        """Speeds of the wheels (rad/s) for this cycle."""
+        """Return the speeds of the wheels (rad/s) for this cycle."""
         enabled = self._master.enabled
         if not enabled:
             self._mode, self._speed = "off", 0.0
@@ -325,8 +333,8 @@ class Rover:
         return self._set_wheels(self._speed, self._speed * capped(curvature, 1.5))
 
     def _set_wheels(self, speed: float, turning: float) -> tuple[float, float]:
-        """Wheel speeds (rad/s) with a lead over the wheels' lag, both scaled down when one is
-        beyond what it can do."""
+        """Return wheel speeds (rad/s) with a lead over the wheels' lag; both are scaled down when
+        one exceeds what it can do."""
         wheels, period = self.numbers.wheels, self.numbers.bus.period
         half = 0.5 * wheels.track_width
         left, right = (
@@ -342,17 +350,18 @@ class Rover:
             capped((new - old) / period, steepest)
             for new, old in zip(self._set, before, strict=True)
         )
+        # A first-order lag of time constant T is cancelled by adding T times the rate of change.
         lead_left, lead_right = (wheels.wheel_lag * lead for lead in leads)
         return left + lead_left, right + lead_right
 
     def _fit(self, x: float) -> Fit | None:
-        """The map's line `x` m ahead of the axle, worked out once in a cycle."""
+        """Return the map's line `x` m ahead of the axle, computed once per cycle."""
         if x not in self._fits:
             self._fits[x] = self._map.fit(self._odometry.pose, x)
         return self._fits[x]
 
     def _line_end(self) -> tuple[float, float, float] | None:
-        """Pose of the line where it is known to end; at rest, as far as it is known at all."""
+        """Return the pose of the line's known end; at rest, of the farthest point that is known."""
         place = self._map.end_place
         if place is None or not (self._map.complete or self._reason):
             return None
@@ -362,8 +371,8 @@ class Rover:
         return None if fit is None else (*place, pose.heading + fit.heading)
 
     def _found_again(self) -> bool:
-        """Whether a stretch that was looked for has been seen often and lies well before the
-        rover."""
+        """Return whether the stretch that was searched has been seen often enough and lies well in
+        front of the rover."""
         near = self._map.entry
         if not self._map.gated or self._map.sights < REGAINED_SIGHTS or near is None:
             return False
@@ -381,7 +390,7 @@ class Rover:
 def _positive(body: Mapping[str, Any], key: str, default: float | None = None) -> float:
     value = body.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < 10.0:
-        raise ValueError(f"{key} = {value!r}: must be above 0 and below 10")
+        raise ValueError(f"{key}: expected a number above 0 and below 10, got {value!r}")
     return float(value)
 
 

@@ -1,8 +1,8 @@
-"""The camera's primitive actions: find the track in four ways, and watch it until it ends.
+"""Primitive actions of the rover's camera: find the track in four ways, and watch it until it ends.
 
 All stream what each image shows as set points of `track_ahead`
-(`services.mobile.sight.TrackAhead`), also that it shows nothing: a stream that falls silent says
-that the camera is dead. Error causes: `no_line`, `no_image`, `bad_image`.
+(`services.mobile.sight.TrackAhead`), even that it shows nothing: a silent stream means a dead
+camera. Error causes: `no_line`, `no_image`, `bad_image`.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import Final
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
-from petrobot.services.mobile.camera import CameraError, FloorCamera
+from petrobot.services.mobile.camera import FloorCamera, FloorCameraError
 from petrobot.services.mobile.detection import (
-    Detector,
     TemplateBank,
+    TrackDetector,
     consensus,
     detect_edges,
     detect_ridge,
@@ -25,7 +25,7 @@ STREAM: Final = "track_ahead"
 CONFIRMED: Final = 3
 """Images in a row that must show a line before it counts as found."""
 GONE: Final = 2
-"""Images without the line after which one whose end is known has passed out of view."""
+"""Images without the line after which a line with a known end has passed out of view."""
 PATCHY: Final = 0.9
 """Share of images below which a watched line was not seen well enough: FAILURE."""
 
@@ -39,14 +39,14 @@ async def find_edges(ctx: Context, *, timeout: float = 30.0, image_timeout: floa
 
 
 async def find_ridge(ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5) -> Result:
-    """Find the track by ridges of its width: averages noise. As `find_edges`."""
+    """Find the track by ridges of its width: averages noise. Otherwise as `find_edges`."""
     return await _find(ctx, detect_ridge, timeout, image_timeout)
 
 
 async def find_consensus(
     ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5
 ) -> Result:
-    """Find the track by random sample consensus of a parabola: stands false edges. As
+    """Find the track by random sample consensus of a parabola: tolerates false edges. Otherwise as
     `find_edges`."""
     return await _find(ctx, consensus(lambda: ctx.random("consensus")), timeout, image_timeout)
 
@@ -54,8 +54,8 @@ async def find_consensus(
 async def find_template(
     ctx: Context, *, timeout: float = 30.0, image_timeout: float = 0.5
 ) -> Result:
-    """Find the track by whole-line templates: stands noise and dim light best, costs most. As
-    `find_edges`."""
+    """Find the track by whole-line templates: tolerates noise and dim light best, costs most.
+    Otherwise as `find_edges`."""
     return await _find(ctx, TemplateBank(), timeout, image_timeout)
 
 
@@ -74,25 +74,28 @@ async def watch_edges(
 async def watch_ridge(
     ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
 ) -> Result:
-    """Stream the track ahead until it ends, by ridges of its width. As `watch_edges`."""
+    """Stream the track ahead until it ends, by ridges of its width. Otherwise as `watch_edges`."""
     return await _watch(ctx, detect_ridge, lost_after, image_timeout)
 
 
 async def watch_consensus(
     ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
 ) -> Result:
-    """Stream the track ahead until it ends, by random sample consensus. As `watch_edges`."""
+    """Stream the track ahead until it ends, by random sample consensus. Otherwise as
+    `watch_edges`."""
     return await _watch(ctx, consensus(lambda: ctx.random("consensus")), lost_after, image_timeout)
 
 
 async def watch_template(
     ctx: Context, *, lost_after: float = 0.8, image_timeout: float = 0.5
 ) -> Result:
-    """Stream the track ahead until it ends, by whole-line templates. As `watch_edges`."""
+    """Stream the track ahead until it ends, by whole-line templates. Otherwise as `watch_edges`."""
     return await _watch(ctx, TemplateBank(), lost_after, image_timeout)
 
 
-async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout: float) -> Result:
+async def _find(
+    ctx: Context, detector: TrackDetector, timeout: float, image_timeout: float
+) -> Result:
     camera: FloorCamera = ctx.device
     watcher = LineWatcher(camera.floor, detector, find=True)
     until, row = ctx.now + timeout, 0
@@ -118,7 +121,7 @@ async def _find(ctx: Context, detector: Detector, timeout: float, image_timeout:
 
 
 async def _watch(
-    ctx: Context, detector: Detector, lost_after: float, image_timeout: float
+    ctx: Context, detector: TrackDetector, lost_after: float, image_timeout: float
 ) -> Result:
     camera: FloorCamera = ctx.device
     watcher = LineWatcher(camera.floor, detector)
@@ -159,13 +162,14 @@ def _ended(kind: TrackEnd, watcher: LineWatcher) -> Result:
 async def _next(
     ctx: Context, camera: FloorCamera, watcher: LineWatcher, image_timeout: float
 ) -> Sight | Result:
-    """What the next image shows, streamed; or how the run ends without one."""
+    """Return what the next image shows, and stream it; or return the result of the run without
+    one."""
     try:
         image = await camera.read(ctx, image_timeout)
-    except CameraError as fault:
+    except FloorCameraError as fault:
         return error("bad_image", str(fault))
     if image is None:
-        camera.end()  # the next run opens the source anew
+        camera.end()  # The next run opens the source again.
         return error("no_image", f"no image for {image_timeout} s", images=watcher.images)
     sight = watcher.look(image.pixels)
     ahead = TrackAhead(max(0.0, ctx.now - image.time), sight.confidence, sight.end, thinned(sight))

@@ -1,5 +1,5 @@
-"""What one image shows of the track: points of its centre line, and offset, heading and curvature
-made of them."""
+"""What one image shows of the track: points of its centre line, and the offset, heading and
+curvature computed from them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Vector = NDArray[np.float64]
 FIT_REACH = 0.5
 """m ahead of the nearest point over which one parabola describes the line."""
 POINT_SPACING = 0.05
-"""m between points that are streamed."""
+"""m between streamed points."""
 STREAMED = 12
 """Most points in a set point."""
 HEAD = 5
@@ -27,15 +27,15 @@ class TrackEnd(IntEnum):
     """How the line ends within view."""
 
     NONE = 0
-    """It goes on out of view, or it is not known yet how it ends."""
+    """It continues out of view, or it is not known yet how it ends."""
     INTERRUPTION = 1
-    """The next square carries no track."""
+    """The next square has no track."""
     T = 2
-    """The crossbar."""
+    """The crossbar of the T."""
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class LineEnd:
     """Where (m, body frame at exposure) and how the line ends."""
 
     kind: TrackEnd
@@ -54,7 +54,7 @@ class Sight:
     x: Vector
     y: Vector
     confidence: float = 0.0
-    end: End | None = None
+    end: LineEnd | None = None
     broke_off: bool = False
     """Whether rows that should show more of the line do not."""
 
@@ -63,18 +63,18 @@ class Sight:
         """Whether there is a line."""
         return self.x.size > 2
 
-    def line(self) -> Line:
-        """A parabola over the first half metre, to know where to look next. Raises ValueError when
-        no line was seen."""
+    def line(self) -> Parabola:
+        """Return a parabola over the first half metre, to know where to look next. Raises
+        ValueError when no line was seen."""
         x, y = self._near()
         return fit_line(x, y)
 
     def describe(self) -> Shape:
-        """Offset, heading and curvature at the nearest point. Raises ValueError when no line was
-        seen.
+        """Return offset, heading and curvature at the nearest point. Raises ValueError when no line
+        was seen.
 
-        The parabola is fitted along the chord: against the body's axis an arc seen at 60 degrees is
-        none.
+        The parabola is fitted along the chord: relative to the body's axis, an arc seen at 60
+        degrees is not a parabola.
         """
         x, y = self._near()
         chord = math.atan2(float(y[-1] - y[0]), float(x[-1] - x[0]))
@@ -102,7 +102,7 @@ UNSEEN = Sight(np.empty(0), np.empty(0))
 @dataclass(frozen=True, slots=True)
 class Shape:
     """The line at its nearest point, `near` m ahead: offset (m) and heading (rad) to the left,
-    curvature (1/m, bending left)."""
+    curvature (1/m, positive to the left)."""
 
     near: float
     offset: float
@@ -111,7 +111,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class Parabola:
     """A parabola y = offset + slope (x - near) + bend (x - near)^2 / 2 over [near, far] (m, body
     frame)."""
 
@@ -122,23 +122,23 @@ class Line:
     bend: float
 
     def at(self, x: float) -> float:
-        """y at a distance x (m)."""
+        """Return y at a distance x (m)."""
         d = x - self.near
         return self.offset + self.slope * d + 0.5 * self.bend * d * d
 
 
-def fit_line(x: Vector, y: Vector) -> Line:
-    """Least-squares parabola through points, a straight line through fewer than five."""
+def fit_line(x: Vector, y: Vector) -> Parabola:
+    """Return the least-squares parabola through points, a straight line through fewer than five."""
     near, far = float(x[0]), float(x[-1])
     degree = 2 if x.size >= 5 and far - near > 0.15 else 1
     coefficients = polynomial(x - near, y, degree)
     bend = 2.0 * coefficients[2] if degree == 2 else 0.0
-    return Line(near, far, coefficients[0], coefficients[1], bend)
+    return Parabola(near, far, coefficients[0], coefficients[1], bend)
 
 
 def polynomial(x: Vector, y: Vector, degree: int, weights: Vector | None = None) -> list[float]:
-    """Coefficients, constant first, of the weighted least-squares polynomial. Raises LinAlgError
-    for too few places."""
+    """Return the coefficients, constant first, of the weighted least-squares polynomial. Raises
+    LinAlgError for too few points."""
     powers = [np.ones_like(x)]
     for _ in range(2 * degree):
         powers.append(powers[-1] * x)
@@ -163,35 +163,39 @@ class TrackAhead:
 
     age: float
     confidence: float
-    end: End | None = None
+    end: LineEnd | None = None
     points: tuple[tuple[float, float], ...] = field(default=())
 
     def values(self) -> list[float]:
-        """As numbers."""
-        end = self.end or End(TrackEnd.NONE, 0.0, 0.0)
+        """Return the set point as numbers."""
+        end = self.end or LineEnd(TrackEnd.NONE, 0.0, 0.0)
         flat = [c for point in self.points for c in point]
         return [self.age, self.confidence, float(end.kind), end.x, end.y, *flat]
 
     @staticmethod
     def parse(values: Sequence[float], held: float = 0.0) -> TrackAhead:
-        """From numbers that their sender has stood by for `held` s. Raises ValueError when they are
-        none."""
+        """Read numbers that were held for `held` s since their sender published them. Raises
+        ValueError when they are not a set point."""
         rest = len(values) - HEAD
         if rest < 0 or rest % 2 or rest // 2 > STREAMED or not all(map(math.isfinite, values)):
             raise ValueError(
-                f"{len(values)} numbers are no set point of track_ahead: {HEAD} and up to "
-                f"{STREAMED} pairs"
+                f"track_ahead: expected {HEAD} finite numbers and up to {STREAMED} pairs, got "
+                f"{len(values)} numbers"
             )
         age, confidence, kind, x, y = values[:HEAD]
         if kind not in tuple(TrackEnd) or age < 0.0:
-            raise ValueError(f"track_ahead: age {age}, end {kind}: not a set point")
-        end = None if kind == TrackEnd.NONE else End(TrackEnd(int(kind)), x, y)
+            raise ValueError(
+                f"track_ahead: expected an age of 0 or more and an end of 0 to 2, got {age} "
+                f"and {kind}"
+            )
+        end = None if kind == TrackEnd.NONE else LineEnd(TrackEnd(int(kind)), x, y)
         points = tuple(zip(values[HEAD::2], values[HEAD + 1 :: 2], strict=True))
         return TrackAhead(age + held, confidence, end, points)
 
 
 def thinned(sight: Sight) -> tuple[tuple[float, float], ...]:
-    """Points of a sight for the stream: the nearest first, at least `POINT_SPACING` apart."""
+    """Return points of a sight for the stream: the nearest first, at least `POINT_SPACING`
+    apart."""
     points: list[tuple[float, float]] = []
     for x, y in zip(sight.x.tolist(), sight.y.tolist(), strict=True):
         if len(points) == STREAMED:

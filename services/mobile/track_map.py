@@ -1,9 +1,9 @@
-"""What is known of the track near the rover: points of its centre line in the odometry frame, seen
-or only expected.
+"""Map of the track near the rover: points of its centre line in the odometry frame, seen or only
+expected.
 
-The camera sees the track only from 0.4 m ahead on; what it saw is kept until the axle has passed
+The camera sees the track only from 0.4 m ahead on. What it saw is kept until the axle has passed
 over it, so that the error at the axle itself is known. Where the track is interrupted, the points
-of a plan stand in for what cannot be seen: whoever follows the map need not know the difference.
+of a plan replace what cannot be seen; whatever follows the map need not know the difference.
 """
 
 from __future__ import annotations
@@ -18,28 +18,29 @@ from numpy.typing import NDArray
 
 from petrobot.services.mobile.odometry import Pose
 from petrobot.services.mobile.paths import join, passes
-from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.mobile.sight import LineEnd, TrackAhead, TrackEnd
 
 Vector = NDArray[np.float64]
 
 CAPACITY = 640
-"""Points kept; the oldest go."""
+"""Points kept; the oldest are overwritten."""
 STEP = 0.015
-"""m or, turning, about as many degrees between two places from which sights are taken."""
+"""m between two places from which sights are taken."""
 TURN_STEP = 0.03
+"""rad, the same for turning."""
 ALIKE = 5
-"""Sights that are taken from one place: a standing rover's noise is averaged, then it learns
-nothing new."""
+"""Sights that are taken from one place: the noise of a standing rover is averaged, then nothing new
+is learned."""
 REACH = 0.22
-"""m around a place within which points bear on the fit there, the nearer the more."""
+"""m around a place within which points count for the fit there, the nearer the more."""
 NEEDED = 3
 """Points that a fit needs."""
 OTHER = 0.15
-"""m off what is known from which a sight is of something else."""
+"""m off the known line from which a sight shows something else."""
 GATE_ASIDE, GATE_TURN = 0.3, 0.6
 """m and rad that a line may be off a gate."""
 STEP_ASIDE = 0.06
-"""m beside the plan from which a line seen is joined anew."""
+"""m beside the plan from which a seen line is joined by a new path."""
 ENDS = 12
 """Sights of an end that are averaged."""
 
@@ -55,18 +56,18 @@ class Fit:
 
     @property
     def heading(self) -> float:
-        """Direction against the pose's (rad)."""
+        """Direction relative to the pose's (rad)."""
         return math.atan(self.slope)
 
     @property
     def curvature(self) -> float:
-        """1/m, to the left positive."""
+        """1/m, positive to the left."""
         steep = 1.0 + self.slope * self.slope
         return self.bend / (steep * math.sqrt(steep))
 
 
 class TrackMap:
-    """Points with weights. All arguments in the odometry frame unless a name says otherwise."""
+    """Points with weights. All arguments are in the odometry frame unless a name says otherwise."""
 
     def __init__(self) -> None:
         self._points = np.zeros((CAPACITY, 3))
@@ -82,33 +83,33 @@ class TrackMap:
         self.sights = 0
         """Sights taken since `begin`."""
         self.entry: Pose | None = None
-        """The nearest point of the newest of them, and the line's direction from there."""
+        """The nearest point of the newest sight, and the line's direction from there."""
         self._local: tuple[Pose, tuple[Vector, Vector, Vector, int]] | None = None
         self._gates: tuple[Pose, ...] = ()
         self._looks = True
         self.regained = False
-        """Whether the stretch that `begin` gave gates for has been found; see `settle`."""
+        """Whether the stretch for which `begin` named gates has been found; see `settle`."""
 
     def begin(self, gates: Sequence[Pose] = (), *, look: bool = True) -> None:
-        """A new stretch begins: what lies behind stays for the axle to pass over, the end of the
-        last one is forgotten.
+        """Begin a new stretch: keep what lies behind until the axle has passed it, forget the end
+        of the last stretch.
 
-        With `gates` only a line that leads through one of them is taken for it until `settle` is
-        called: others may be in view, also while the rover turns on the spot. Without `look` no
-        sight is taken until the next stretch begins.
+        With `gates`, only a line that leads through one of them is accepted until `settle` is
+        called: others may be in view, for example while the rover turns on the spot. Without
+        `look`, no sight is taken until the next stretch begins.
         """
         self._ends.clear()
         self.sights, self.refused, self.entry = 0, 0, None
         self._gates, self._looks, self.regained = tuple(gates), look, False
 
     def settle(self) -> None:
-        """The stretch has been found and lies before the rover: from now on what goes on with it is
-        taken."""
+        """Accept from now on what continues the stretch: it has been found and lies in front of the
+        rover."""
         self._gates, self.regained = (), True
 
     @property
     def gated(self) -> bool:
-        """Whether the stretch is looked for through gates."""
+        """Whether the stretch is searched through gates."""
         return bool(self._gates)
 
     @property
@@ -117,11 +118,11 @@ class TrackMap:
         all."""
         return not self._looks or bool(self._ends)
 
-    # Taking in
+    # Input
 
     def take(self, pose: Pose, ahead: TrackAhead) -> bool:
-        """A sight from `pose` (where the rover was at exposure). False if it was not taken: nothing
-        new, or something else."""
+        """Take a sight from `pose` (where the rover was at exposure). Return False if it was not
+        used: nothing new, or something else."""
         if len(ahead.points) < 3 or not self._looks:
             return False
         if not self._admitted(pose, ahead.points) or self._contradicts(pose, ahead.points):
@@ -139,7 +140,7 @@ class TrackMap:
         self.sights += 1
         self._local = None
         for x, y in ahead.points:
-            self._add(*pose.floor(x, y), 1.0 / (0.3 + x * x))  # near points are seen more sharply
+            self._add(*pose.floor(x, y), 1.0 / (0.3 + x * x))  # Near points are sharper.
         return True
 
     def plan(self, points: Sequence[Sequence[float]]) -> None:
@@ -158,7 +159,7 @@ class TrackMap:
         self._count, self._taken_at, self._local = 0, None, None
 
     def drop_plan(self) -> None:
-        """Expect nothing more; what was seen stays."""
+        """Forget what is expected; keep what was seen."""
         self._planned, self._local = np.empty((0, 3)), None
 
     def _add(self, x: float, y: float, weight: float) -> None:
@@ -177,18 +178,18 @@ class TrackMap:
         return self._alike >= ALIKE
 
     def _admitted(self, pose: Pose, points: Sequence[tuple[float, float]]) -> bool:
-        """Whether a line may be the new stretch."""
+        """Return whether a line may be the new stretch."""
         if not self._gates:
             return True
         line = [pose.floor(*point) for point in points]
         return any(passes(line, gate, GATE_ASIDE, GATE_TURN) for gate in self._gates)
 
     def _see_instead_of_plan(self, pose: Pose, points: Sequence[tuple[float, float]]) -> None:
-        """What was planned for where the line is now seen is planned no more.
+        """Remove the plan where the line is now seen.
 
-        A line that lies well beside the plan replaces all that was known, for a step in the map
-        would look like a bend; a smooth way from here to where it begins is planned instead, since
-        it may begin far ahead.
+        A line well beside the plan replaces all that was known, for a step in the map would look
+        like a bend. Since it may begin far ahead, a smooth path from here to its beginning is
+        planned instead.
         """
         if not len(self._planned):
             return
@@ -212,14 +213,14 @@ class TrackMap:
                 off.append(abs(fit.y - y) * math.cos(fit.heading))
         return len(off) >= 2 and sorted(off)[len(off) // 2] > OTHER
 
-    def _note_end(self, pose: Pose, end: End) -> None:
+    def _note_end(self, pose: Pose, end: LineEnd) -> None:
         self._ends.append((end.kind, *pose.floor(end.x, end.y)))
 
-    # Giving out
+    # Output
 
     @property
     def end(self) -> tuple[TrackEnd, float, float] | None:
-        """Kind and place (m) of the end of this stretch, None when none was seen."""
+        """Kind and position (m) of the end of this stretch, None when none was seen."""
         if not self._ends:
             return None
         kind = self._ends[-1][0]
@@ -233,8 +234,8 @@ class TrackMap:
         return (end[1], end[2]) if end is not None else self.tip
 
     def ahead(self, pose: Pose) -> float:
-        """How far ahead (m) the line is known, up to its end if that was seen; negative when that
-        lies behind."""
+        """Return how far ahead (m) the line is known, up to its end if that was seen; negative when
+        that lies behind."""
         place = self.end_place
         if place is None:
             return 0.0
@@ -248,8 +249,8 @@ class TrackMap:
     def fit(
         self, pose: Pose, x: float, reach: float = REACH, *, planned: bool = True
     ) -> Fit | None:
-        """The line `x` m ahead of a pose, from the points within `reach` of it; None where there
-        are too few."""
+        """Return the line `x` m ahead of a pose, from the points within `reach` of it; None where
+        there are too few."""
         near = self._near(pose, x, reach, planned)
         if near is None:
             return None
@@ -265,7 +266,7 @@ class TrackMap:
     def _near(
         self, pose: Pose, x: float, reach: float, planned: bool
     ) -> tuple[Vector, Vector, Vector] | None:
-        """Distances from the place, y and weights of the points that bear on it."""
+        """Return distances from the place, y and weights of the points that count there."""
         ahead, y, w, seen = self._around(pose)
         if not planned:
             ahead, y, w = ahead[:seen], y[:seen], w[:seen]
@@ -274,6 +275,7 @@ class TrackMap:
         if keep.size < NEEDED:
             return None
         d, y, w = d.take(keep), y.take(keep), w.take(keep)
+        # Biweight kernel: (1 - (d / reach)^2)^2 times the point's own weight.
         part = d * (1.0 / reach)
         part *= part
         np.subtract(1.0, part, out=part)
@@ -282,8 +284,8 @@ class TrackMap:
         return d, y, part
 
     def _around(self, pose: Pose) -> tuple[Vector, Vector, Vector, int]:
-        """Points near a pose in its body frame, weights, and how many of them were seen; kept,
-        since several fits ask for them."""
+        """Return points near a pose in its body frame, their weights, and how many of them were
+        seen; cached, since several fits need them."""
         if self._local is not None and self._local[0] == pose:
             return self._local[1]
         seen = self._points[: min(self._count, CAPACITY)]
@@ -299,13 +301,15 @@ class TrackMap:
 
 
 def _entry(pose: Pose, points: Sequence[tuple[float, float]]) -> Pose:
-    """Where a line seen from a pose begins, and its direction over the first third of a metre."""
+    """Return where a line seen from a pose begins, and its direction over the first third of a
+    metre."""
     (x0, y0), (x1, y1) = points[0], points[min(len(points) - 1, 6)]
     return Pose(*pose.floor(x0, y0), pose.heading + math.atan2(y1 - y0, x1 - x0))
 
 
 def _weighted(d: Vector, y: Vector, w: Vector, degree: int) -> Fit | None:
-    """Weighted least squares about d = 0, by normal equations: three unknowns at most."""
+    """Return the weighted least-squares fit about d = 0, by normal equations and Cramer's rule:
+    three unknowns at most."""
     wd = w * d
     s0, s1, s2 = float(w.sum()), float(wd.sum()), float(wd @ d)
     t0, t1 = float(w @ y), float(wd @ y)

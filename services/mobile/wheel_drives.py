@@ -1,9 +1,9 @@
-"""The CANopen master of the rover's bus: two wheel drives and the reflector sensor, on
-`services.comm.canopen_master`.
+"""CANopen master of the rover's bus: two wheel drives and the reflector sensor, on top of
+`services.comm.canopen.master`.
 
-A machine: frames in, frames out, times passed in. It knows neither track nor actions: each cycle it
-is given two wheel speeds (rad/s) and says how far the wheels have turned. A sensor that falls
-silent is reported, but stops nobody.
+Sans-I/O: frames in, frames out, times passed in. It knows neither track nor actions: each cycle it
+receives two wheel speeds (rad/s) and reports how far the wheels have turned. A silent sensor is
+reported, but does not stop the rover.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from petrobot.services.comm.canopen.master import (
 from petrobot.services.mobile.reflectors import ECHOES
 
 HEARTBEAT_PATIENCE: Final = 0.25
-"""s of silence after which a node counts as lost (both ways)."""
+"""Seconds of silence after which a node counts as lost (both ways)."""
 SILENT_CYCLES: Final = 5
-"""Cycles without a drive's TPDO after which it counts as lost."""
+"""Cycles without a drive's TPDO after which the drive counts as lost."""
 RESET_CYCLES: Final = 5
 """Cycles between two fault resets."""
 STOP_CYCLES: Final = 40
-"""Cycles that a drive is given to stop quickly before its power is taken away and its brake
+"""Cycles that a drive has for its quick stop, before its power is switched off and its brake
 holds."""
 SENSOR_TIMER_MS: Final = 40
 SENSOR_OBJECTS: Final = tuple(
@@ -60,7 +60,7 @@ _HALF, _WHOLE = 1 << 31, 1 << 32
 
 
 class WheelLink:
-    """What the master knows of one wheel's drive."""
+    """The master's view of one wheel's drive."""
 
     def __init__(self, node: int, quick_stop: float) -> None:
         """`quick_stop` in rad/s^2."""
@@ -68,7 +68,7 @@ class WheelLink:
         self.sdo = SdoClient(node)
         self.state = State.NOT_READY_TO_SWITCH_ON
         self.limited = False
-        """Whether the drive cuts its set points because the battery gives no more."""
+        """Whether the drive cuts its set points because the battery cannot supply more."""
         self.spoken = False
         self.silent = 0
         self.error_code = 0
@@ -78,8 +78,8 @@ class WheelLink:
         self._turned = 0
 
     def transfers(self, cycle: float) -> list[Transfer]:
-        """The configuration of this drive for a bus cycle of so many seconds, and what is read from
-        it."""
+        """Return the SDO transfers that configure this drive for a bus cycle (s), and read what the
+        master must know."""
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
             Transfer(
@@ -89,34 +89,35 @@ class WheelLink:
         ]
 
     def wrong(self) -> str:
-        """What makes the device at this node unfit, in words; empty if nothing."""
+        """Return in words why the device at this node does not fit; empty if it does."""
         return unfit(self.node, self.sdo.results, _MODE)
 
     def take(self, data: bytes) -> bool:
-        """The drive's TPDO; says whether its status is another one. Raises ValueError for bytes
-        that are none."""
+        """Process the drive's TPDO; return whether its status has changed. Raises ValueError for
+        bytes of another length."""
         if len(data) != _TPDO.size:
             raise ValueError(
-                f"TPDO of node {self.node} has {len(data)} bytes, must have {_TPDO.size}"
+                f"TPDO of node {self.node}: expected {_TPDO.size} bytes, got {len(data)}"
             )
         statusword, position, _ = _TPDO.unpack(data)
         before = self.state, self.limited
         self.state = state_of(statusword)
         self.limited = bool(statusword & StatusBit.INTERNAL_LIMIT)
         if self._position is not None:
+            # The position counts modulo 2^32: take the difference as a signed 32-bit number.
             self._turned += (position - self._position + _HALF) % _WHOLE - _HALF
         self._position = position
         self.silent, self.spoken = 0, True
         return (self.state, self.limited) != before
 
     def turned(self) -> float:
-        """rad that the wheel has turned since the last call."""
+        """Return the rad that the wheel has turned since the last call."""
         turned, self._turned = self._turned, 0
         return from_units(turned)
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
-        """The RPDO: a controlword that leads to where the master wants the drive, and the target
-        speed (rad/s)."""
+        """Return the RPDO: the controlword that leads to the state that the master wants, and the
+        target speed (rad/s)."""
         word = self._power.word(self.state, wanted, resetting)
         return Frame(canopen.RPDO1_BASE + self.node, _RPDO.pack(word, to_units(target)))
 
@@ -144,11 +145,11 @@ class WheelMaster(CanopenMaster[WheelLink]):
 
     @property
     def sensor_alive(self) -> bool:
-        """Whether the sensor's heartbeat has been heard of late."""
+        """Whether the sensor's heartbeat has been received recently."""
         return self.alive(self.sensor)
 
     def wheel(self, trouble: Trouble) -> str:
-        """Which wheel a trouble is of, "" if of none."""
+        """Return the wheel that a trouble belongs to, "" if none."""
         return "" if trouble.axis is None else self.names[trouble.axis]
 
     def _take_echoes(self, data: bytes) -> None:

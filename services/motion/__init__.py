@@ -1,1 +1,2 @@
-"""The motion node's actions: the PUMA 560, its drives and its ways of intercepting."""
+"""Actions and drivers of the motion node: the PUMA 560, its drives, and how it intercepts a
+ball."""

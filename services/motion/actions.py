@@ -1,8 +1,8 @@
-"""The arm's primitive actions: intercept, follow and wait, empty and home, reset and home.
+"""Primitive actions of the arm: intercept, follow and wait, empty and home, reset and home.
 
-All are coroutines that see the servo only through `ctx.device`, a `Remote` of
+All are coroutines that reach the driver only through `ctx.device`, a `Remote` of
 `petrobot.services.motion.arm:Arm`: they send commands and read its state. Error causes:
-`drive_fault`, `power`, `bus` (as the servo says), `unreachable`, `no_setpoint`, `refused`,
+`drive_fault`, `power`, `bus` (reported by the driver), `unreachable`, `no_setpoint`, `refused`,
 `arm_timeout`, `cup_not_empty`.
 """
 
@@ -14,19 +14,19 @@ from typing import Any, Final
 from petrobot.services.action import Cancelled, Context, Result, Status, error, failure, success
 
 RENEW: Final = 0.1
-"""s between repeated `follow` commands: a servo that hears none for 0.5 s holds."""
+"""Seconds between repeated `follow` commands; the driver holds if it receives none for 0.5 s."""
 GRACE: Final = 0.3
-"""s that a caught ball leaves the external event to preempt the run before the run ends by
-itself."""
+"""Seconds for which the run stays active after the catch, so that the external event can preempt it
+first."""
 CYCLE: Final = 0.004
-"""s, the servo's cycle: the least that it makes sense to wait."""
+"""Seconds per cycle of the driver: waiting less makes no sense."""
 ANSWER: Final = 0.5
-"""s within which the servo takes a command."""
+"""Seconds within which the driver must accept a command."""
 NOW: Final = 0.1
-"""s before the arrival from which no better prediction is waited for."""
+"""Seconds before the arrival from which a better prediction is not awaited any more."""
 IN_FLIGHT: Final = 0.2
-"""s before the arrival from which the stream may cease: the ball has left the table, or is about
-to."""
+"""Seconds before the arrival from which the stream may cease: the ball has left the table, or is
+about to."""
 
 
 async def intercept_upright(
@@ -37,8 +37,8 @@ async def intercept_upright(
     patience: float = 3.0,
     sigma: float = 0.008,
 ) -> Result:
-    """Bring the cup, held upright, to where the ball will fall into it, about `depth` m below the
-    exit. See `_intercept`."""
+    """Bring the upright cup to where the ball will fall into it, about `depth` m below the exit.
+    See `_intercept`."""
     return await _intercept(
         ctx, {"strategy": "upright", "preferred": depth}, timeout, patience, sigma
     )
@@ -53,8 +53,8 @@ async def intercept_tilted(
     patience: float = 3.0,
     sigma: float = 0.008,
 ) -> Result:
-    """Bring the cup, tilted by `tilt` (rad) against the ball, to its way about `depth` m below the
-    exit. See `_intercept`."""
+    """Bring the cup, tilted by `tilt` (rad) against the ball, into its path about `depth` m below
+    the exit. See `_intercept`."""
     return await _intercept(
         ctx, {"strategy": "tilted", "tilt": tilt, "preferred": depth}, timeout, patience, sigma
     )
@@ -63,12 +63,12 @@ async def intercept_tilted(
 async def follow_and_wait(
     ctx: Context, *, margin: float = 0.4, patience: float = 1.0, timeout: float = 10.0
 ) -> Result:
-    """Keep the cup on the newest prediction and wait for the ball until `margin` s after its
+    """Keep the cup at the newest prediction and wait for the ball until `margin` s after its
     predicted arrival.
 
     SUCCESS when the ball lies in the cup, unless the external event `ball_caught` ends the run
-    first; FAILURE `missed`. ERROR `no_setpoint` if no prediction comes within `patience` s or
-    predictions cease long before the ball, and as the servo says.
+    first; FAILURE `missed`. ERROR `no_setpoint` if no prediction arrives within `patience` s or the
+    stream ceases long before the ball arrives, and the driver's own errors.
     """
     following = _Following(ctx, {})
     try:
@@ -78,7 +78,7 @@ async def follow_and_wait(
         if result.cause == "" and ctx.device.state["ball_in_cup"]:
             await ctx.sleep(GRACE)
     finally:
-        ctx.device.send({"do": "hold"})  # also when the run is preempted
+        ctx.device.send({"do": "hold"})  # Also when the run is preempted.
     return result
 
 
@@ -91,12 +91,12 @@ async def empty_and_home(
     timeout: float = 12.0,
     always: bool = False,
 ) -> Result:
-    """Go home, turn the cup over away from the table if something is in it (or `always`), and see
+    """Go home; turn the cup over away from the table if something is in it (or `always`); check
     that it is empty.
 
-    Home first: on the straight way from a catch far aside to where the cup is turned over, the cup
-    would meet the table's edge. ERROR `cup_not_empty` if the light barrier stays interrupted after
-    so many `attempts`.
+    The arm goes home first: on the straight path from a catch at the side to the emptying pose, the
+    cup would hit the edge of the table. ERROR `cup_not_empty` if the light barrier is still
+    interrupted after so many `attempts`.
     """
     until = ctx.now + timeout
     stuck = await _go(ctx, "home", speed, until)
@@ -119,9 +119,12 @@ async def empty_and_home(
 
 
 async def reset_and_home(ctx: Context, *, speed: float = 0.3, timeout: float = 15.0) -> Result:
-    """Reset faults, enable the drives again and bring the arm home slowly, and empty the cup if
-    a ball lies in it: the next one would find no room. ERROR as the servo says if they stay in
-    fault."""
+    """Reset faults, enable the drives again, bring the arm home slowly, and empty the cup if a ball
+    lies in it.
+
+    A ball left in the cup would leave no room for the next one. ERROR as the driver reports if the
+    drives stay in fault.
+    """
     until = ctx.now + timeout
     why = await _command(ctx, {"do": "reset"})
     if why:
@@ -136,12 +139,12 @@ async def reset_and_home(ctx: Context, *, speed: float = 0.3, timeout: float = 1
 async def _intercept(
     ctx: Context, how: Mapping[str, Any], timeout: float, patience: float, sigma: float
 ) -> Result:
-    """Follow the stream's catch points until the cup is in place for one that is good enough.
+    """Follow the catch points of the stream until the cup is in place for one that is good enough.
 
-    SUCCESS: in place, and the prediction's sigma_y is at most `sigma` (m) or the ball is as good as
-    there; FAILURE `late`: the ball's predicted arrival went by before; ERROR: `no_setpoint` (none
-    within `patience` s, or they have ceased), `unreachable`, or as the servo says. Following goes
-    on but after an ERROR, for `follow_and_wait`.
+    SUCCESS: in place, and sigma_y of the prediction is at most `sigma` (m) or the ball is about to
+    arrive; FAILURE `late`: the predicted arrival has passed; ERROR: `no_setpoint` (none within
+    `patience` s, or the stream has ceased), `unreachable`, or as the driver reports. After SUCCESS
+    and FAILURE the arm keeps following, for `follow_and_wait`.
     """
     following = _Following(ctx, how)
     try:
@@ -157,8 +160,7 @@ async def _intercept(
 
 
 class _Following:
-    """Repeats the `follow` command as the servo asks for, and looks at its state whenever there is
-    something new."""
+    """Repeat the `follow` command as the driver requires, and judge each new state of the arm."""
 
     def __init__(self, ctx: Context, how: Mapping[str, Any]) -> None:
         self._ctx = ctx
@@ -168,8 +170,8 @@ class _Following:
     async def until(
         self, judge: Callable[[Mapping[str, Any], float], Result | None], timeout: float
     ) -> Result:
-        """Follow until `judge(state, seconds)` gives a result, the servo is in trouble, or
-        `timeout` s are over."""
+        """Follow until `judge(state, seconds)` returns a result, the driver reports a fault, or
+        `timeout` s have passed."""
         ctx = self._ctx
         why = await self._renew()
         if why:
@@ -197,7 +199,7 @@ class _Following:
 def _await_place(
     state: Mapping[str, Any], waited: float, patience: float, sigma: float
 ) -> Result | None:
-    """What an interception has come to; None while it goes on."""
+    """Return the result of an interception; None while it is in progress."""
     plan, reason = state["plan"], state["reason"]
     if reason == "unreachable":
         return error("unreachable", "the arm cannot bring the cup to the predicted point")
@@ -219,7 +221,7 @@ def _await_place(
 def _await_ball(
     state: Mapping[str, Any], waited: float, margin: float, patience: float
 ) -> Result | None:
-    """What waiting for the ball has come to; None while it goes on."""
+    """Return the result of waiting for the ball; None while it is in progress."""
     plan = state["plan"]
     if state["ball_in_cup"]:
         return success(point=_point(state))
@@ -235,7 +237,7 @@ def _await_ball(
 
 
 def _ceased(state: Mapping[str, Any]) -> Result | None:
-    """The error of a stream that ended while the ball was still far."""
+    """Return the error of a stream that ended while the ball was still far away."""
     if state["reason"] == "no_setpoint" and state["plan"]["arrival"] > IN_FLIGHT:
         return error(
             "no_setpoint",
@@ -250,7 +252,7 @@ def _point(state: Mapping[str, Any]) -> list[float]:
 
 
 def _trouble(state: Mapping[str, Any]) -> Result | None:
-    """The servo's first fault as an action's end."""
+    """Return the driver's first fault as the result of an action."""
     if state["faults"]:
         cause, joint, code, text = state["faults"][0]
         return error(cause, text, joint=joint, code=code)
@@ -258,8 +260,8 @@ def _trouble(state: Mapping[str, Any]) -> Result | None:
 
 
 async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
-    """Send a command and wait until the servo has taken it; gives why it was refused, empty if it
-    was not."""
+    """Send a command and wait until the driver has processed it; return why it was refused, empty
+    if it was not."""
     number = ctx.device.send(body)
     if not await ctx.wait(lambda: ctx.device.handled >= number, ANSWER):
         return "the servo does not answer"
@@ -267,7 +269,7 @@ async def _command(ctx: Context, body: Mapping[str, Any]) -> str:
 
 
 async def _go(ctx: Context, pose: str, speed: float, until: float) -> Result | None:
-    """Move to a named pose; None when it is reached, else how the action ends."""
+    """Move to a named pose; return None when it is reached, else the result of the action."""
     why = await _command(ctx, {"do": "move", "pose": pose, "speed": speed})
     if why:
         return _trouble(ctx.device.state) or error("refused", why)

@@ -1,18 +1,19 @@
-"""The driver `Arm`: the PUMA's servo on its bus, in cycles of 4 ms.
+"""Driver of the PUMA: class `Arm`, which controls the arm over its CAN bus in cycles of 4 ms.
 
-Each cycle it reads the bus, moves the commanded trajectory on within the joint limits and the
-guard's, and sends the drives their set points. Commands (plain data, key `do`):
+In each cycle it reads the bus, advances the commanded trajectory within the joint limits and the
+limits of the collision guard, and sends set points to the drives. Commands are plain data; the key
+`do` names them:
 
     {"do": "move", "pose": NAME or six angles (rad), "speed": 0 to 1}   all joints arrive together
-    {"do": "follow", "strategy": NAME, ...}    go where the stream's newest prediction can be
-                                               caught; must be repeated within
-                                               `LEASE` seconds, else the arm holds
+    {"do": "follow", "strategy": NAME, ...}    go to where the newest prediction of the stream can
+                                               be caught; must be repeated within `LEASE`
+                                               seconds, else the arm holds
     {"do": "hold"}      come to rest and stay there
-    {"do": "reset"}     forget faults, configure and enable the drives again, hold
-    {"do": "disable"}   come to rest, then take the power away: the brakes hold
+    {"do": "reset"}     clear faults, configure and enable the drives again, then hold
+    {"do": "disable"}   come to rest, then switch the power off: the brakes hold the arm
 
-No set point older than three of its periods is ever executed: the arm then brakes at its limits and
-holds.
+The driver never executes a set point that is older than three periods of its stream: the arm then
+brakes at its limits and holds.
 """
 
 from __future__ import annotations
@@ -20,42 +21,163 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import sub
 from typing import Any, Final
 
 import numpy as np
 
-from petrobot.services.device import Ports, Setpoint
-from petrobot.services.motion.arm_settings import Settings, drive_settings, numbers
-from petrobot.services.motion.barrier import Barrier
-from petrobot.services.motion.drive_master import DriveMaster, Phase
+from petrobot.services.comm.canopen.master import Phase
+from petrobot.services.device import Ports, Setpoint, refuse_unknown_keys
+from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.services.motion.following import Follower
 from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
 from petrobot.services.motion.kinematics import Puma, branch_of
-from petrobot.services.motion.limits import Guard
-from petrobot.services.motion.model import JOINTS
+from petrobot.services.motion.limits import CollisionGuard
+from petrobot.services.motion.model import (
+    JOINTS,
+    ArmModel,
+    CatchingCell,
+    nominal_arm,
+    nominal_cell,
+    read_arm,
+    read_cell,
+)
 from petrobot.services.motion.steering import Steering
 
+# --- Settings ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Configuration of the driver in services.toml.
+
+    `stream` and `stream_period` (s) name the stream of catch points; `speed` is the share of the
+    joints' greatest speeds to use; `enable` says whether to enable the drives at the start; `model`
+    and `cell` name files to read instead of the package's own.
+    """
+
+    stream: str = "catch_point"
+    stream_period: float = 0.02
+    speed: float = 1.0
+    enable: bool = True
+    model: str = ""
+    cell: str = ""
+
+    @classmethod
+    def parse(cls, config: Mapping[str, Any]) -> Settings:
+        """Read the device's table; ignore the keys of its ports (interface, channel, ...). Raises
+        ValueError."""
+        refuse_unknown_keys(config, cls.__slots__)
+        fields = {name: config[name] for name in cls.__slots__ if name in config}
+        for name, value in fields.items():
+            kind = type(getattr(_DEFAULTS, name))
+            fits = (
+                isinstance(value, int | float) and not isinstance(value, bool)
+                if kind is float
+                else type(value) is kind
+            )
+            if not fits:
+                raise ValueError(
+                    f"services.toml: arm: {name}: expected a {kind.__name__}, got {value!r}"
+                )
+        settings = cls(**fields)
+        if not 0.0 < settings.speed <= 1.0:
+            raise ValueError(
+                "services.toml: arm: speed: expected a number above 0 and at most 1, got "
+                f"{settings.speed}"
+            )
+        if not settings.stream_period > 0.0:
+            raise ValueError(
+                "services.toml: arm: stream_period: expected seconds above 0, got "
+                f"{settings.stream_period}"
+            )
+        return settings
+
+
+_DEFAULTS: Final = Settings()
+
+
+def numbers(settings: Settings, ports: Ports) -> tuple[ArmModel, CatchingCell]:
+    """Return the arm and the cell: the package's own, or those in the files that the settings
+    name."""
+    model = read_arm(ports.file(settings.model).decode()) if settings.model else nominal_arm()
+    return model, (
+        read_cell(ports.file(settings.cell).decode()) if settings.cell else nominal_cell()
+    )
+
+
+def drive_settings(model: ArmModel) -> list[DriveSettings]:
+    """Return the configuration of each drive, base to flange."""
+    limits = zip(
+        model.lower.tolist(), model.upper.tolist(), model.acceleration.tolist(), strict=True
+    )
+    return [DriveSettings(lower, upper, acceleration) for lower, upper, acceleration in limits]
+
+
+# --- The light barrier in the cup ----------------------------------------------------------------
+
+BALL_SETTLE: Final = 0.06
+"""Seconds for which the beam must stay interrupted. A ball that only bounces through does not
+count."""
+
+
+class CupBarrier:
+    """Decide from the light barrier whether a ball has been caught.
+
+    A ball counts once the beam has been interrupted for `BALL_SETTLE`. It is reported once, and
+    only if `arm` was called and the cup has been empty since.
+    """
+
+    def __init__(self) -> None:
+        self.interrupted = False
+        self.present = False
+        self._since = 0.0
+        self._wanted = False
+        self._armed = False
+
+    def arm(self) -> None:
+        """Report the next ball that comes into the empty cup."""
+        self._wanted, self._armed = True, False
+
+    def look(self, now: float, interrupted: bool) -> bool:
+        """Process the state of the beam; return True in the one cycle in which an awaited ball
+        counts."""
+        if not interrupted:
+            self.interrupted = self.present = False
+            self._armed = self._armed or self._wanted
+            self._wanted = False
+            return False
+        if not self.interrupted:
+            self.interrupted, self._since = True, now
+        self.present = now - self._since >= BALL_SETTLE - 1e-9
+        told = self.present and self._armed
+        self._armed = self._armed and not told
+        return told
+
+
+# --- The driver ----------------------------------------------------------------------------------
+
 PERIOD: Final = 0.004
-"""s, the servo's and the bus's cycle."""
+"""Seconds per cycle of driver and bus."""
 LEASE: Final = 0.5
-"""s after which following ends in a hold if the action that asked for it has gone silent."""
+"""Seconds after which following ends in a hold unless the action has repeated its command."""
 SPEED_SHARE: Final = 0.97
-"""Share of the drives' greatest speed that is commanded: the rest is theirs to catch up with."""
+"""Share of the drives' greatest speed that is commanded. The drives need the rest to catch up."""
 LEAST_SHARE: Final = 1e-3
-"""Slower than this share of its speed no arm moves on purpose."""
+"""Smallest share of its speed at which the arm accepts a move."""
 IN_PLACE: Final = 0.003
-"""rad by which the measured joints may differ from the pose that a move is said to have reached."""
+"""Rad by which the measured joints may differ from the goal of a move that counts as reached."""
 NEAR_PLACE: Final = 0.02
-"""rad, the same while following, where small corrections never end: 5 mm at the cup."""
+"""The same while following, where small corrections never end (rad); 5 mm at the cup."""
 LAG_CYCLES: Final = 8
-"""Cycles by which the measured joints may follow the commanded ones: bus, links, interpolation,
-sampling."""
+"""Cycles by which the measured joints may lag behind the commanded ones: bus, links, interpolation
+and sampling each add some."""
 LAG_PERIOD: Final = 5
-"""Cycles after which the following error is worked out anew: 20 ms."""
+"""Cycles between two computations of the following error: 20 ms."""
 LOST: Final = 0.15
-"""rad of following error at which the servo itself gives up, besides the drives' own watch."""
+"""Rad of following error at which the driver stops the arm, in addition to each drive's own
+check."""
 BALL: Final = 0x01
 POWER: Final = 0x02
 
@@ -70,7 +192,7 @@ class Arm:
         self._ports = ports
         self.model, cell = numbers(settings, ports)
         self._puma = Puma.of(self.model)
-        self._guard = Guard(self._puma, self.model, cell)
+        self._guard = CollisionGuard(self._puma, self.model, cell)
         home = self.model.poses["home"]
         self._interceptor = Interceptor(
             self._puma, cell, self._guard, home, branch_of(self._puma, np.asarray(home))
@@ -85,7 +207,7 @@ class Arm:
         self._setpoint: Setpoint = ports.stream(settings.stream)
         self._bus = ports.can()
         self._follower = Follower(settings.stream_period)
-        self._ball = Barrier()
+        self._ball = CupBarrier()
         self._mode = "off"
         self._reason = ""
         self._paused = False
@@ -106,9 +228,9 @@ class Arm:
             "disable": self._disable,
         }
 
-    # Driver contract.
+    # What the node calls (`services.device.Driver`).
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Take a command; raises ValueError for one that is unknown, malformed, or cannot be obeyed
+        """Accept a command. Raises ValueError if it is unknown, malformed, or cannot be obeyed
         now."""
         act = self._commands.get(str(body.get("do")))
         if act is None:
@@ -118,7 +240,7 @@ class Arm:
         act(now, body)
 
     def step(self, now: float) -> None:
-        """One cycle."""
+        """Run one cycle."""
         self._cycles += 1
         self._now = now
         try:
@@ -140,7 +262,7 @@ class Arm:
             self._master.bus_lost(now, str(reason))
 
     def state(self) -> Mapping[str, Any]:
-        """What actions, operator and report see; see `docs/motion.md` for the keys."""
+        """Return what actions, operator and report see; docs/motion.md explains the keys."""
         master, trajectory, follower = self._master, self._trajectory, self._follower
         return {
             "enabled": self._mode != "off",
@@ -178,12 +300,12 @@ class Arm:
         self._rest("stopped")
 
     def quick_stop(self, now: float) -> None:
-        """Emergency stop: the drives stop quickly with the next cycle; then their power goes and
+        """Stop in an emergency: the drives quick-stop in the next cycle, then lose their power, and
         the brakes hold."""
         self._master.give_up("emergency stop", "emergency_stop", 0)
 
     def stopped(self) -> bool:
-        """Whether the arm stands still, held by its drives or its brakes."""
+        """Return whether the arm stands still, held by its drives or its brakes."""
         if self._mode == "off":
             return (
                 self._master.phase is not Phase.RUNNING
@@ -192,12 +314,12 @@ class Arm:
         return self._trajectory.still and self._standing()
 
     def hold(self, now: float) -> str:
-        """Operator's pause: brake, and go on with the same after `release`."""
+        """Pause for the operator: brake, and resume the same motion after `release`."""
         self._paused = True
         return "held"
 
     def release(self, now: float) -> None:
-        """End of the pause."""
+        """End the pause."""
         self._paused = False
         self._leased_until = max(self._leased_until, now + LEASE)
 
@@ -249,12 +371,15 @@ class Arm:
             or len(pose) != JOINTS
             or not all(math.isfinite(angle) for angle in pose)
         ):
-            raise ValueError(f"a pose is a name or {JOINTS} angles in rad, not {pose!r}")
+            raise ValueError(
+                f"move: pose: expected a name or {JOINTS} finite angles in rad, got {pose!r}"
+            )
         return [float(angle) for angle in pose]
 
     # The cycle.
     def _speeds(self) -> list[float]:
-        """Joint speeds to command: the settings' or the drives' own, whichever is less (rad/s)."""
+        """Return the joint speeds to command: those of the settings or of the drives, whichever are
+        less (rad/s)."""
         drives = [SPEED_SHARE * speed or math.inf for speed in self._master.speeds]
         return [min(mine, theirs) for mine, theirs in zip(self._full_speed, drives, strict=True)]
 
@@ -265,13 +390,13 @@ class Arm:
         ]
 
     def _sense(self, now: float) -> None:
-        """The light barrier."""
+        """Read the light barrier."""
         inputs = self._master.inputs
         if inputs is not None and self._ball.look(now, bool(inputs & BALL)):
             self._ports.raise_event("ball_caught")
 
     def _drive(self, now: float) -> None:
-        """Move the commanded trajectory on by one cycle."""
+        """Advance the commanded trajectory by one cycle."""
         enabled = self._master.enabled
         if self._mode == "off":
             if enabled:
@@ -300,6 +425,8 @@ class Arm:
 
     def _advance(self) -> None:
         self._commanded.append(self._trajectory.q)
+        # Receiving and planning took time. A set point must be fresh at the moment at which it is
+        # executed, so read the clock again.
         late = (
             self._ports.now
         )  # receiving and planning took time: what counts is the clock at the last moment
@@ -310,18 +437,19 @@ class Arm:
             self._follower.executed(late)
 
     def _follows(self) -> bool:
-        """Whether this cycle goes towards a set point."""
+        """Return whether this cycle moves towards a set point."""
         return self._mode == "follow" and self._steering.goal is not None and not self._paused
 
     def _let_go(self) -> None:
-        """The last set point is stale: come to rest, and take its values for new ones if they come
+        """Come to rest because the last set point is stale; count its values as new if they arrive
         again."""
         self._steering.rest()
         self._follower.drop()
         self._reason = "no_setpoint"
 
     def _follow_on(self, now: float) -> None:
-        """Aim at the newest prediction, or hold where it is stale or the action silent."""
+        """Aim at the newest prediction; hold if it is stale or the action has stopped repeating its
+        command."""
         follower, trajectory = self._follower, self._trajectory
         if now > self._leased_until and not self._paused:
             self._rest("silent_action")
@@ -351,33 +479,36 @@ class Arm:
         self._mode, self._reason, self._after_stop = "off", reason, ""
 
     def _lag(self) -> float:
-        """How far (rad) the measured joints are off the path commanded of late; how late they are
-        on it does not count."""
+        """Return how far the measured joints are from the recently commanded path (rad).
+
+        Lateness on the path does not count: the distance to the nearest commanded pose of the last
+        `LAG_CYCLES` cycles is taken.
+        """
         if self._mode == "off" or not self._commanded:
             return 0.0
         least, before, measured = math.inf, None, self._measured
         for q in self._commanded:
-            if q is before:  # the same one cycle after cycle while the arm stands
+            if q is before:  # The arm stands: the same tuple was commanded again.
                 continue
             before, farthest = q, 0.0
             for a, b in zip(q, measured, strict=True):
                 off = a - b if a > b else b - a
                 if off > farthest:
                     farthest = off
-                    if off >= least:  # most often by the first joint
+                    if off >= least:  # Usually the first joint decides.
                         break
             else:
                 least = farthest
         return least
 
     def _lost(self) -> bool:
-        """Whether the measured joints are too far off all of that path; most often the first look
-        settles it."""
+        """Return whether the measured joints are too far from every pose of that path; usually the
+        first comparison decides."""
         return bool(self._commanded) and all(self._off_by(q) > LOST for q in self._commanded)
 
     def _in_place(self) -> bool:
-        """Whether the measured joints are where they are wanted: at the end of a move, or at the
-        newest plan's pose."""
+        """Return whether the measured joints are at the end of a move, or at the pose of the newest
+        plan."""
         if self._mode == "follow":
             plan = self._follower.plan
             return plan is not None and self._off_by(plan.q) < NEAR_PLACE
@@ -407,13 +538,13 @@ def _share(value: Any) -> float:
         or not isinstance(value, int | float)
         or not LEAST_SHARE <= value <= 1.0
     ):
-        raise ValueError(f"speed = {value!r}: must be at least {LEAST_SHARE:g} and at most 1")
+        raise ValueError(f"move: speed: expected a number from {LEAST_SHARE:g} to 1, got {value!r}")
     return float(value)
 
 
 def _strategy(body: Mapping[str, Any], present: Strategy) -> Strategy:
-    """The strategy that a command names, with its own values where it gives any; without a name the
-    present one."""
+    """Return the strategy that a command names, changed by the values that it gives; the present
+    strategy if it names none."""
     name = body.get("strategy")
     if name is not None and name not in STRATEGIES:
         raise ValueError(f"unknown strategy {name!r}: know {', '.join(STRATEGIES)}")

@@ -1,5 +1,5 @@
-"""Following a stream of catch points: which set points may be executed, and the plan made of the
-newest one."""
+"""Following a stream of catch points: which set points may be executed, and the plan for the newest
+one."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ from typing import Any, Final
 from petrobot.services.device import Setpoint
 from petrobot.services.motion.interception import (
     STRATEGIES,
+    CatchPlan,
     Interceptor,
-    Plan,
     Prediction,
     Strategy,
 )
 from petrobot.services.motion.trajectory import Trajectory
 
 STALE_PERIODS: Final = 3
-"""Periods of the stream after which a set point is not executed any more."""
+"""Periods of the stream after which a set point must not be executed any more."""
 FROZEN: Final = 0.03
-"""s before the ball from which the cup keeps still: what can still be corrected is less than what a
-moving rim can spoil."""
+"""Seconds before the ball arrives from which the cup keeps still: a late correction gains less than
+a moving rim can spoil."""
 SAME_PLACE: Final = 0.0003
-"""m, SAME_SPEED m/s, SAME_TIME s: what two predictions may differ by and still lead to one plan;
-0.5 mm at the cup."""
+"""m, `SAME_SPEED` m/s, `SAME_TIME` s: by how much two predictions may differ and still share one
+plan; 0.5 mm at the cup."""
 SAME_SPEED: Final = 0.002
 SAME_TIME: Final = 0.002
 SAME_SIGMA: Final = 0.002
 ROUNDING: Final = 1e-9
-"""s by which rounding may carry an age."""
+"""Seconds by which rounding may change an age."""
 
 
 class Follower:
-    """The stream's newest prediction and what became of it."""
+    """The newest prediction of the stream, and the plan for it."""
 
     def __init__(self, period: float) -> None:
         self._period = period
         self.strategy: Strategy = STRATEGIES["tilted"]
-        self.plan: Plan | None = None
+        self.plan: CatchPlan | None = None
         self._made = 0.0
         self._prediction: Prediction | None = None
         self._planned: Prediction | None = None
@@ -52,25 +52,25 @@ class Follower:
         self.stale = 0
 
     def begin(self, count: int) -> None:
-        """Forget what was: only set points that come from now on count."""
+        """Forget the past: only set points that arrive from now on count."""
         self.plan, self._prediction, self._values = None, None, None
         self.count, self.age, self._came = count, math.inf, -math.inf
 
     def fresh(self, now: float) -> bool:
-        """Whether the last good set point may be executed (still); notes its age."""
+        """Return whether the last valid set point may still be executed; store its age."""
         self.age = now - self._came
         return self.age <= STALE_PERIODS * self._period + ROUNDING
 
     def executed(self, now: float) -> None:
-        """A cycle went towards the last good set point: its age is kept account of apart from what
-        decides about it."""
+        """Record that a cycle moved towards the last valid set point; its age is recorded
+        separately from the rule that decides about it."""
         age = now - self._came
         self.oldest = max(self.oldest, age)
         self.stale += age > STALE_PERIODS * self._period + ROUNDING
 
     def take(self, setpoint: Setpoint, now: float) -> bool:
-        """Take a set point with new values if there is one that may be executed; a repeat only
-        makes the last one younger."""
+        """Accept a set point with new values if it may be executed; a repetition only renews the
+        last one."""
         values = setpoint.values
         if setpoint.count == self.count or values is None:
             return False
@@ -86,7 +86,7 @@ class Follower:
         return self.fresh(now) and new
 
     def drop(self) -> None:
-        """The last set point has become stale: its values count as new if they come again."""
+        """Treat the values of the stale set point as new if they arrive again."""
         self._values = None
 
     def plan_with(
@@ -96,9 +96,9 @@ class Follower:
         speed: Sequence[float],
         acceleration: Sequence[float],
         now: float,
-    ) -> Plan | None:
-        """Plan for the prediction just taken; None if it cannot be reached (the plan of before is
-        forgotten)."""
+    ) -> CatchPlan | None:
+        """Plan for the prediction just accepted; return None if it cannot be reached (then the
+        earlier plan is forgotten)."""
         assert self._prediction is not None
         if self.plan is not None and (
             self.plan.arrival - (now - self._made) < FROZEN or self._says_the_same(now)
@@ -117,8 +117,8 @@ class Follower:
         return self.plan
 
     def _says_the_same(self, now: float) -> bool:
-        """Whether the newest prediction differs from the planned one by less than is worth a new
-        plan."""
+        """Return whether the newest prediction differs too little from the planned one to be worth
+        a new plan."""
         new, old = self._prediction, self._planned
         if new is None or old is None or self.strategy != self._planned_for:
             return False
@@ -131,7 +131,7 @@ class Follower:
         )
 
     def published(self, now: float) -> dict[str, Any] | None:
-        """The plan as plain data: times are seconds from `now`."""
+        """Return the plan as plain data; times are seconds from `now`."""
         plan, prediction = self.plan, self._prediction
         if plan is None or prediction is None:
             return None

@@ -1,13 +1,13 @@
-"""Where to catch: from a predicted exit over the table's edge to the joint pose that has the cup
+"""Where to catch: from a predicted exit over the table's edge to a joint pose that has the cup
 there in time. Pure.
 
-The ball leaves the edge and falls along a parabola. Along its fall candidates are laid out, each a
-depth below the edge and a turn of the hand about the cup's axis (which leaves the cup where it is,
-but brings other joints to work); all are solved and timed at once, on the arm's own branch. The
-cheapest is taken: in time first, then quickly reached, near the preferred depth, mouth open to the
-ball. The choice of before keeps a bonus, so that small changes of the prediction move the pose a
-little instead of jumping to another candidate. docs/motion.md tells how depths and tilt were
-chosen.
+The ball leaves the edge and falls along a parabola. Candidates are laid out along its fall: each is
+a depth below the edge and a turn of the hand about the cup's axis, which leaves the cup in place
+but uses other joints. All candidates are solved and timed at once, on one branch of the inverse
+kinematics, and the cheapest is taken: in time first, then quickly reached, near the preferred
+depth, mouth open to the ball. The earlier choice keeps a bonus, so that a small change of the
+prediction moves the pose a little instead of jumping to another candidate. docs/motion.md says how
+depths and tilt were chosen.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.services.motion.kinematics import Branch, Puma
-from petrobot.services.motion.limits import Guard
-from petrobot.services.motion.model import Cell, Vector
+from petrobot.services.motion.kinematics import ArmBranch, Puma
+from petrobot.services.motion.limits import CollisionGuard
+from petrobot.services.motion.model import CatchingCell, Vector
 from petrobot.services.motion.trajectory import reach_time
 
 STREAM_LENGTH: Final = 9
-"""Values of a set point of `catch_point`: time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t."""
+"""Number of values in a set point of `catch_point`: time_to_go, x, y, z, vx, vy, vz, sigma_y,
+sigma_t."""
 
 
 LARGEST: Final = 1000.0
-"""s, m or m/s beyond which a number is no catch point of any laboratory (nor is one that is not
-finite)."""
+"""s, m or m/s above which a number cannot belong to a catch point of any laboratory; rejects NaN
+and infinity too."""
 SLOWEST: Final = 1e-3
-"""m/s towards the arm, below which a ball does not come."""
+"""m/s towards the arm below which the ball does not arrive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,24 +49,26 @@ class Prediction:
 
     @classmethod
     def parse(cls, values: Sequence[float], age: float = 0.0) -> Prediction:
-        """A set point that arrived `age` seconds ago. Raises ValueError if it is none, or moves
-        away from the arm."""
+        """Read a set point that arrived `age` seconds ago. Raises ValueError if it is malformed or
+        moves away from the arm."""
         if len(values) != STREAM_LENGTH or not all(abs(value) <= LARGEST for value in values):
             raise ValueError(
-                f"a catch point has {STREAM_LENGTH} numbers of at most {LARGEST:g}, not "
+                f"catch point: expected {STREAM_LENGTH} numbers of at most {LARGEST:g}, got "
                 f"{list(values)}"
             )
         go, x, y, z, vx, vy, vz, sigma_y, sigma_t = (float(value) for value in values)
         if vx > -SLOWEST or sigma_y < 0.0 or sigma_t < 0.0:
             raise ValueError(
-                f"a catch point has vx <= -{SLOWEST:g} m/s and sigmas >= 0, not vx = {vx}, "
+                f"catch point: expected vx <= -{SLOWEST:g} m/s and sigmas >= 0, got vx = {vx}, "
                 f"sigmas {sigma_y}, {sigma_t}"
             )
         return cls(go - age, (x, y, z), (vx, vy, vz), sigma_y, sigma_t)
 
     def shrunk(self, spread: float) -> Prediction:
-        """Weighed against a prior of y = 0 +- `spread` (m): a coarse prediction moves the arm only
-        a part of the way."""
+        """Weigh the prediction against a prior of y = 0 +- `spread` (m).
+
+        The mean of two Gaussians: a coarse prediction moves the arm only a part of the way.
+        """
         weight = spread * spread / (spread * spread + self.sigma_y * self.sigma_y)
         x, y, z = self.point
         vx, vy, vz = self.velocity
@@ -74,9 +77,13 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """How to hold the cup: tilt of its axis from the vertical against the ball (rad), depths below
-    the exit at which to catch (m), the preferred one, and the least cosine between the cup's axis
-    and the ball's way that counts as open."""
+    """How to hold the cup.
+
+    `tilt` of its axis from the vertical against the ball (rad); `depths` below the exit at which to
+    catch (m), and the `preferred` one; `opening`: least cosine between the cup's axis and the
+    ball's path at which the mouth counts as open; `hands`: turns of the hand about the cup's axis
+    (rad).
+    """
 
     tilt: float
     depths: tuple[float, ...]
@@ -84,7 +91,7 @@ class Strategy:
     opening: float
     hands: tuple[float, ...] = tuple(math.radians(angle) for angle in range(-90, 91, 18))
     margin: float = 0.03
-    """Seconds by which the arm wants to be there before the ball: the drives' lag and settling."""
+    """Seconds by which the arm should arrive before the ball: the drives lag and settle."""
 
 
 STRATEGIES: Final = {
@@ -97,30 +104,30 @@ STRATEGIES: Final = {
 level cup further down."""
 
 PRIOR_SPREAD: Final = 0.17
-"""m, standard deviation of where balls leave: uniform within +-0.30 m."""
+"""m, standard deviation of where balls leave: uniform within +-0.30 m, so 0.30 / sqrt(3)."""
 DEPTH_COST: Final = 2.0
-"""s per m off the preferred depth."""
+"""s per m from the preferred depth."""
 CLOSED_COST: Final = 4.0
 """s per unit of cosine by which the mouth is less open to the ball than it should be."""
 ROOM: Final = 0.075
-"""m from the table's edge to the cup's mouth from which the arm has room to move sideways."""
+"""m from the table's edge to the cup's mouth at which the arm has room to move sideways."""
 EDGE_COST: Final = 8.0
-"""s per m closer to the edge than that."""
+"""s per m closer to the edge than `ROOM`."""
 RETREAT: Final = 0.08
-"""m from a catching pose back to the pose from which it is approached where the straight way is not
-clear."""
+"""m back from a catching pose to the pose from which it is approached where the straight path is
+not clear."""
 LATE_COST: Final = 20.0
 """Weight of each second too late."""
 EARLY: Final = 0.05
 """s of slack below which time costs more."""
 HASTE: Final = 0.05
-"""s of motion from which the full margin is asked for."""
+"""s of motion from which the full margin is required."""
 KEEP: Final = 0.03
 """Cost by which another candidate must be better than the present one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CatchPlan:
     """A catching pose. Times are seconds from when the plan was made; `slack` is the time left
     over, negative if late."""
 
@@ -134,11 +141,16 @@ class Plan:
 
 
 class Interceptor:
-    """Chooses catching poses for one arm and cup. One `plan` costs about as much as ten servo
-    cycles: make one a prediction."""
+    """Chooses catching poses for one arm and cup. One `plan` costs about as much as ten cycles of
+    the driver, so make one per prediction."""
 
     def __init__(
-        self, puma: Puma, cell: Cell, guard: Guard, home: Sequence[float], branch: Branch
+        self,
+        puma: Puma,
+        cell: CatchingCell,
+        guard: CollisionGuard,
+        home: Sequence[float],
+        branch: ArmBranch,
     ) -> None:
         self._puma = puma
         self._cell = cell
@@ -151,8 +163,8 @@ class Interceptor:
         outward = np.array([0.0, 0.0, 1.0]) - axis[2] * axis
         if np.linalg.norm(outward) < 0.1:
             raise ValueError(
-                "cell.toml: cup: axis must not lie along the flange's axis: turning the hand "
-                "would do nothing"
+                "cell.toml: cup.axis: expected an axis across the flange's axis z6, got one along "
+                "it: turning the hand would not change anything; mount the cup sideways"
             )
         outward /= np.linalg.norm(outward)
         self._mount = np.column_stack([axis, outward, np.cross(axis, outward)])
@@ -165,10 +177,10 @@ class Interceptor:
         qd: Sequence[float],
         speed: Sequence[float],
         acceleration: Sequence[float],
-        before: Plan | None = None,
-    ) -> Plan | None:
-        """The best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None if no
-        candidate can be reached."""
+        before: CatchPlan | None = None,
+    ) -> CatchPlan | None:
+        """Return the best catching pose from the arm's state and limits (rad, rad/s, rad/s^2); None
+        if no candidate can be reached."""
         prediction = prediction.shrunk(PRIOR_SPREAD)
         layout = self._layout(strategy)
         axis = _against(prediction.velocity, strategy.tilt)
@@ -182,7 +194,7 @@ class Interceptor:
         ).max(axis=1)
         hands = layout.hands
         arrival = prediction.time_to_go + np.repeat(fall[:, 3], hands)
-        haste = np.minimum(times / HASTE, 1.0)  # a cup that is in place already needs no margin
+        haste = np.minimum(times / HASTE, 1.0)  # A cup that is already in place needs no margin.
         slack = arrival - strategy.margin * haste - times
         closed = CLOSED_COST * np.repeat(np.maximum(strategy.opening - fall[:, 4], 0.0), hands)
         late = LATE_COST * np.maximum(-slack, 0.0) + haste * np.maximum(EARLY - slack, 0.0)
@@ -197,12 +209,12 @@ class Interceptor:
             if not self._guard.violation(pose):
                 x, y, z = points[index // hands].tolist()
                 when = float(arrival[index]), float(times[index]), float(slack[index])
-                return Plan(pose, (x, y, z), _triple(axis), *when, index)
+                return CatchPlan(pose, (x, y, z), _triple(axis), *when, index)
         return None
 
     def retreat(self, q: Sequence[float]) -> tuple[float, ...] | None:
-        """The pose that holds the cup as in a joint pose but further from the table; None if there
-        is none that is clear."""
+        """Return the pose that holds the cup as in a joint pose but further from the table; None if
+        it is not clear."""
         pose = self._puma.forward(np.asarray(q))
         pose[0, 3] -= RETREAT
         back: list[float] = self._puma.inverse(pose, (self._branch,), near=np.asarray(q))[
@@ -212,15 +224,15 @@ class Interceptor:
 
     def _layout(self, strategy: Strategy) -> _Layout:
         if strategy not in self._layouts:
-            self._layouts = {strategy: _Layout(strategy)}  # one at a time is in use
+            self._layouts = {strategy: _Layout(strategy)}  # Only one strategy is in use at a time.
         return self._layouts[strategy]
 
     def _fall(
         self, strategy: Strategy, prediction: Prediction, axis: Vector
     ) -> list[tuple[float, ...]]:
-        """Of each depth of the strategy: the parabola's point there (x, y, z; m), when the ball is
-        there (s after the edge), and the cosine between the cup's axis and the way that it comes
-        from."""
+        """Return for each depth of the strategy: the point of the parabola (x, y, z; m), the time
+        after the edge (s), and the cosine between the cup's axis and the direction that the ball
+        comes from."""
         gravity, (x, y, z), (vx, vy, vz) = self._cell.gravity, prediction.point, prediction.velocity
         ax, ay, az = axis.tolist()
         fall: list[tuple[float, ...]] = []
@@ -232,8 +244,8 @@ class Interceptor:
         return fall
 
     def _poses(self, points: Vector, axis: Vector, layout: _Layout) -> Vector:
-        """Poses (n * hands, 4, 4) of frame 6 with the cup's mouth at the points, its axis as given,
-        in all turns of the hand."""
+        """Return poses (n * hands, 4, 4) of frame 6 with the cup's mouth at the points and its axis
+        as given, in all turns of the hand."""
         ahead = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
         ahead /= math.sqrt(float(ahead @ ahead))
         x, y, z = axis.tolist()
@@ -252,7 +264,7 @@ class Interceptor:
 
 
 class _Layout:
-    """Arrays of a strategy's candidates that do not depend on the prediction, and room for those
+    """Arrays of a strategy's candidates that do not depend on the prediction, and buffers for those
     that do."""
 
     def __init__(self, strategy: Strategy) -> None:
@@ -273,7 +285,7 @@ def _triple(vector: Vector) -> tuple[float, float, float]:
 
 
 def _against(velocity: tuple[float, float, float], tilt: float) -> Vector:
-    """Unit vector tilted from the vertical towards where the ball comes from."""
+    """Return the unit vector tilted from the vertical towards where the ball comes from."""
     speed = math.hypot(velocity[0], velocity[1])
     share = math.sin(tilt) / speed if speed > 0.0 else 0.0
     return np.array([-velocity[0] * share, -velocity[1] * share, math.cos(tilt)])

@@ -3,7 +3,7 @@ batches at once.
 
 Standard Denavit-Hartenberg convention with the signs of Paul and Zhang, "Computationally efficient
 kinematics for manipulators with spherical wrists" (Int. J. Robotics Research 5(2), 1986). Frame 6
-lies at the wrist's centre. A joint pose is an array (..., 6) in radians, a pose a homogeneous
+lies at the centre of the wrist. A joint pose is an array (..., 6) in radians, a pose a homogeneous
 matrix (..., 4, 4) in metres.
 """
 
@@ -19,34 +19,34 @@ from numpy.typing import NDArray
 from petrobot.services.motion.model import ArmModel, Vector
 
 SINGULAR = 1e-10
-"""Sine of q5 below which the axes of joints 4 and 6 count as one line."""
+"""Sine of q5 below which the axes of joints 4 and 6 count as one line (wrist singularity)."""
 
 
-class Branch(NamedTuple):
-    """One of the eight ways to reach a pose, each +1 or -1."""
+class ArmBranch(NamedTuple):
+    """One of the eight joint solutions of a pose, as three signs, each +1 or -1."""
 
     shoulder: int
-    """+1: the wrist lies before the shoulder (in the direction that q1 points to); -1: over the
-    shoulder."""
+    """+1: the wrist lies in front of the shoulder (in the direction that q1 points to); -1: the arm
+    reaches back over the shoulder."""
     elbow: int
-    """+1: elbow above the line from shoulder to wrist; -1: below."""
+    """+1: the elbow lies above the line from shoulder to wrist; -1: below."""
     wrist: int
     """Sign of q5: +1 not flipped, -1 flipped."""
 
     @property
     def label(self) -> str:
-        """The branch in words, as "fore up noflip"."""
+        """The branch in words, such as "fore up noflip"."""
         words = (("over", "fore"), ("down", "up"), ("flip", "noflip"))
         return " ".join(pair[(sign + 1) // 2] for pair, sign in zip(words, self, strict=True))
 
 
-BRANCHES = tuple(Branch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1))
+BRANCHES = tuple(ArmBranch(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1))
 
 
 @dataclass(frozen=True)
 class Puma:
-    """The arm's geometry, ready to be computed with. `limits` are (lower, upper) in radians, (6,)
-    each."""
+    """The arm's geometry for computation (m). `lower` and `upper` are the joint limits in radians,
+    (6,) each."""
 
     d1: float
     a2: float
@@ -58,7 +58,7 @@ class Puma:
 
     @classmethod
     def of(cls, model: ArmModel) -> Puma:
-        """The geometry of a model; raises ValueError if it is not a PUMA's (twists, zero
+        """Return the geometry of a model. Raises ValueError if the arm is not a PUMA (twists, zero
         lengths)."""
         twists = np.round(np.degrees(model.alpha), 9).tolist()
         zero = [*model.d[[1, 4, 5]], *model.a[[0, 3, 4, 5]]]
@@ -79,11 +79,12 @@ class Puma:
 
     @property
     def forearm(self) -> float:
-        """Distance from elbow axis to wrist centre, both projected along the elbow's axis (m)."""
+        """Distance from the elbow axis to the wrist's centre, both projected along the elbow's axis
+        (m)."""
         return math.hypot(self.a3, self.d4)
 
     def forward(self, q: Vector) -> Vector:
-        """Pose of frame 6 for joint poses (..., 6): matrices (..., 4, 4), m."""
+        """Return poses of frame 6 for joint poses (..., 6): matrices (..., 4, 4), m."""
         q = np.asarray(q, dtype=float)
         c, s = np.cos(q), np.sin(q)
         c1, s1, c4, s4, c5, s5, c6, s6 = (
@@ -117,13 +118,14 @@ class Puma:
         return pose
 
     def inverse(
-        self, pose: Vector, branches: tuple[Branch, ...] = BRANCHES, near: Vector | None = None
+        self, pose: Vector, branches: tuple[ArmBranch, ...] = BRANCHES, near: Vector | None = None
     ) -> Vector:
-        """Joint poses (..., len(branches), 6) of poses (..., 4, 4), in the order of `branches`.
+        """Return joint poses (..., len(branches), 6) of poses (..., 4, 4), in the order of
+        `branches`.
 
         A solution that does not exist or breaks a joint limit is NaN. Where several turns of a
         joint fit its limits, the one closest to `near` (6,; default: the middle of the limits) is
-        given. Where q5 is 0, q4 is that of `near`.
+        returned. Where q5 is 0, q4 is that of `near`.
         """
         pose = np.asarray(pose, dtype=float)
         near = 0.5 * (self.lower + self.upper) if near is None else np.asarray(near, dtype=float)
@@ -135,11 +137,13 @@ class Puma:
             return self._within(q, near)
 
     def _solve_arm(self, p: Vector, shoulder: Vector, elbow: Vector, q: Vector) -> None:
-        """The first three joints from the wrist's centre (..., 1, 3)."""
+        """Solve the first three joints from the wrist's centre (..., 1, 3)."""
         x, y, h = p[..., 0], p[..., 1], p[..., 2] - self.d1
         reach = shoulder * np.sqrt(x * x + y * y - self.d3 * self.d3)
         q[..., 0] = np.arctan2(y, x) + np.arctan2(self.d3, reach)
         length = self.forearm
+        # Law of cosines in the triangle of shoulder, elbow and wrist centre; arccos gives NaN out
+        # of reach.
         cosine = (reach * reach + h * h - self.a2 * self.a2 - length * length) / (
             2.0 * self.a2 * length
         )
@@ -150,7 +154,7 @@ class Puma:
         )
 
     def _solve_wrist(self, r: Vector, wrist: Vector, q4_if_singular: float, q: Vector) -> None:
-        """The last three joints from the orientation (..., 1, 3, 3) and the first three."""
+        """Solve the last three joints from the orientation (..., 1, 3, 3) and the first three."""
         c1, s1 = np.cos(q[..., 0, None]), np.sin(q[..., 0, None])
         c23, s23 = (
             np.cos(q[..., 1] + q[..., 2])[..., None],
@@ -168,12 +172,12 @@ class Puma:
         c4, s4 = np.cos(q4), np.sin(q4)
         q[..., 3] = q4
         q[..., 4] = np.arctan2(sine, m3[..., 2])
-        # y4 axis seen in frame 6 gives q6 also where q5 is 0.
+        # The y4 axis seen in frame 6 gives q6 even where q5 is 0.
         q[..., 5] = np.arctan2(c4 * m2[..., 0] - s4 * m1[..., 0], c4 * m2[..., 1] - s4 * m1[..., 1])
 
     def _within(self, q: Vector, near: Vector) -> Vector:
-        """Turns of 2 pi such that each joint is within its limits, closest to `near`; NaN rows
-        where there are none."""
+        """Choose turns of 2 pi such that each joint is within its limits, closest to `near`; NaN
+        rows where none fits."""
         turn = 2.0 * math.pi
         q += turn * np.round((near - q) / turn)
         q += turn * (q < self.lower - LIMIT_SLACK)
@@ -183,13 +187,14 @@ class Puma:
         return q
 
     def jacobian(self, q: Vector) -> Vector:
-        """Geometric Jacobian (6, 6) of frame 6's origin in the base frame for one joint pose (6,):
-        rows v (m/s), omega (rad/s)."""
+        """Return the geometric Jacobian (6, 6) of frame 6's origin in the base frame for one joint
+        pose (6,): rows v (m/s), omega (rad/s)."""
         axes, origins = self._axes(np.asarray(q, dtype=float))
         return np.vstack([np.cross(axes, origins[6] - origins[:6]).T, axes.T])
 
     def _axes(self, q: Vector) -> tuple[Vector, Vector]:
-        """Axes of the joints (6, 3) and origins of frames 0 to 6 (7, 3) in the base frame."""
+        """Return the axes of the joints (6, 3) and the origins of frames 0 to 6 (7, 3) in the base
+        frame."""
         c1, s1 = math.cos(q[0]), math.sin(q[0])
         c2, s2 = math.cos(q[1]), math.sin(q[1])
         c23, s23 = math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
@@ -212,13 +217,13 @@ class Puma:
 
 
 LIMIT_SLACK = 1e-9
-"""Radians by which rounding may carry a solution beyond a joint limit."""
+"""rad by which rounding may carry a solution beyond a joint limit."""
 
 
-def branch_of(puma: Puma, q: NDArray[np.float64]) -> Branch:
-    """The branch on which a joint pose (6,) lies."""
+def branch_of(puma: Puma, q: NDArray[np.float64]) -> ArmBranch:
+    """Return the branch on which a joint pose (6,) lies."""
     c23, s23 = math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
     reach = puma.a2 * math.cos(q[1]) + puma.a3 * c23 - puma.d4 * s23
     shoulder = 1 if reach >= 0 else -1
     bend = math.sin(q[2] + math.atan2(puma.d4, puma.a3))
-    return Branch(shoulder, 1 if bend * shoulder <= 0 else -1, 1 if math.sin(q[4]) >= 0 else -1)
+    return ArmBranch(shoulder, 1 if bend * shoulder <= 0 else -1, 1 if math.sin(q[4]) >= 0 else -1)

@@ -1,9 +1,15 @@
-"""The guard: joint limits, table, floor and pedestal that no set point can pass.
+"""The collision guard: no set point passes that leads beyond a joint limit or into table, floor or
+pedestal.
 
 A commanded step is allowed only if the pose in which the arm would come to rest, braking from after
-that step, is clear, and so is the way there if it is long. So at every moment the arm can stop
-without touching anything; where a step is refused the servo brakes on the way that was found clear
-one cycle before.
+that step, touches nothing, and, where the braking distance is long, if the path to it touches
+nothing either. So the arm can stop at any moment without touching anything: where a step is
+refused, the arm brakes along the path that was found clear one cycle before (compare
+inevitable collision states, Fraichard and Asama, IROS 2003).
+
+The kernels compute on plain floats and use square roots and squares only, so that the compiled
+kernels (numba) decide exactly as the uncompiled ones; sine and cosine come from the same C library
+in both. Lengths in m, angles in rad.
 """
 
 from __future__ import annotations
@@ -12,47 +18,223 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from petrobot.services.motion.clearance import (
-    Cup,
-    Links,
-    Point,
-    Radii,
-    Solids,
-    Turn,
-    clear,
-    clear_step,
-    farther,
-    turned,
-)
+from petrobot.services.host.numba_kernels import kernel
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.model import JOINTS, ArmModel, Cell
-from petrobot.services.motion.trajectory import Six, Trajectory, six
+from petrobot.services.motion.model import JOINTS, ArmModel, CatchingCell
+from petrobot.services.motion.trajectory import (
+    Six,
+    Trajectory,
+    braked_for,
+    braking_times,
+    rest_of,
+    six,
+    toward,
+)
+
+# --- Kernels -------------------------------------------------------------------------------------
+
+Point = tuple[float, float, float]
+Links = tuple[float, float, float, float, float]
+"""d1, a2, a3, d3, d4 of the arm (Denavit-Hartenberg parameters)."""
+Cup = tuple[Point, Point, float, float]
+"""Mouth and outward axis in the flange's frame, length and outer radius."""
+Solids = tuple[float, float, float, float, float, float, float, float]
+"""Where the solid parts of the cell begin, margins included.
+
+Greatest x beside the table for the arm and for the cup, least z above it for each, margin to the
+floor, height of the pedestal, and its radius for the wrist and for the cup.
+"""
+Radii = tuple[float, float]
+"""Radii of forearm and wrist."""
+Pose = tuple[Links, Radii, Cup, Solids]
+
+
+@kernel
+def within(q: Six, lower: Six, upper: Six) -> bool:
+    """Return whether all joints are within their limits."""
+    return (
+        lower[0] <= q[0] <= upper[0]
+        and lower[1] <= q[1] <= upper[1]
+        and lower[2] <= q[2] <= upper[2]
+        and lower[3] <= q[3] <= upper[3]
+        and lower[4] <= q[4] <= upper[4]
+        and lower[5] <= q[5] <= upper[5]
+    )
+
+
+@kernel
+def ball_clear(x: float, z: float, radius: float, solids: Solids) -> bool:
+    """Return whether a sphere on the forearm is clear of table and floor."""
+    ahead, _, above, _, floor, _, _, _ = solids
+    return (x + radius <= ahead or z - radius >= above) and z - radius >= floor
+
+
+@kernel
+def forearm_clear(elbow: Point, wrist: Point, radii: Radii, solids: Solids) -> bool:
+    """Return whether forearm and wrist, as four spheres along the forearm, are clear of table,
+    floor and pedestal."""
+    thick, hand = radii
+    (ex, _, ez), (x, y, z) = elbow, wrist
+    _, _, _, _, _, pedestal, beside, _ = solids
+    return (
+        ball_clear(ex, ez, thick, solids)
+        and ball_clear(ex + 0.5 * (x - ex), ez + 0.5 * (z - ez), thick, solids)
+        and ball_clear(ex + 0.75 * (x - ex), ez + 0.75 * (z - ez), thick, solids)
+        and ball_clear(x, z, hand, solids)
+        and (z >= pedestal or x * x + y * y >= beside * beside)
+    )
+
+
+@kernel
+def cup_clear(mouth: Point, axis: Point, length: float, radius: float, solids: Solids) -> bool:
+    """Return whether the cup, as a cylinder, is clear of table, floor and pedestal."""
+    _, ahead, _, above, floor, pedestal, _, beside = solids
+    (x, y, z), (ax, ay, az) = mouth, axis
+    bx, by, bz = x - length * ax, y - length * ay, z - length * az
+    # A disc of radius r with the unit normal a reaches r * sqrt(1 - a_x^2) in direction x.
+    front = max(x, bx) + radius * math.sqrt(max(0.0, 1.0 - ax * ax))
+    low = min(z, bz) - radius * math.sqrt(max(0.0, 1.0 - az * az))
+    return (
+        (front <= ahead or low >= above)
+        and low >= floor
+        and (z >= pedestal or x * x + y * y >= beside * beside)
+        and (bz >= pedestal or bx * bx + by * by >= beside * beside)
+    )
+
+
+@kernel
+def pose_clear(q: Six, links: Links, radii: Radii, cup: Cup, solids: Solids) -> bool:
+    """Return whether forearm and cup touch nothing in a joint pose."""
+    d1, a2, a3, d3, d4 = links
+    mouth, axis, length, radius = cup
+    c1, s1, c23, s23 = math.cos(q[0]), math.sin(q[0]), math.cos(q[1] + q[2]), math.sin(q[1] + q[2])
+    reach = a2 * math.cos(q[1]) + a3 * c23
+    height = d1 + a2 * math.sin(q[1]) + a3 * s23
+    elbow = (reach * c1 + d3 * s1, reach * s1 - d3 * c1, height)
+    reach -= d4 * s23
+    wx, wy, wz = reach * c1 + d3 * s1, reach * s1 - d3 * c1, height + d4 * c23
+    if not forearm_clear(elbow, (wx, wy, wz), radii, solids):
+        return False
+    turn = (
+        c1,
+        s1,
+        c23,
+        s23,
+        math.cos(q[3]),
+        math.sin(q[3]),
+        math.cos(q[4]),
+        math.sin(q[4]),
+        math.cos(q[5]),
+        math.sin(q[5]),
+    )
+    x, y, z = turned(turn, mouth)
+    return cup_clear((wx + x, wy + y, wz + z), turned(turn, axis), length, radius, solids)
+
+
+Turn = tuple[float, float, float, float, float, float, float, float, float, float]
+"""Cosine and sine of joint 1, of joints 2 and 3 together, of joints 4, 5 and 6."""
+
+
+@kernel
+def turned(turn: Turn, vector: Point) -> Point:
+    """Rotate a vector of frame 6 into the base frame."""
+    c1, s1, c23, s23, c4, s4, c5, s5, c6, s6 = turn
+    x, y, z = vector
+    x, y = c6 * x - s6 * y, s6 * x + c6 * y
+    x, z = c5 * x - s5 * z, s5 * x + c5 * z  # The twists before and after joint 5 cancel.
+    x, y = c4 * x - s4 * y, s4 * x + c4 * y
+    radial, up = c23 * x - s23 * z, s23 * x + c23 * z
+    return c1 * radial - s1 * y, s1 * radial + c1 * y, up
+
+
+@kernel
+def clear(
+    q: Six, lower: Six, upper: Six, links: Links, radii: Radii, cup: Cup, solids: Solids
+) -> bool:
+    """Return whether a joint pose is within the limits and touches nothing."""
+    return within(q, lower, upper) and pose_clear(q, links, radii, cup, solids)
+
+
+@kernel
+def farther(a: Six, b: Six, limit: float) -> bool:
+    """Return whether any joint differs by more than `limit` between two poses."""
+    return (
+        abs(a[0] - b[0]) > limit
+        or abs(a[1] - b[1]) > limit
+        or abs(a[2] - b[2]) > limit
+        or abs(a[3] - b[3]) > limit
+        or abs(a[4] - b[4]) > limit
+        or abs(a[5] - b[5]) > limit
+    )
+
+
+@kernel
+def clear_step(
+    period: float,
+    near: float,
+    q: Six,
+    qd: Six,
+    target: Six,
+    speed: Six,
+    acceleration: Six,
+    brakes: Six,
+    lower: Six,
+    upper: Six,
+    links: Links,
+    radii: Radii,
+    cup: Cup,
+    solids: Solids,
+) -> tuple[Six, Six, bool]:
+    """Compute the next cycle toward `target`: positions, velocities, and whether the arm can come
+    to rest from there.
+
+    Where braking takes more than `near` rad, the path to rest is checked at its beginning, after a
+    quarter and after half of its time.
+    """
+    q, qd = toward(period, q, qd, target, speed, acceleration)
+    rest = rest_of(period, q, qd, brakes)
+    if not clear(rest, lower, upper, links, radii, cup, solids):
+        return q, qd, False
+    if not farther(rest, q, near):
+        return q, qd, True
+    times = braking_times(period, qd, brakes)
+    longest = max(times)
+    return (
+        q,
+        qd,
+        clear(q, lower, upper, links, radii, cup, solids)
+        and clear(braked_for(0.25 * longest, q, qd, times), lower, upper, links, radii, cup, solids)
+        and clear(braked_for(0.5 * longest, q, qd, times), lower, upper, links, radii, cup, solids),
+    )
+
+
+# --- The guard -----------------------------------------------------------------------------------
 
 Geometry = tuple[Six, Six, Links, Radii, Cup, Solids]
-"""Least and greatest angles, and the rest of what services/motion/clearance.py asks for."""
+"""Least and greatest angles, and the other arguments of the kernels."""
 
 CUP_MARGIN = 0.005
 """m between cup and table."""
 ARM_MARGIN = 0.01
-"""m between arm and table, and of everything to floor and pedestal."""
+"""m between arm and table, and of every part to floor and pedestal."""
 NEAR = 0.02
-"""rad of braking below which the way to rest is too short (10 mm at the cup) to need a look at its
-middle."""
+"""rad of braking below which the path to rest is too short to need a check at its middle; 10 mm at
+the cup."""
 LOOKS = (0.0, 0.25, 0.5)
-"""Shares of the braking time at which a long way to rest is looked at, besides its end; the kernel
-has the same."""
+"""Shares of the braking time at which a long path to rest is checked, besides its end; `clear_step`
+uses the same."""
 JOINT_SLACK = 1e-6
 """rad by which rounding may carry a command beyond a joint limit."""
 
 
 def point(values: Sequence[float]) -> Point:
-    """Three floats."""
+    """Return three floats."""
     x, y, z = values
     return float(x), float(y), float(z)
 
 
 class Placement(NamedTuple):
-    """Where the parts of the arm are (m, base frame): the forearm's ends, the cup's mouth and its
+    """Where parts of the arm are (m, base frame): both ends of the forearm, the cup's mouth and its
     outward axis."""
 
     elbow: Point
@@ -61,19 +243,20 @@ class Placement(NamedTuple):
     axis: Point
 
 
-class Guard:
-    """Knows what is solid in the cell. Plain floats: one pose at a time, twice a cycle."""
+class CollisionGuard:
+    """Knows what is solid in the cell. Works on plain floats, since it checks one pose at a time,
+    twice a cycle."""
 
     def __init__(
         self,
         puma: Puma,
         model: ArmModel,
-        cell: Cell,
+        cell: CatchingCell,
         cup_margin: float = CUP_MARGIN,
         arm_margin: float = ARM_MARGIN,
     ) -> None:
-        """Margins (m) are between cup and table, and of everything else; they cover what happens
-        between the poses looked at."""
+        """Margins (m) are between cup and table, and of everything else. They cover what happens
+        between the checked poses."""
         self._cup_margin, self._arm_margin = cup_margin, arm_margin
         self._puma = puma
         self._model = model
@@ -86,12 +269,12 @@ class Guard:
         self._geometry = self._numbers()
         self._warm_up()
         self._vouched: Six | None = None
-        """Where `advance` left a trajectory, if it let it go on: the very tuple, so another
-        trajectory's is never meant."""
+        """Position to which `advance` last moved a trajectory after checking it. The tuple itself
+        is compared, so the state of another trajectory is never mistaken for it."""
 
     def _warm_up(self) -> None:
-        """Kernels are compiled, or read from where they are kept, now and not in the servo's first
-        cycles."""
+        """Compile the kernels, or load them from the cache, now and not in the first cycles of the
+        arm."""
         home = Trajectory([0.0] * JOINTS, 0.004, [1.0] * JOINTS, [1.0] * JOINTS)
         home.aim(home.q)
         home.resting(*home.proposed())
@@ -101,7 +284,7 @@ class Guard:
         self._vouched = None
 
     def _numbers(self) -> Geometry:
-        """What the kernels must know: limits, links, radii, cup, and where the solids begin."""
+        """Return the kernels' arguments: limits, links, radii, cup, and where the solids begin."""
         puma, body, cell, cup = self._puma, self._body, self._cell, self._cell.cup
         solids = (
             cell.near_edge - self._arm_margin,
@@ -122,14 +305,14 @@ class Guard:
             solids,
         )
 
-    def closer(self, share: float) -> Guard:
-        """A guard that keeps only a share of the margins."""
-        return Guard(
+    def closer(self, share: float) -> CollisionGuard:
+        """Return a guard with only a share of the margins."""
+        return CollisionGuard(
             self._puma, self._model, self._cell, share * self._cup_margin, share * self._arm_margin
         )
 
     def place(self, q: Sequence[float]) -> Placement:
-        """Where forearm and cup are in a joint pose."""
+        """Return where forearm and cup are in a joint pose."""
         return self._placed(q, *self._forearm(q))
 
     def _placed(self, q: Sequence[float], elbow: Point, wrist: Point) -> Placement:
@@ -140,7 +323,7 @@ class Guard:
         )
 
     def _forearm(self, q: Sequence[float]) -> tuple[Point, Point]:
-        """Both ends of the forearm."""
+        """Return both ends of the forearm."""
         puma = self._puma
         c1, s1, c23, s23 = (
             math.cos(q[0]),
@@ -155,7 +338,7 @@ class Guard:
         return elbow, (reach * c1 + puma.d3 * s1, reach * s1 - puma.d3 * c1, height + puma.d4 * c23)
 
     def violation(self, q: Sequence[float]) -> str:
-        """What a joint pose would touch, in words; empty if it is clear."""
+        """Return in words what a joint pose would touch; empty if it is clear."""
         if clear(six(q), *self._geometry):
             return ""
         for angle, (low, high) in zip(q, self._limits, strict=True):
@@ -165,7 +348,7 @@ class Guard:
         return self._arm_touches(elbow, wrist) or self._cup_touches(self._placed(q, elbow, wrist))
 
     def _beyond(self, q: Sequence[float]) -> int:
-        """The first joint beyond its limit, from 1."""
+        """Return the number (from 1) of the first joint beyond its limit."""
         pairs = zip(q, self._limits, strict=True)
         return next(
             number
@@ -174,7 +357,7 @@ class Guard:
         )
 
     def _cup_touches(self, at: Placement) -> str:
-        """The cup as a cylinder: extents of its two end discs."""
+        """Check the cup as a cylinder: the extents of its two end discs."""
         cell, axis = self._cell, at.axis
         bottom = tuple(m - self._length * a for m, a in zip(at.mouth, axis, strict=True))
         ahead = max(at.mouth[0], bottom[0]) + self._radius * math.sqrt(
@@ -196,7 +379,7 @@ class Guard:
         return ""
 
     def _arm_touches(self, elbow: Point, wrist: Point) -> str:
-        """Forearm and wrist as spheres along the forearm."""
+        """Check forearm and wrist as spheres along the forearm."""
         cell, body = self._cell, self._body
         for share, radius in (
             (0.0, body.forearm),
@@ -222,8 +405,8 @@ class Guard:
         return ""
 
     def path_clear(self, start: Sequence[float], end: Sequence[float], parts: int = 5) -> bool:
-        """Whether the straight way between two joint poses is clear, looked at in so many
-        places."""
+        """Return whether the straight path between two joint poses is clear, checked at so many
+        points."""
         steps = [number / parts for number in range(1, parts + 1)]
         return not any(
             self.violation([a + share * (b - a) for a, b in zip(start, end, strict=True)])
@@ -231,11 +414,11 @@ class Guard:
         )
 
     def advance(self, trajectory: Trajectory) -> str:
-        """Move a trajectory on by one cycle; gives what it refused to touch, in words, empty if it
-        went on as it wished.
+        """Advance a trajectory by one cycle; return in words what it was refused to touch, empty if
+        the step was allowed.
 
-        It brakes where it refuses; that this way is clear holds if the guard has watched from a
-        clear pose on.
+        A refused step becomes a braking step. That the braking path is clear is certain only if the
+        guard has checked every step since a clear pose.
         """
         target = trajectory.target
         if target is None:
@@ -262,8 +445,8 @@ class Guard:
         return refused
 
     def _refusal(self, trajectory: Trajectory, q: Six, qd: Six) -> str:
-        """What the arm would touch where it comes to rest from this state, or on the way there;
-        empty if nothing."""
+        """Return what the arm would touch where it comes to rest from this state, or on the way
+        there; empty if nothing."""
         rest = trajectory.resting(q, qd)
         refused = self.violation(rest)
         if not refused and farther(rest, q, NEAR):
@@ -273,7 +456,7 @@ class Guard:
         return refused
 
     def stops_clear(self, trajectory: Trajectory) -> bool:
-        """Whether the pose in which the trajectory comes to rest is clear; known at once if
+        """Return whether the pose in which the trajectory comes to rest is clear; needs no check if
         `advance` has just found it so."""
         return trajectory.q is self._vouched or not self.violation(
             trajectory.resting(trajectory.q, trajectory.qd)
@@ -281,7 +464,7 @@ class Guard:
 
 
 def _turn(q: Sequence[float]) -> Turn:
-    """Rotation of frame 6 in the base frame: cosine and sine of each angle on the way."""
+    """Return cosine and sine of each angle that rotates frame 6 into the base frame."""
     cos, sin, elbow = math.cos, math.sin, q[1] + q[2]
     return (
         cos(q[0]),

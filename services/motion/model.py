@@ -1,4 +1,4 @@
-"""The PUMA 560 and its cup as numbers: read from `puma560.toml` and `cell.toml`, in SI units and
+"""The PUMA 560 and its cup as numbers, read from `puma560.toml` and `cell.toml`; SI units and
 radians."""
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ Vector = NDArray[np.float64]
 JOINTS = 6
 
 
-class ModelError(ValueError):
-    """A file of numbers lacks a key or holds a value that cannot be; the message names file, key
-    and remedy."""
+class ArmFileError(ValueError):
+    """An arm or cell file lacks a key or has an impossible value; the message names file, key and
+    what was expected."""
 
 
 @dataclass(frozen=True)
-class Link:
-    """A link moved by the joint of the same place: mass (kg), centre of mass (m) and inertia about
-    it (kg m^2) in its DH frame."""
+class LinkInertia:
+    """The link moved by the joint of the same number: mass (kg), centre of mass (m) and inertia
+    about it (kg m^2) in its DH frame."""
 
     mass: float
     centre: tuple[float, float, float]
@@ -36,7 +36,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Body:
-    """Radii (m) of the capsules that stand for the arm's solid parts."""
+    """Radii (m) of the capsules that stand for the solid parts of the arm."""
 
     base: float
     upper_arm: float
@@ -46,7 +46,7 @@ class Body:
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Geometry and limits of the arm. Arrays have one entry a joint, base to flange; SI units,
+    """Geometry and limits of the arm. Arrays have one entry per joint, base to flange; SI units,
     radians."""
 
     d: Vector
@@ -61,7 +61,7 @@ class ArmModel:
     rotor_inertia: Vector
     viscous: Vector
     coulomb: Vector
-    links: tuple[Link, ...]
+    links: tuple[LinkInertia, ...]
     body: Body
     flange: float
     poses: Mapping[str, tuple[float, ...]]
@@ -69,9 +69,11 @@ class ArmModel:
 
 @dataclass(frozen=True)
 class Cup:
-    """The cup and how it sits on the flange: `mouth` (m) is the centre of its opening and `axis`
-    (unit vector) points out of it, both in frame 6; `radius` is the inner one, `wall` its
-    thickness, `depth` that of the inside (m)."""
+    """The cup and its mount on the flange.
+
+    `mouth` (m) is the centre of its opening and `axis` (unit vector) points out of it, both in
+    frame 6; `radius` is the inner one, `wall` its thickness, `depth` that of the inside (m).
+    """
 
     mouth: tuple[float, float, float]
     axis: tuple[float, float, float]
@@ -81,8 +83,8 @@ class Cup:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """What motion knows of the cell: cup, table (m, base frame) and ball (m, m/s^2)."""
+class CatchingCell:
+    """What motion needs of the cell: cup, table (m, base frame) and ball (m, m/s^2)."""
 
     cup: Cup
     table_top: float
@@ -99,14 +101,14 @@ def _numbers(table: Mapping[str, Any], key: str, where: str, length: int) -> tup
         or len(value) != length
         or not all(isinstance(v, int | float) for v in value)
     ):
-        raise ModelError(f"{where}: {key} must be {length} numbers, is {value!r}")
+        raise ArmFileError(f"{where}: {key}: expected a list of {length} numbers, got {value!r}")
     return tuple(float(v) for v in value)
 
 
 def _number(table: Mapping[str, Any], key: str, where: str) -> float:
     value = table.get(key)
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise ModelError(f"{where}: {key} must be a finite number, is {value!r}")
+        raise ArmFileError(f"{where}: {key}: expected a finite number, got {value!r}")
     return float(value)
 
 
@@ -120,14 +122,15 @@ def _column(joints: Sequence[Mapping[str, Any]], key: str, scale: float = 1.0) -
 
 
 def read_arm(text: str) -> ArmModel:
-    """The arm of a text in the format that the head of `puma560.toml` describes. Raises
-    ModelError."""
+    """Read an arm from a text in the format that the head of `puma560.toml` describes. Raises
+    ArmFileError."""
     table = tomllib.loads(text)
     joints, links = table.get("joint", []), table.get("link", [])
     if len(joints) != JOINTS or len(links) != JOINTS:
-        raise ModelError(
-            f"puma560.toml: needs {JOINTS} [[joint]] and [[link]], has {len(joints)} and "
-            f"{len(links)}"
+        raise ArmFileError(
+            f"puma560.toml: expected {JOINTS} tables [[joint]] and [[link]] each, got "
+            f"{len(joints)} "
+            f"and {len(links)}"
         )
     limits = np.radians(
         [
@@ -162,9 +165,9 @@ def read_arm(text: str) -> ArmModel:
     )
 
 
-def _link(table: Mapping[str, Any], where: str) -> Link:
+def _link(table: Mapping[str, Any], where: str) -> LinkInertia:
     centre, inertia = _numbers(table, "centre", where, 3), _numbers(table, "inertia", where, 3)
-    return Link(
+    return LinkInertia(
         _number(table, "mass", where),
         (centre[0], centre[1], centre[2]),
         (inertia[0], inertia[1], inertia[2]),
@@ -178,27 +181,30 @@ def _poses(table: Mapping[str, Any], limits: Vector) -> dict[str, tuple[float, .
     }
     for name, pose in poses.items():
         if np.any(np.asarray(pose) < limits[:, 0]) or np.any(np.asarray(pose) > limits[:, 1]):
-            raise ModelError(
-                f"puma560.toml: poses: {name} lies outside the joint limits: bring it inside"
+            raise ArmFileError(
+                f"puma560.toml: poses.{name}: lies outside the joint limits; change the pose"
             )
     return poses
 
 
-def read_cell(text: str) -> Cell:
-    """What motion needs of a text in the format of `services/cell.toml`. Raises ModelError."""
+def read_cell(text: str) -> CatchingCell:
+    """Read what motion needs from a text in the format of `services/cell.toml`. Raises
+    ArmFileError."""
     table = tomllib.loads(text)
     for section in ("cup", "table", "ball"):
         if section not in table:
-            raise ModelError(f"cell.toml: lacks [{section}]: see services/cell.toml for its keys")
+            raise ArmFileError(
+                f"cell.toml: table [{section}] is missing; services/cell.toml shows its keys"
+            )
     cup, desk, ball = table["cup"], table["table"], table["ball"]
     mouth, axis = (
         _numbers(cup, "mouth", "cell.toml: cup", 3),
         np.array(_numbers(cup, "axis", "cell.toml: cup", 3)),
     )
     if abs(float(np.linalg.norm(axis)) - 1.0) > 1e-3:
-        raise ModelError(f"cell.toml: cup: axis must be a unit vector, is {axis.tolist()}")
+        raise ArmFileError(f"cell.toml: cup.axis: expected a unit vector, got {axis.tolist()}")
     axis = axis / np.linalg.norm(axis)
-    return Cell(
+    return CatchingCell(
         cup=Cup(
             (mouth[0], mouth[1], mouth[2]),
             (float(axis[0]), float(axis[1]), float(axis[2])),
@@ -216,13 +222,13 @@ def read_cell(text: str) -> Cell:
 
 @lru_cache(maxsize=1)
 def nominal_arm() -> ArmModel:
-    """The arm of the package's own `services/motion/puma560.toml`."""
+    """Return the arm of the package's own `services/motion/puma560.toml`."""
     return read_arm(
         files("petrobot.services.motion").joinpath("puma560.toml").read_text(encoding="utf-8")
     )
 
 
 @lru_cache(maxsize=1)
-def nominal_cell() -> Cell:
-    """The cell of the package's own `services/cell.toml`."""
+def nominal_cell() -> CatchingCell:
+    """Return the cell of the package's own `services/cell.toml`."""
     return read_cell(files("petrobot.services").joinpath("cell.toml").read_text(encoding="utf-8"))

@@ -1,5 +1,5 @@
-"""Steering: from a goal to commanded positions, within limits, past the guard, and round what
-stands in the way."""
+"""Steering: from a goal to commanded positions, within the limits, past the collision guard, and
+around obstacles."""
 
 from __future__ import annotations
 
@@ -8,37 +8,39 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import Vector
 from petrobot.services.motion.trajectory import Six, Trajectory, synchronised
 
 CREEP: Final = 0.1
-"""Share of the greatest speeds at which an arm leaves a pose that it should not be in."""
+"""Share of the greatest speeds at which the arm leaves a pose that it should not be in."""
 CLOSER: Final = 0.4
-"""Share of the guard's margins that is kept on a way round."""
+"""Share of the guard's margins that is kept on a detour."""
 LOOK: Final = 3
-"""Cycles on a way round before the straight way is looked at again."""
+"""Cycles on a detour between two checks of the straight path."""
 
 Retreat = Callable[[Sequence[float]], tuple[float, ...] | None]
-"""Gives the pose that holds the cup as a joint pose does, but further from the table; None if there
-is none that is clear."""
+"""Function that returns the pose with the same cup orientation but further from the table; None if
+that pose is not clear."""
 
 
 class Steering:
-    """Moves a trajectory to goals. `move` goes straight in joint space, all joints arriving
-    together; `chase` goes as fast as each joint can. Both go by way of another pose where the
-    straight way is not clear. Angles in rad, speeds in rad/s.
+    """Moves a trajectory to goals. Angles in rad, speeds in rad/s.
+
+    `move` goes straight in joint space, all joints arriving together; `chase` goes as fast as each
+    joint can. Both take a detour over another pose where the straight path is not clear.
     """
 
     def __init__(
         self,
-        guard: Guard,
+        guard: CollisionGuard,
         retreat: Retreat,
         home: Sequence[float],
         period: float,
         acceleration: Vector,
     ) -> None:
-        """`acceleration` (rad/s^2, (6,)) are the joints' greatest; speeds are set by `limit`."""
+        """`acceleration` (rad/s^2, (6,)) are the greatest of the joints; `limit` sets the
+        speeds."""
         self._guard = guard
         self._close_guard = guard.closer(CLOSER)
         self._retreat = retreat
@@ -48,7 +50,7 @@ class Steering:
         self.trajectory = Trajectory(home, period, self._speed.tolist(), acceleration.tolist())
         self.goal: tuple[float, ...] | None = None
         self.refused = ""
-        """What the last step was refused for; empty if it was not."""
+        """Why the last step was refused; empty if it was not."""
         self._via: tuple[float, ...] | None = None
         self._given_up = 0
         self._creeps = False
@@ -57,7 +59,7 @@ class Steering:
         self._cycles = 0
 
     def limit(self, speed: Sequence[float]) -> None:
-        """Greatest joint speeds from now on."""
+        """Set the greatest joint speeds from now on."""
         self._speed = np.array(speed)
         self._choose_limits()
 
@@ -71,7 +73,7 @@ class Steering:
         self._choose_limits()
 
     def chase(self, goal: Sequence[float]) -> None:
-        """Go to a joint pose in haste; may be called in any cycle with another one."""
+        """Go to a joint pose as fast as possible; may be called in any cycle with another pose."""
         if tuple(goal) == self.goal and not self._together:
             return
         self._share, self._together, self.goal = 1.0, False, tuple(goal)
@@ -82,12 +84,13 @@ class Steering:
         self.goal, self._via = None, None
 
     def reset(self, q: Sequence[float]) -> None:
-        """Stand still here: the drives were off, or are."""
+        """Stand still at `q`: the drives were off, or are."""
         self.rest()
         self.trajectory.reset(q)
 
     def cycle(self, braking: bool = False) -> None:
-        """The next commanded position; with `braking` on the way to a standstill, the goal kept."""
+        """Compute the next commanded position; with `braking` come to a standstill but keep the
+        goal."""
         self._cycles += 1
         trajectory = self.trajectory
         if braking or self.goal is None:
@@ -104,8 +107,11 @@ class Steering:
             self._go_by(self._way_round(self.goal))
 
     def _guarded(self) -> str:
-        """One step past the guard that the arm's present way to rest satisfies; on a way round the
-        closer one. An arm that was switched on where neither is satisfied may leave, creeping."""
+        """Step past the guard whose margins the present braking path satisfies.
+
+        On a detour that is the closer guard. An arm that was switched on where neither guard is
+        satisfied may leave that pose, creeping.
+        """
         trajectory = self.trajectory
         if self._via is None and not self._creeps and self._guard.stops_clear(trajectory):
             return self._guard.advance(trajectory)
@@ -120,8 +126,8 @@ class Steering:
         return ""
 
     def _look_again(self, goal: Sequence[float]) -> None:
-        """Leave the way round if the straight way is clear; take another one where it has come to
-        its end or is refused."""
+        """Leave the detour if the straight path is clear; try another detour where this one has
+        ended or was refused."""
         if self._guard.path_clear(self._rest(), goal):
             self._given_up = 0
             self._go_by(None)
@@ -148,8 +154,11 @@ class Steering:
         self._choose_limits()
 
     def _choose_limits(self) -> None:
-        """On a move or a way round all joints come to its end together, so that the way is
-        straight; a joint that moves already keeps its whole acceleration, to turn round in time."""
+        """Choose speeds and accelerations for the present goal.
+
+        On a move or a detour all joints finish together, so that the path is straight. A joint that
+        is moving already keeps its full acceleration, so that it can turn around in time.
+        """
         speed, acceleration = (
             self._speed * self._share,
             self._acceleration * (self._share if self._together else 1.0),
@@ -161,8 +170,11 @@ class Steering:
         self.trajectory.limit(speed.tolist(), acceleration.tolist())
 
     def _way_round(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Where to go first when the straight way is not clear: to before the goal, back from the
-        table, or home. Those that were given up before come last."""
+        """Return where to go first when the straight path is not clear: in front of the goal, back
+        from the table, or home.
+
+        Poses that were given up before come last.
+        """
         rest = self._rest()
         ways = [
             way for way in (self._retreat(goal), self._retreat(rest), self._home) if way is not None

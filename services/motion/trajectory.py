@@ -1,13 +1,13 @@
-"""Online joint trajectories: velocity- and acceleration-limited, re-targeted at any cycle from any
-state of motion.
+"""Online joint trajectories, limited in velocity and acceleration, that accept a new target in any
+cycle and any state of motion.
 
-Each joint takes in each cycle the greatest velocity from which it can still come to rest exactly on
-its target by an even ramp of whole cycles; that is the discrete time-optimal law (compare Kroeger,
-"On-line trajectory generation in robotic systems", 2010, type II) and needs no planning, so a new
+In each cycle each joint takes the greatest velocity from which it can still come to rest exactly on
+its target by an even ramp of whole cycles. That is the discrete time-optimal rule (compare Kroeger,
+"On-line trajectory generation in robotic systems", 2010, type II). It needs no planning, so a new
 target costs nothing. Positions are the trapezoidal sums of the velocities: a drive that
 interpolates linearly in velocity follows them exactly.
 
-Kernels on plain floats, not arrays: six joints a cycle are too few for numpy to pay.
+The kernels compute on plain floats, not arrays: six joints are too few for numpy to be faster.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ from petrobot.services.host.numba_kernels import kernel
 from petrobot.services.motion.model import Vector
 
 Six = tuple[float, float, float, float, float, float]
-"""One number a joint, base to flange."""
+"""One number per joint, base to flange."""
 
 
 @kernel
 def next_velocity(
     error: float, velocity: float, period: float, speed: float, acceleration: float
 ) -> float:
-    """Velocity at the end of the next cycle (rad/s) of a joint that has `error` rad to go.
+    """Return the velocity at the end of the next cycle (rad/s) of a joint that has `error` rad to
+    go.
 
     The change never exceeds `acceleration * period`, nor the result `speed`, unless the joint is
-    faster already (then it brakes). In units of u = v / (a T) and S = 2 (error - v T / 2) / (a
+    already faster (then it brakes). In units of u = v / (a T) and S = 2 (error - v T / 2) / (a
     T^2), an even ramp from u to rest in k = ceil(u) cycles covers u (k + 1); this solves u (ceil(u)
     + 1) <= |S| for the greatest u.
     """
@@ -42,7 +43,7 @@ def next_velocity(
         return 0.0
     cycles = math.ceil(0.5 * (math.sqrt(1.0 + 4.0 * size) - 1.0) - ROUNDING)
     wish = quantum * (size / (cycles + 1.0) if size > cycles * cycles - 1.0 else cycles - 1.0)
-    # comparisons, not min and max: this is asked for six joints in every cycle
+    # Comparisons are faster than min and max here; six joints run this in every cycle.
     wish = wish if wish < speed else speed
     wish = wish if left >= 0.0 else -wish
     least, most = velocity - quantum, velocity + quantum
@@ -59,21 +60,22 @@ cycle longer each time."""
 
 @kernel
 def braking_velocity(velocity: float, period: float, acceleration: float) -> float:
-    """Velocity at the end of the next cycle of a joint that comes to rest by an even ramp of whole
-    cycles (rad/s)."""
+    """Return the velocity at the end of the next cycle (rad/s) of a joint that comes to rest by an
+    even ramp of whole cycles."""
     cycles = braking_cycles(velocity, period, acceleration)
     return velocity * (cycles - 1) / cycles if cycles else 0.0
 
 
 @kernel
 def braking_cycles(velocity: float, period: float, acceleration: float) -> int:
-    """Whole cycles that the even ramp to rest takes."""
+    """Return the number of whole cycles that the even ramp to rest takes."""
     return math.ceil(abs(velocity) / (acceleration * period) - ROUNDING)
 
 
 @kernel
 def braking_distance(velocity: float, period: float, acceleration: float) -> float:
-    """What the even ramp of `braking_velocity` covers, with the velocity's sign (rad)."""
+    """Return the distance that the even ramp of `braking_velocity` covers, with the sign of the
+    velocity (rad)."""
     return 0.5 * velocity * period * braking_cycles(velocity, period, acceleration)
 
 
@@ -94,7 +96,7 @@ def _gone(period: float, q: Six, qd: Six, after: Six) -> Six:
 def toward(
     period: float, q: Six, qd: Six, target: Six, speed: Six, acceleration: Six
 ) -> tuple[Six, Six]:
-    """Positions and velocities at the end of the next cycle on the way to a target."""
+    """Return positions and velocities at the end of the next cycle on the way to a target."""
     after = (
         next_velocity(target[0] - q[0], qd[0], period, speed[0], acceleration[0]),
         next_velocity(target[1] - q[1], qd[1], period, speed[1], acceleration[1]),
@@ -108,7 +110,7 @@ def toward(
 
 @kernel
 def to_rest(period: float, q: Six, qd: Six, brakes: Six) -> tuple[Six, Six]:
-    """Positions and velocities at the end of the next cycle when all joints brake."""
+    """Return positions and velocities at the end of the next cycle when all joints brake."""
     after = (
         braking_velocity(qd[0], period, brakes[0]),
         braking_velocity(qd[1], period, brakes[1]),
@@ -122,7 +124,7 @@ def to_rest(period: float, q: Six, qd: Six, brakes: Six) -> tuple[Six, Six]:
 
 @kernel
 def rest_of(period: float, q: Six, qd: Six, brakes: Six) -> Six:
-    """Where all joints come to rest if they brake from here."""
+    """Return where all joints come to rest if they brake from here."""
     return (
         q[0] + braking_distance(qd[0], period, brakes[0]),
         q[1] + braking_distance(qd[1], period, brakes[1]),
@@ -135,7 +137,7 @@ def rest_of(period: float, q: Six, qd: Six, brakes: Six) -> Six:
 
 @kernel
 def braking_times(period: float, qd: Six, brakes: Six) -> Six:
-    """How long each joint's way to rest takes (s)."""
+    """Return the time that each joint needs to come to rest (s)."""
     return (
         period * braking_cycles(qd[0], period, brakes[0]),
         period * braking_cycles(qd[1], period, brakes[1]),
@@ -153,8 +155,8 @@ def _brakes_at(angle: float, velocity: float, now: float, time: float) -> float:
 
 @kernel
 def braked_for(now: float, q: Six, qd: Six, times: Six) -> Six:
-    """Where the joints are `now` seconds after they began to brake from here, ways to rest that
-    take `times`."""
+    """Return where the joints are `now` seconds after they began to brake from here; `times` are
+    their braking times."""
     return (
         _brakes_at(q[0], qd[0], now, times[0]),
         _brakes_at(q[1], qd[1], now, times[1]),
@@ -166,10 +168,11 @@ def braked_for(now: float, q: Six, qd: Six, times: Six) -> Six:
 
 
 def reach_time(error: Vector, velocity: Vector, speed: Vector, acceleration: Vector) -> Vector:
-    """Least time (s) to come to rest `error` rad away, from `velocity` rad/s, under the limits; any
-    shapes that broadcast.
+    """Return the least time (s) to come to rest `error` rad away, from `velocity` rad/s, under the
+    limits; any shapes that broadcast.
 
-    Continuous time; `Trajectory` needs at most two cycles more.
+    Continuous time (triangular or trapezoidal velocity profile); `Trajectory` needs at most two
+    cycles more.
     """
     away = error - velocity * np.abs(velocity) / (2.0 * acceleration)
     side = np.where(away >= 0.0, 1.0, -1.0)
@@ -182,10 +185,10 @@ def reach_time(error: Vector, velocity: Vector, speed: Vector, acceleration: Vec
 
 
 def synchronised(error: Vector, speed: Vector, acceleration: Vector) -> tuple[Vector, Vector]:
-    """Limits (speed, acceleration), each (6,), under which all joints start and end a move from
-    rest at one time.
+    """Return limits (speed, acceleration), each (6,), under which all joints start and end a move
+    from rest together.
 
-    Slowing a joint's time by 1 / s scales its speed by s and its acceleration by s^2.
+    Stretching the time of a joint by 1 / s scales its speed by s and its acceleration by s^2.
     """
     times = reach_time(error, np.zeros_like(error), speed, acceleration)
     longest = float(times.max())
@@ -195,20 +198,20 @@ def synchronised(error: Vector, speed: Vector, acceleration: Vector) -> tuple[Ve
 
 _STILL: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 SLOWEST = 0.05
-"""Least scale of a synchronised joint; a joint with nearly nothing to do may end early."""
+"""Least scale of a synchronised joint; a joint with almost nothing to do may finish early."""
 
 
 def six(values: Iterable[float]) -> Six:
-    """Six floats; raises ValueError for fewer or more."""
+    """Return six floats. Raises ValueError for fewer or more."""
     a, b, c, d, e, f = map(float, values)
     return a, b, c, d, e, f
 
 
 class Trajectory:
-    """The commanded motion of the arm's joints, advanced by one period a call. Angles in rad,
+    """The commanded motion of the arm's joints, advanced by one period per call. Angles in rad,
     speeds in rad/s.
 
-    `target` None means: come to rest. Limits may be changed at any time; a joint beyond new limits
+    `target` None means: come to rest. Limits may change at any time; a joint beyond new limits
     brakes into them. Braking to rest always uses the accelerations given first.
     """
 
@@ -227,39 +230,40 @@ class Trajectory:
         self.limit(speed, acceleration)
 
     def limit(self, speed: Sequence[float], acceleration: Sequence[float]) -> None:
-        """Go by these limits from now on (rad/s, rad/s^2, one a joint)."""
+        """Use these limits from now on (rad/s, rad/s^2, one per joint)."""
         self.speed: Six = six(speed)
         self.acceleration: Six = six(acceleration)
         if not (min(self.speed) > 0.0 and min(self.acceleration) > 0.0):
             raise ValueError(
-                f"limits must be positive, are {self.speed} rad/s and {self.acceleration} rad/s^2"
+                f"trajectory limits: expected positive numbers, got {self.speed} rad/s and "
+                f"{self.acceleration} rad/s^2"
             )
 
     def aim(self, target: Sequence[float] | None) -> None:
-        """Go to a joint pose, or come to rest."""
+        """Go to a joint pose, or come to rest (None)."""
         self.target = None if target is None else six(target)
 
     def reset(self, q: Sequence[float]) -> None:
-        """Stand still here."""
+        """Stand still at `q`."""
         self.q, self.qd, self.target = six(q), _STILL, None
 
     def proposed(self) -> tuple[Six, Six]:
-        """Position and velocity at the end of the next cycle toward the target."""
+        """Return position and velocity at the end of the next cycle toward the target."""
         if self.target is None:
             return self.braking()
         return toward(self.period, self.q, self.qd, self.target, self.speed, self.acceleration)
 
     def braking(self) -> tuple[Six, Six]:
-        """Position and velocity at the end of the next cycle when all joints brake."""
+        """Return position and velocity at the end of the next cycle when all joints brake."""
         return to_rest(self.period, self.q, self.qd, self.brakes)
 
     def resting(self, q: Six, qd: Six) -> Six:
-        """Where all joints come to rest if they brake from here."""
+        """Return where all joints come to rest if they brake from here."""
         return rest_of(self.period, q, qd, self.brakes)
 
     def stopping(self, q: Six, qd: Six, *shares: float) -> Iterator[Six]:
-        """Where the joints are after shares of the time that braking from here takes, the slowest
-        joint deciding."""
+        """Yield where the joints are after shares of the braking time from here; the slowest joint
+        decides that time."""
         times = braking_times(self.period, qd, self.brakes)
         longest = max(times)
         for share in shares:
@@ -275,7 +279,7 @@ class Trajectory:
         return not any(self.qd)
 
     def arrived(self, tolerance: float = 1e-6) -> bool:
-        """Whether the commanded motion rests on its target (rad)."""
+        """Return whether the commanded motion rests on its target, within a tolerance (rad)."""
         if self.target is None:
             return self.still
         return self.still and all(

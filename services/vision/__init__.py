@@ -1,1 +1,1 @@
-"""The vision node's actions: calibrate, locate, track and predict."""
+"""Actions and drivers of the vision node: calibrate, locate, track and predict."""

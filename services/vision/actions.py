@@ -1,9 +1,9 @@
-"""The camera's primitive actions: locate a rolling ball in five ways, track it and predict where it
-leaves in three ways.
+"""Primitive actions of the camera: locate a rolling ball in five ways; track it and predict in
+three ways where it leaves the table.
 
-Every locator gives `ball`, plain data with which every tracker goes on: `places` rows [dt, x, y] (s
-relative to the image `sequence`, m, base frame), their accuracy `sigma` (m), and the `age` (s) of
-that image when the locator ended.
+Every locator returns `ball`, plain data from which every tracker starts: `places`, rows [dt, x, y]
+(s relative to the image `sequence`, m, base frame), their accuracy `sigma` (m), and the `age` (s)
+of that image when the locator finished.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from petrobot.services.vision.camera import Camera
 from petrobot.services.vision.locating import LocateSpecification, locate
 from petrobot.services.vision.location import (
     BackgroundSubtraction,
+    BallDetector,
     CompensatedSubtraction,
-    Detector,
     FixedThreshold,
     HoughCircles,
     MixtureOfGaussians,
@@ -32,23 +32,23 @@ from petrobot.services.vision.prediction import (
 from petrobot.services.vision.tracking import TrackSpecification, track
 
 
-def _background(camera: Camera) -> Detector:
+def _background(camera: Camera) -> BallDetector:
     return BackgroundSubtraction(camera.view, camera.background)
 
 
-def _compensated(camera: Camera) -> Detector:
+def _compensated(camera: Camera) -> BallDetector:
     return CompensatedSubtraction(camera.view, camera.background)
 
 
-def _mog2(camera: Camera) -> Detector:
+def _mog2(camera: Camera) -> BallDetector:
     return MixtureOfGaussians(camera.view)
 
 
-def _hough(camera: Camera) -> Detector:
+def _hough(camera: Camera) -> BallDetector:
     return HoughCircles(camera.view)
 
 
-def _threshold(camera: Camera) -> Detector:
+def _threshold(camera: Camera) -> BallDetector:
     return FixedThreshold(camera.view)
 
 
@@ -56,33 +56,34 @@ async def locate_background(ctx: Context, **options: float) -> Result:
     """Locate a rolling ball by subtracting the stored picture of the empty table: accurate and
     cheap in steady light.
 
-    Options: those of `LocateSpecification`. SUCCESS and FAILURE (cause `inaccurate` or `late`) give
-    `ball` and `images`; ERROR has cause `no_ball`, `no_image` or `bad_image`.
+    Options: those of `LocateSpecification`. SUCCESS and FAILURE (cause `inaccurate` or `late`)
+    return `ball` and `images`; ERROR has cause `no_ball`, `no_image` or `bad_image`.
     """
     return await locate(ctx, "background", _background, 0.0007, LocateSpecification.of(options))
 
 
 async def locate_mog2(ctx: Context, **options: float) -> Result:
     """Locate a rolling ball by a mixture-of-Gaussians background (MOG2): follows changing light,
-    costs most. As `locate_background`."""
+    costs most. Otherwise as `locate_background`."""
     return await locate(ctx, "mog2", _mog2, 0.0022, LocateSpecification.of(options))
 
 
 async def locate_hough(ctx: Context, **options: float) -> Result:
-    """Locate a rolling ball as a moving circle: needs no background, coarse. As
+    """Locate a rolling ball as a moving circle: needs no background, coarse. Otherwise as
     `locate_background`."""
     return await locate(ctx, "hough", _hough, 0.0028, LocateSpecification.of(options))
 
 
 async def locate_threshold(ctx: Context, **options: float) -> Result:
     """Locate a rolling ball as what is brighter than one grey level: cheapest, fails in uneven or
-    dim light. As `locate_background`."""
+    dim light. Otherwise as `locate_background`."""
     return await locate(ctx, "threshold", _threshold, 0.0015, LocateSpecification.of(options))
 
 
 async def locate_compensated(ctx: Context, **options: float) -> Result:
     """Locate a rolling ball by subtracting the stored picture, scaled to the light of each image:
-    as accurate, also where the lamps beat or were switched. As `locate_background`."""
+    as accurate as `locate_background`, even where lamps flicker or were switched. Otherwise as
+    `locate_background`."""
     return await locate(ctx, "compensated", _compensated, 0.0007, LocateSpecification.of(options))
 
 
@@ -99,7 +100,7 @@ async def _predict(
 async def predict_least_squares(
     ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
 ) -> Result:
-    """Track the ball and stream its predicted exit by least squares with sliding and rolling
+    """Track the ball and stream its predicted exit, by least squares with sliding and rolling
     deceleration.
 
     Publishes [time_to_go, x, y, z, vx, vy, vz, sigma_y, sigma_t] (s, m, m/s) at each image until
@@ -113,7 +114,7 @@ async def predict_least_squares(
 async def predict_kalman(
     ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
 ) -> Result:
-    """Track the ball and stream its predicted exit by an extended Kalman filter. As
+    """Track the ball and stream its predicted exit, by an extended Kalman filter. Otherwise as
     `predict_least_squares`."""
     return await _predict(ctx, Kalman, ball, stream, options)
 
@@ -121,6 +122,6 @@ async def predict_kalman(
 async def predict_constant_velocity(
     ctx: Context, *, ball: Mapping[str, Any], stream: str = "catch_point", **options: float
 ) -> Result:
-    """Track the ball and stream its predicted exit at even speed: cheapest, late for slow balls. As
-    `predict_least_squares`."""
+    """Track the ball and stream its predicted exit at constant speed: cheapest, late for slow
+    balls. Otherwise as `predict_least_squares`."""
     return await _predict(ctx, ConstantVelocity, ball, stream, options)

@@ -1,9 +1,9 @@
-"""The calibration command: a folder of board images becomes calibration.toml; images not there yet
-are taken from a camera.
+"""The calibration command: turns a folder of board images into calibration.toml, and takes missing
+images with a camera.
 
-The folder's views.toml lists the board and the images with the known poses (docs/vision.md shows
+The folder's views.toml lists the board and the images with their known poses (docs/vision.md shows
 one). `add_arguments`, `run` and EXAMPLE serve `petrobot calibrate`; `calibrate_main` is the same
-without it (python -m petrobot.services.vision.calibrate).
+command on its own (python -m petrobot.services.vision.calibrate).
 """
 
 from __future__ import annotations
@@ -37,12 +37,13 @@ from petrobot.services.vision.calibration_file import (
 Pixels = NDArray[np.uint8]
 EXAMPLE = "petrobot calibrate --views board_images --output calibration.toml"
 RATE, PATIENCE, SETTLE = 10.0, 5.0, 3
-"""Images/s while taking board images, s to wait for one, images dropped while exposure settles."""
+"""Images/s while board images are taken, seconds to wait for one, and images dropped while the
+exposure settles."""
 EXIT_BAD_INPUT = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
+    """Declare the command's options."""
     parser.add_argument(
         "--views",
         type=Path,
@@ -75,10 +76,12 @@ def run(
     say: Callable[[str], None] = print,
     wait: Callable[[str], str] = input,
 ) -> int:
-    """Calibrate; gives the exit code. `say` prints, `wait` asks the operator to place the board."""
-    if not options.output.parent.is_dir():  # told before the work, not after it
+    """Calibrate; return the exit code. `say` prints; `wait` asks the operator to place the
+    board."""
+    if not options.output.parent.is_dir():  # Check before the work, not after it.
         print(
-            f"calibrate: {options.output}: there is no folder {options.output.parent}; make it",
+            f"calibrate: {options.output}: folder {options.output.parent} does not exist; "
+            "create it",
             file=sys.stderr,
         )
         return EXIT_BAD_INPUT
@@ -105,7 +108,7 @@ def run(
 
 
 def report(found: Calibration, views: int) -> str:
-    """What the calibration found, for people."""
+    """Return what the calibration found, as text for the operator."""
     x, y, z = found.optics.position
     return "\n".join(
         [
@@ -123,7 +126,7 @@ def take_missing(
     folder: Path, source: ImageSource, say: Callable[[str], None], wait: Callable[[str], str]
 ) -> None:
     """Take each image that views.toml lists and the folder lacks. Raises ConnectionError when the
-    camera is dead."""
+    camera sends no image."""
     files, board = missing_views(folder)
     if not files:
         return
@@ -136,14 +139,14 @@ def take_missing(
                 pixels = _settled(source)
                 if find_corners(pixels, board) is not None:
                     break
-                say("the board is not seen whole; once more")
+                say("the board is not completely in view; try again")
             cv2.imwrite(str(path), pixels)
     finally:
         source.close()
 
 
 def _settled(source: ImageSource) -> Pixels:
-    """A fresh image after some dropped ones."""
+    """Return a fresh image after dropping the first ones."""
     taken, deadline = 0, time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
         image = source.newest()
@@ -157,7 +160,7 @@ def _settled(source: ImageSource) -> Pixels:
 
 
 def calibrate_main(argv: Sequence[str] | None = None) -> int:
-    """Command line of its own; gives the exit code: 0 written, 2 bad input."""
+    """Run the command on its own; return the exit code: 0 written, 2 bad input."""
     parser = argparse.ArgumentParser(
         prog="calibrate", description=__doc__, epilog=f"example:\n  {EXAMPLE}"
     )

@@ -1,11 +1,12 @@
-"""Calibration from images of a chessboard: lens, distortion and the camera's place in the base
+"""Calibration from images of a chessboard: lens, distortion and the camera's pose in the base
 frame, solved together.
 
-Views whose board pose in the base frame is known (laid on the table at measured places) fix the
-camera to the base; views held by hand at any tilt fix the lens. Start: OpenCV's calibrateCamera
-(Zhang 2000). Then one least-squares problem over all unknowns: intrinsics, camera pose, and each
-view's pose, known ones held to their measured value by a prior of its accuracy (bundle adjustment;
-no hand-eye routine is needed, which OpenCV 5 dropped). Pure: images in, calibration out.
+Views whose board pose in the base frame is known (laid on the table at measured places) tie the
+camera to the base; views held by hand at any tilt determine the lens. The start values come from
+OpenCV's calibrateCamera (Z. Zhang, "A flexible new technique for camera calibration", 2000). Then
+one least-squares problem covers all unknowns: intrinsics, camera pose, and each view's pose; a
+prior holds known poses to their measured values within their accuracy (bundle adjustment). No
+hand-eye routine is needed, which OpenCV 5 no longer has. Pure: images in, calibration out.
 """
 
 from __future__ import annotations
@@ -24,33 +25,36 @@ Array = NDArray[np.float64]
 CORNER_SIGMA_PX = 0.07
 """px, accuracy of a chessboard corner (residual of calibrations at 3 grey levels of noise)."""
 CORNER_WINDOW = 5
-"""px, half width of the window in which a corner is refined; less than half a square's side in any
-view."""
+"""px, half width of the window in which a corner is refined; less than half the side of a square in
+any view."""
 PLACEMENT_SIGMA = 0.0003
-"""m, accuracy to which the place of a board on the table is known."""
+"""m, accuracy to which the position of a board on the table is known."""
 PLACEMENT_TURN = 0.0005
-"""rad, accuracy of its direction."""
+"""rad, accuracy to which its direction is known."""
 FEWEST_VIEWS, FEWEST_KNOWN = 6, 3
+"""Fewest views with the whole board, and fewest of them with a known pose."""
 LENS = 8
-"""fx fy cx cy k1 k2 p1 p2."""
+"""Number of lens unknowns: fx fy cx cy k1 k2 p1 p2."""
 
 
 class CalibrationError(ValueError):
-    """The images do not make a calibration; the text says why and what to do."""
+    """The images do not determine a calibration; the message says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A chessboard of `columns` x `rows` inner corners, squares of `square` m; its frame has its
-    origin at the first corner, beside the black square that touches the board's printed corner, x
-    along the columns, z out of the board."""
+    """A chessboard of `columns` x `rows` inner corners with squares of `square` m.
+
+    Origin of its frame: the first corner, beside the black square that touches the printed corner
+    of the board; x along the columns, z out of the board.
+    """
 
     columns: int = 9
     rows: int = 6
     square: float = 0.060
 
     def points(self) -> Array:
-        """Inner corners (rows * columns, 3) in the board's frame (m)."""
+        """Return the inner corners (rows * columns, 3) in the board's frame (m)."""
         y, x = np.mgrid[0 : self.rows, 0 : self.columns].astype(float)
         return (
             np.stack([x.ravel(), y.ravel(), np.zeros(self.rows * self.columns)], axis=-1)
@@ -60,8 +64,8 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """One image of the board, grey levels (height, width); `pose` (4, 4): board frame to base frame
-    where it is known."""
+    """One image of the board, grey levels (height, width); `pose` (4, 4) from board frame to base
+    frame, None where unknown."""
 
     pixels: NDArray[np.uint8]
     pose: Array | None = None
@@ -69,23 +73,23 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A calibrated camera and how well it is known."""
+    """A calibrated camera and how accurately it is known."""
 
     optics: Optics
     views: int
     residual_px: float
-    """rms distance of corners from where the calibrated camera expects them."""
+    """rms distance between the corners and where the calibrated camera expects them."""
     table_residual: float
     """m, rms distance on the board's plane between corners of the known views and their stated
-    places."""
+    positions."""
     table_sigma: float
-    """m, standard deviation (from the fit's covariance) of a point of the table, rms over the
+    """m, standard deviation (from the covariance of the fit) of a point of the table, rms over the
     image."""
 
 
 def find_corners(pixels: NDArray[np.uint8], board: Board) -> Array | None:
-    """Inner corners (n, 2) px in the order of `Board.points`; None when the board is not seen
-    whole."""
+    """Return the inner corners (n, 2) px in the order of `Board.points`; None when the whole board
+    is not in view."""
     found, corners = cv2.findChessboardCornersSB(
         pixels, (board.columns, board.rows), None, cv2.CALIB_CB_ACCURACY
     )
@@ -95,14 +99,15 @@ def find_corners(pixels: NDArray[np.uint8], board: Board) -> Array | None:
     corners = cv2.cornerSubPix(pixels, corners, (CORNER_WINDOW, CORNER_WINDOW), (-1, -1), limit)
     grid = np.asarray(corners, float).reshape(board.rows, board.columns, 2)
     if np.linalg.det(np.stack([grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]])) > 0.0:
-        grid = grid[::-1]  # seen from the printed side, x to y turns left; image y points down
+        # Seen from the printed side, the turn from x to y is to the left, but image y points down.
+        grid = grid[::-1]
     ordered = grid.reshape(-1, 2)
     return ordered if _begins_black(pixels, ordered, board) else ordered[::-1]
 
 
 def _begins_black(pixels: NDArray[np.uint8], corners: Array, board: Board) -> bool:
-    """Whether the inner square at the first corner is black: tells the board from itself turned by
-    180 degrees."""
+    """Return whether the inner square at the first corner is black; tells the board from itself
+    turned by 180 degrees."""
     grid = corners.reshape(board.rows, board.columns, 2)
 
     def square(row: int, column: int) -> float:
@@ -113,7 +118,7 @@ def _begins_black(pixels: NDArray[np.uint8], corners: Array, board: Board) -> bo
 
 
 def calibrate(views: Sequence[BoardView], board: Board) -> Calibration:
-    """Calibrate from board images. Raises CalibrationError when they do not suffice."""
+    """Calibrate from board images. Raises CalibrationError when they are too few."""
     seen = [
         (corners, view)
         for view in views
@@ -144,9 +149,12 @@ def adjust(
 
 
 class _Adjustment:
-    """The least-squares problem. Unknowns: lens (8), camera pose (6: turn and shift), one pose (6)
-    a view: of a known view its deviation from the stated pose in the board's frame, of any other
-    the board in the camera's frame."""
+    """The least-squares problem.
+
+    Unknowns: lens (8), camera pose (6: rotation vector and translation), and one pose (6) per view:
+    for a known view its deviation from the stated pose in the board's frame, for any other the
+    board in the camera's frame.
+    """
 
     def __init__(
         self,
@@ -161,9 +169,9 @@ class _Adjustment:
         self._size = size
 
     def solve(self) -> Calibration:
-        """Start from calibrateCamera, refine all together, report residuals."""
-        # not above: a node that only reads a calibration would load all of it for nothing, a third
-        # of its start
+        """Start from calibrateCamera, refine all unknowns together, report residuals."""
+        # Imported here, not above: a node that only reads a calibration would otherwise load scipy
+        # for nothing, a third of its start.
         from scipy.optimize import least_squares
 
         start = self._start()
@@ -214,8 +222,8 @@ class _Adjustment:
         return np.concatenate([np.asarray(part, float) for part in parts])
 
     def _residuals(self, unknown: Array) -> Array:
-        """Corner residuals in units of their accuracy, then the deviations of the known views in
-        units of theirs."""
+        """Return the corner residuals in units of their accuracy, then the deviations of the known
+        views in units of theirs."""
         fx, fy, cx, cy = unknown[:4]
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         base = _pose(unknown[LENS : LENS + 3], unknown[LENS + 3 : LENS + 6])
@@ -235,8 +243,8 @@ class _Adjustment:
         return np.concatenate(parts + priors)
 
     def _slopes(self, unknown: Array) -> Array:
-        """Jacobian by central differences; a view's pose moves its own residuals only, so all views
-        are moved at once."""
+        """Return the Jacobian by central differences. A view's pose changes only its own residuals,
+        so all views are moved at once."""
         rows = 2 * len(self._points)
         views = len(self._corners)
         own_rows = np.arange(views * rows).reshape(views, rows)
@@ -283,7 +291,8 @@ class _Adjustment:
         return float(np.sqrt(np.mean(squares)))
 
     def _table_sigma(self, unknown: Array, jacobian: Array) -> float:
-        """Propagate the fit's covariance to the plane of the known views, at a grid of pixels."""
+        """Propagate the covariance of the fit to the plane of the known views, at a grid of
+        pixels."""
         covariance = np.linalg.pinv(jacobian.T @ jacobian)[: LENS + 6, : LENS + 6]
         u, v = np.meshgrid(
             np.linspace(0, self._size[0] - 1, 9), np.linspace(0, self._size[1] - 1, 7)
@@ -302,7 +311,7 @@ class _Adjustment:
 
 
 def _pose(turn: Array, shift: Array) -> Array:
-    """(4, 4) from a rotation vector (3,) and a translation (3,)."""
+    """Return the pose (4, 4) of a rotation vector (3,) and a translation (3,)."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.asarray(turn, float))[0]
     pose[:3, 3] = shift
@@ -310,5 +319,5 @@ def _pose(turn: Array, shift: Array) -> Array:
 
 
 def _vector(pose: Array) -> Array:
-    """Rotation vector and translation (6,) of a pose (4, 4)."""
+    """Return rotation vector and translation (6,) of a pose (4, 4)."""
     return np.concatenate([np.ravel(cv2.Rodrigues(pose[:3, :3])[0]), pose[:3, 3]])

@@ -1,5 +1,5 @@
-"""The calibration on disk: calibration.toml in and out, and folders of board images with their
-poses."""
+"""Files of a calibration: read and write calibration.toml, and read folders of board images with
+their poses."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ DEFAULT = Path(__file__).with_name("calibration.toml")
 
 
 class CalibrationFileError(ValueError):
-    """A calibration file or a folder of views that cannot be used; the text names file, key and
+    """A calibration file or a folder of views cannot be used; the message names file, key and
     remedy."""
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """The calibration as TOML."""
+    """Return the calibration as TOML."""
     optics = calibration.optics
     rows = ",\n  ".join(_numbers(row) for row in optics.rotation)
     return f"""\
@@ -35,7 +35,7 @@ schema = {SCHEMA}
 views = {calibration.views}
 residual_px = {calibration.residual_px:.4f}  # rms of the board's corners
 table_residual = {calibration.table_residual:.6f}  # m, rms of corners at known places
-table_sigma = {calibration.table_sigma:.6f}  # m, standard deviation of a point of the table, rms over the image
+table_sigma = {calibration.table_sigma:.6f}  # m, standard deviation of a point of the table
 
 [lens]
 focal_px = {_numbers(optics.focal)}
@@ -44,7 +44,7 @@ distortion = {_numbers(optics.distortion)}  # k1 k2 p1 p2, OpenCV's order
 
 [pose]
 position = {_numbers(optics.position)}  # m, optical centre in the base frame
-# camera coordinates of a base-frame point p are rotation (p - position); rows are the camera's x, y and z axes
+# camera coordinates of a base-frame point p: rotation (p - position); rows: camera's x, y, z axes
 rotation = [
   {rows},
 ]
@@ -56,13 +56,14 @@ def _numbers(values: Any) -> str:
 
 
 def parse_calibration(text: str, name: str) -> Calibration:
-    """Read a calibration's TOML; `name` is the file, for the fault's text. Raises
+    """Read a calibration from TOML; `name` is the file named in error messages. Raises
     CalibrationFileError."""
     try:
         data = tomllib.loads(text)
         if data.get("schema") != SCHEMA:
             raise CalibrationFileError(
-                f"{name}: schema must be {SCHEMA}; remake it with petrobot calibrate"
+                f"{name}: schema: expected {SCHEMA}, got {data.get('schema')!r}; remake the file "
+                "with petrobot calibrate"
             )
         lens, pose = data["lens"], data["pose"]
         optics = Optics(
@@ -76,7 +77,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
         calibration = Calibration(optics, int(data["views"]), *quality)
     except tomllib.TOMLDecodeError as fault:
         raise CalibrationFileError(
-            f"{name}: no TOML ({fault}); remake it with petrobot calibrate"
+            f"{name}: not valid TOML ({fault}); remake it with petrobot calibrate"
         ) from fault
     except KeyError as fault:
         raise CalibrationFileError(
@@ -86,19 +87,20 @@ def parse_calibration(text: str, name: str) -> Calibration:
         raise CalibrationFileError(f"{name}: {fault}; remake it with petrobot calibrate") from fault
     if not np.allclose(optics.rotation @ optics.rotation.T, np.eye(3), atol=1e-6):
         raise CalibrationFileError(
-            f"{name}: [pose] rotation is no rotation; remake it with petrobot calibrate"
+            f"{name}: [pose] rotation: expected an orthogonal matrix; remake it with petrobot "
+            "calibrate"
         )
     return calibration
 
 
 def _tuple(values: Sequence[float], count: int) -> Any:
     if len(values) != count:
-        raise ValueError(f"{count} numbers expected, {list(values)} found")
+        raise ValueError(f"expected {count} numbers, got {list(values)}")
     return tuple(float(value) for value in values)
 
 
 def read_views(folder: Path) -> tuple[list[BoardView], Board]:
-    """Board images of a folder, as its views.toml lists them.
+    """Read the board images of a folder, as its views.toml lists them.
 
     views.toml: `[board] columns, rows, square` and for each image `[[views]] file`, with `pose` (4
     rows of 4 numbers, board frame to base frame, m) where the board lay at a known place. Raises
@@ -109,8 +111,8 @@ def read_views(folder: Path) -> tuple[list[BoardView], Board]:
 
 
 def missing_views(folder: Path) -> tuple[list[tuple[Path, bool]], Board]:
-    """Images that views.toml lists and the folder lacks, each with whether its pose is known, and
-    the board.
+    """Return the images that views.toml lists and the folder lacks, each with whether its pose is
+    known, and the board.
 
     Raises CalibrationFileError.
     """
@@ -133,7 +135,7 @@ def _listed(folder: Path) -> tuple[Board, list[tuple[Path, Array | None]]]:
             f"{path}: cannot be read ({fault.strerror}); it lists the board images"
         ) from fault
     except tomllib.TOMLDecodeError as fault:
-        raise CalibrationFileError(f"{path}: no TOML ({fault}); mend that line") from fault
+        raise CalibrationFileError(f"{path}: not valid TOML ({fault}); correct it") from fault
     except KeyError as fault:
         raise CalibrationFileError(
             f"{path}: key {fault} is missing; docs/vision.md shows such a file"
@@ -148,18 +150,19 @@ def _pose(entry: Mapping[str, Any], path: Path) -> Array | None:
         return np.array(entry["pose"], float).reshape(4, 4)
     except (TypeError, ValueError) as fault:
         raise CalibrationFileError(
-            f"{path}: pose of {entry['file']} needs 4 rows of 4 numbers"
+            f"{path}: pose of {entry['file']}: expected 4 rows of 4 numbers"
         ) from fault
 
 
 def _grey(path: Path) -> NDArray[np.uint8]:
-    if not path.is_file():  # OpenCV would warn in words of its own
+    if not path.is_file():  # OpenCV would print a warning of its own.
         raise CalibrationFileError(
-            f"{path}: not there; mend `file` in views.toml, or take it: petrobot calibrate --source"
+            f"{path}: file not found; correct `file` in views.toml, or take the image with "
+            "petrobot calibrate --source"
         )
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
         raise CalibrationFileError(
-            f"{path}: no image; mend `file` in views.toml or take the image again"
+            f"{path}: not an image; correct `file` in views.toml or take the image again"
         )
     return np.asarray(pixels, np.uint8)

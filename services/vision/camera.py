@@ -1,5 +1,5 @@
-"""The driver of a camera over the table: starts and stops images, hands them to actions, keeps what
-was learned between runs."""
+"""Driver of a camera over the table: starts and stops images, passes them to actions, and keeps
+what was learned between runs."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from petrobot.services.action import Context
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.device import Ports, refuse_unknown_keys
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
-from petrobot.services.vision.location import Background, Detector
+from petrobot.services.vision.location import Background, BallDetector
 from petrobot.services.vision.prediction import Surface
 from petrobot.services.vision.table import TableView
 
 KEYS = ("calibration", "cell", "rate", "threads")
-"""Its own keys in services.toml."""
+"""The driver's own keys in services.toml."""
 CELL = Path(__file__).parents[1] / "cell.toml"
 REMEMBERED = 256
-"""Images whose times are remembered, for a tracker that goes on where a locator ended."""
+"""Images whose times are remembered, for a tracker that continues where a locator finished."""
 
 QUALITY = 75
-"""Of JPEGs for the operator (0 to 100)."""
+"""Quality of the JPEGs for the operator (0 to 100)."""
 SHOWN_RADIUS_PX = 12.0
 MOST_SHOWN = 8
-"""Candidates that are drawn over an image."""
+"""Most candidates that are drawn over an image."""
 
 
 class CameraError(ValueError):
-    """The camera's config or its images cannot be used; the text says what to change."""
+    """The camera's configuration or its images cannot be used; the message says what to change."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What an action saw in an image, for the operator: places in px, shape (n, 2), or `table`
-    places in m for what it predicts."""
+    """What an action saw in an image, for the operator: `pixels` of shape (n, 2), or `table`
+    positions in m for what it predicts."""
 
     label: str
     pixels: Any = ()
@@ -49,12 +49,12 @@ class Mark:
 
 
 class Camera:
-    """A device without cyclic duty. Its keys in services.toml, all optional but those of its
+    """A device without cyclic work. Its keys in services.toml, all optional except those of its
     source:
 
-    `calibration`: file beside services.toml (default: the simulated camera's); `cell`: the cell's
-    data (default: the shipped one); `rate`: images/s (default: the cell's); `threads`: for OpenCV
-    (default 1: cores are shared with other nodes).
+    `calibration`: file beside services.toml (default: that of the simulated camera); `cell`: the
+    cell's data (default: the shipped one); `rate`: images/s (default: the cell's); `threads`: for
+    OpenCV (default 1: other nodes share the cores).
     """
 
     period: float | None = None
@@ -72,12 +72,12 @@ class Camera:
         self.surface = Surface.of(cell)
         self.background = Background()
         self.usual_rate = _rate(config.get("rate", cell["camera"]["rate"]))
-        self._detectors: dict[str, Detector] = {}
+        self._detectors: dict[str, BallDetector] = {}
         self._times: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._newest: Image | None = None
         self._shown: Image | None = None
         self.marks: tuple[Mark, ...] = ()
-        """What was seen in the image read last; actions set it, the operator's picture shows it."""
+        """What was seen in the last image read; actions set it, the operator's picture shows it."""
         self._rate = 0.0
         self._count = 0
 
@@ -85,12 +85,12 @@ class Camera:
 
     @property
     def rate(self) -> float:
-        """Images/s asked for now, 0 when none."""
+        """Images/s requested now, 0 when none."""
         return self._rate
 
     def start(self, rate: float = 0.0) -> bool:
-        """Have images taken at `rate` (1/s; 0: the usual one). False when they went on at that rate
-        already.
+        """Request images at `rate` (1/s; 0: the usual rate). Return False when they already arrive
+        at that rate.
 
         Raises ConnectionError when the source cannot be opened.
         """
@@ -109,8 +109,8 @@ class Camera:
         self._rate, self._newest = 0.0, None
 
     async def read(self, ctx: Context, timeout: float) -> Image | None:
-        """The newest image not read yet, None when none comes for `timeout` s. Raises CameraError
-        for one of another size."""
+        """Return the newest image that was not read yet, None when none arrives for `timeout` s.
+        Raises CameraError for an image of another size."""
         await ctx.wait(self._arrived, timeout)
         image, self._newest = self._newest, None
         if image is None:
@@ -118,9 +118,8 @@ class Camera:
         if image.pixels.shape != (self.view.height_px, self.view.width_px):
             high, wide = image.pixels.shape
             raise CameraError(
-                f"the camera gives {wide}x{high} images, the cell's are "
-                f"{self.view.width_px}x{self.view.height_px}: "
-                "change [camera] of the cell and calibrate again"
+                f"camera: expected images of {self.view.width_px}x{self.view.height_px} as in the "
+                f"cell's file, got {wide}x{high}; change [camera] there and calibrate again"
             )
         self._count += 1
         self._shown, self.marks = image, ()
@@ -134,11 +133,12 @@ class Camera:
         return self._newest is not None
 
     def time_of(self, sequence: int) -> float | None:
-        """Mid-exposure time (s) of an image read lately, None when it is not remembered."""
+        """Return the mid-exposure time (s) of a recently read image, None when it is not
+        remembered."""
         return next((time for number, time in reversed(self._times) if number == sequence), None)
 
-    def detector(self, name: str, make: Callable[[], Detector]) -> Detector:
-        """The detector of this name with all that it has learned; made at first use."""
+    def detector(self, name: str, make: Callable[[], BallDetector]) -> BallDetector:
+        """Return the detector of this name with all that it has learned; make it at first use."""
         if name not in self._detectors:
             self._detectors[name] = make()
         return self._detectors[name]
@@ -146,14 +146,14 @@ class Camera:
     # For the node
 
     def command(self, now: float, body: Mapping[str, Any]) -> None:
-        """Cyclic drivers take commands; this one's actions use its methods."""
+        """Refuse: actions call the methods above instead."""
         raise ValueError("the camera takes no commands; its actions read images")
 
     def step(self, now: float) -> None:
-        """Nothing is due between images."""
+        """Do nothing: nothing is due between images."""
 
     def state(self) -> Mapping[str, Any]:
-        """Plain data for operator and report."""
+        """Return plain data for operator and report."""
         return {
             "rate": self._rate,
             "images": self._count,
@@ -161,7 +161,8 @@ class Camera:
         }
 
     def picture(self) -> Mapping[str, Any]:
-        """The image read last with what was seen in it, as a JPEG; empty before the first."""
+        """Return the last image read, with what was seen in it, as a JPEG; empty before the
+        first."""
         image = self._shown
         if image is None:
             return {}
@@ -180,8 +181,8 @@ class Camera:
         }
 
     def _shapes(self, mark: Mark) -> list[dict[str, Any]]:
-        """A mark in the page's words: circles where something was found, one path along what was
-        predicted."""
+        """Return a mark in the format of the page: circles where something was found, one path
+        along what was predicted."""
         found = [(float(x), float(y)) for x, y in mark.pixels]
         shapes: list[dict[str, Any]] = [
             {
@@ -215,27 +216,27 @@ class Camera:
         self.end()
 
     def stopped(self) -> bool:
-        """Whether no images are taken; a camera never moves."""
+        """Return whether no images are taken; a camera never moves."""
         return self._rate == 0.0
 
     def hold(self, now: float) -> str:
-        """A rolling ball does not wait: while images are taken the camera cannot hold."""
+        """Refuse a pause while images are taken: a rolling ball does not wait."""
         return "held" if self.stopped() else "cannot hold"
 
     def release(self, now: float) -> None:
-        """Nothing was held."""
+        """Do nothing: nothing was held."""
 
     def close(self) -> None:
-        """Let the source go."""
+        """Stop the images and close the source."""
         self.end()
         self._images.close()
 
 
 def _rate(value: Any) -> float:
-    """Images/s as configured."""
+    """Return the images/s of the configuration. Raises CameraError."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= 1000.0:
         raise CameraError(
-            f"camera: rate = {value!r} images/s; give a number above 0 and at most 1000, such as 50"
+            f"camera: rate: expected images/s above 0 and at most 1000, such as 50, got {value!r}"
         )
     return float(value)
 
@@ -246,4 +247,4 @@ def _cell(config: Mapping[str, Any], ports: Ports) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as fault:
-        raise CameraError(f"{name or CELL.name}: no TOML ({fault}); mend that line") from fault
+        raise CameraError(f"{name or CELL.name}: not valid TOML ({fault}); correct it") from fault

@@ -1,51 +1,189 @@
-"""Locating: reads images until candidates of a detector are confirmed as a ball that rolls towards
-the near edge."""
+"""Locating: reads images until a detector's candidates are confirmed as a ball that rolls toward
+the near edge.
+
+Candidates are a rolling ball if, image after image, they lie on one straight line at one plausible
+speed. Stickers, glare and the arm also produce candidates, but they do not roll towards the near
+edge.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
-from petrobot.services.vision.confirmation import Confirmation, Track
-from petrobot.services.vision.location import Detector, MixtureOfGaussians
+from petrobot.services.vision.location import BallDetector, MixtureOfGaussians
 from petrobot.services.vision.specification import Specification
 
+# --- Confirmation --------------------------------------------------------------------------------
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class BallTrack:
+    """A ball that was seen to roll.
+
+    `times` (n,) s, `places` (n, 2) m, `velocity` (2,) m/s, and the `residual` (m, rms) of the
+    places about the straight line of constant speed through them.
+    """
+
+    times: Array
+    places: Array
+    velocity: Array
+    residual: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rolling:
+    """What counts as a ball that rolls towards the near edge (m, s)."""
+
+    slowest: float = 0.25
+    """Slowest and fastest ball (m/s)."""
+    fastest: float = 3.5
+    towards: float = -0.15
+    """m/s, greatest x velocity: negative, towards the near edge."""
+    gate: float = 0.015
+    """m that a candidate may lie from where the track expects it."""
+    spread: float = 0.008
+    """m, largest rms residual of a confirmed track."""
+    shortest: float = 0.03
+    """m that a confirmed track must cover."""
+
+
+class Confirmation:
+    """Joins candidates of successive images to tracks, and confirms a track that has `count` of
+    them."""
+
+    MOST = 40
+    """Most tracks kept; the oldest go first."""
+    MISSED = 3
+    """Images in a row in which a track may find no candidate."""
+
+    def __init__(self, count: int, rolling: Rolling | None = None) -> None:
+        """`count` consistent detections, at least 3, confirm a ball."""
+        self._count = max(3, count)
+        self._rolling = rolling or Rolling()
+        self._tracks: list[list[tuple[float, float, float]]] = []
+        self._missed: list[int] = []
+
+    def add(self, time: float, places: Sequence[Sequence[float]] | Array) -> BallTrack | None:
+        """Take the candidates (n, 2) m of the image at `time` (s, rising); return a track as soon
+        as one is confirmed."""
+        free = [(time, float(x), float(y)) for x, y in places]
+        kept, missed = [], []
+        for track, misses in zip(self._tracks, self._missed, strict=True):
+            nearest = self._extension(track, free)
+            if nearest is not None:
+                kept.append([*track, nearest])
+                missed.append(0)
+            elif misses < self.MISSED:
+                kept.append(track)
+                missed.append(misses + 1)
+        used = {track[-1] for track in kept if track[-1][0] == time and len(track) > 2}
+        fresh = [[candidate] for candidate in free if candidate not in used]
+        self._tracks = (kept + fresh)[-self.MOST :]
+        self._missed = (missed + [0] * len(fresh))[-self.MOST :]
+        confirmed = [
+            found for track in self._tracks if (found := self._confirmed(track)) is not None
+        ]
+        return min(confirmed, key=lambda found: found.residual) if confirmed else None
+
+    def _extension(
+        self, track: list[tuple[float, float, float]], free: list[tuple[float, float, float]]
+    ) -> tuple[float, float, float] | None:
+        """Return the candidate that continues a track best, None if none does."""
+        best, least = None, np.inf
+        for candidate in free:
+            away = self._misfit(track, candidate)
+            if away < least:
+                best, least = candidate, away
+        return best
+
+    def _misfit(
+        self, track: list[tuple[float, float, float]], candidate: tuple[float, float, float]
+    ) -> float:
+        """Return how badly a candidate continues a track (m); inf when it does not."""
+        t, x, y = track[-1]
+        step = candidate[0] - t
+        vx, vy = (candidate[1] - x) / step, (candidate[2] - y) / step
+        speed = float(np.hypot(vx, vy))
+        if (
+            not self._rolling.slowest <= speed <= self._rolling.fastest
+            or vx > self._rolling.towards
+        ):
+            return float("inf")
+        if len(track) == 1:
+            return speed * step
+        fit = _line(np.array(track[-6:]))
+        expected = fit[0] + fit[1] * candidate[0]
+        away = float(np.hypot(candidate[1] - expected[0], candidate[2] - expected[1]))
+        return away if away <= self._rolling.gate else float("inf")
+
+    def _confirmed(self, track: list[tuple[float, float, float]]) -> BallTrack | None:
+        if len(track) < self._count or self._missed[self._tracks.index(track)]:
+            return None
+        rows = np.array(track)
+        offset, velocity = _line(rows)
+        residual = float(
+            np.sqrt(np.mean(np.sum((rows[:, 1:] - offset - rows[:, :1] * velocity) ** 2, axis=1)))
+        )
+        way = float(np.hypot(*(rows[-1, 1:] - rows[0, 1:])))
+        if residual > self._rolling.spread or way < self._rolling.shortest:
+            return None
+        return BallTrack(rows[:, 0], rows[:, 1:], velocity, residual)
+
+
+def _line(rows: Array) -> tuple[Array, Array]:
+    """Return position at time 0 (2,) and velocity (2,) of the least-squares line of constant speed
+    through rows t, x, y."""
+    middle = rows.mean(axis=0)
+    off = rows - middle
+    velocity = off[:, 0] @ off[:, 1:] / max(float(off[:, 0] @ off[:, 0]), 1e-12)
+    return middle[1:] - velocity * middle[0], velocity
+
+
+# --- Searching -----------------------------------------------------------------------------------
+
 LEARN_EVERY = 10
-"""Images: the stored background takes in every so manieth one."""
+"""The stored background learns from every so many images."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocateSpecification(Specification):
-    """When a ball counts as located, and how well (s, m)."""
+    """When a ball counts as located, and how accurately (s, m)."""
 
     timeout: float = 5.0
-    """s until no ball is an error."""
+    """s after which no ball is an error."""
     confirmations: float = 4.0
     """Consistent detections that confirm a ball."""
     rate: float = 0.0
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.8
-    """s without an image until the camera counts as dead."""
+    """s without an image after which the camera counts as dead."""
     max_residual: float = 0.0015
-    """m, rms of the places about a straight line of even speed: above it FAILURE `inaccurate`."""
+    """m, rms of the places about a straight line of constant speed; above it FAILURE
+    `inaccurate`."""
     min_ahead: float = 1.0
-    """m before the near edge at least: below it FAILURE `late`."""
+    """m that the ball must still be before the near edge; below it FAILURE `late`."""
 
 
 async def locate(
     ctx: Context,
     name: str,
-    make: Callable[[Camera], Detector],
+    make: Callable[[Camera], BallDetector],
     sigma: float,
     specification: LocateSpecification,
 ) -> Result:
-    """Locate with the detector that `make` makes, kept by the camera under `name`; `sigma`: its
+    """Locate with the detector that `make` makes; the camera keeps it under `name`. `sigma` is its
     accuracy (m).
 
-    Images go on after SUCCESS and FAILURE, for the tracker; they end with ERROR.
+    The images continue after SUCCESS and FAILURE, for the tracker; they end with ERROR.
     """
     camera: Camera = ctx.device
     search = _Search(ctx, camera, camera.detector(name, lambda: make(camera)), specification)
@@ -65,7 +203,11 @@ class _Search:
     """One run of a locator."""
 
     def __init__(
-        self, ctx: Context, camera: Camera, detector: Detector, specification: LocateSpecification
+        self,
+        ctx: Context,
+        camera: Camera,
+        detector: BallDetector,
+        specification: LocateSpecification,
     ) -> None:
         self._ctx = ctx
         self._camera = camera
@@ -75,7 +217,7 @@ class _Search:
         self._images = 0
 
     async def run(self, sigma: float) -> Result:
-        """Read images until a ball is confirmed, or the time is over."""
+        """Read images until a ball is confirmed, or the time is up."""
         asked = self._specification
         if self._camera.start(asked.rate) and isinstance(self._detector, MixtureOfGaussians):
             self._detector.forget()
@@ -97,7 +239,7 @@ class _Search:
                 return self._judge(track, image, sigma)
         return error("no_ball", f"no rolling ball in {self._images} images", images=self._images)
 
-    def _look(self, image: Image) -> Track | None:
+    def _look(self, image: Image) -> BallTrack | None:
         self._images += 1
         background = self._camera.background
         candidates = self._detector.detect(image.pixels)
@@ -107,8 +249,8 @@ class _Search:
             background.learn(image.pixels)
         return self._confirmation.add(image.time, places)
 
-    def _judge(self, track: Track, image: Image, sigma: float) -> Result:
-        """The confirmed ball as plain data, SUCCESS when it meets the specification."""
+    def _judge(self, track: BallTrack, image: Image, sigma: float) -> Result:
+        """Return the confirmed ball as plain data; SUCCESS when it meets the specification."""
         asked = self._specification
         ahead = float(track.places[-1, 0]) - self._camera.view.near_edge
         ball = {

@@ -1,9 +1,9 @@
-"""Where the ball is in an image: five detectors over the whole table that differ in what they cost
-and what deceives them, and the measurement in a small window with which a known ball is tracked.
+"""Where the ball is in an image: five detectors over the whole table, which differ in cost and in
+what deceives them, and the measurement in a small window that tracks a known ball.
 
-Every detector takes an image (height, width) uint8 and gives candidates (n, 2): the ball's centre
-in pixels. They keep state of their own kind; time, cameras and the question which candidate is the
-ball (`confirmation.py`) are none of theirs.
+Every detector takes an image (height, width) uint8 and returns candidates (n, 2): the ball's centre
+in pixels. Each keeps its own state. Time, cameras, and the question which candidate is the ball
+(`locating.py`) are not their concern.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ NOTHING: Array = np.empty((0, 2))
 _NEIGHBOURS: Pixels = np.ones((3, 3), np.uint8)
 
 HALF = 2
-"""Detectors over the whole table look at images of half the size first."""
+"""Detectors over the whole table first look at images of half the size."""
 SMALLEST, LARGEST = 0.45, 1.9
-"""Area of a candidate, relative to the area that a ball (with the streak of the fastest one)
-covers."""
+"""Area of a candidate, relative to the area that a ball covers (largest: with the streak of the
+fastest ball)."""
 ROUNDEST_FILL = 0.55
-"""A disc fills pi/4 of its bounding box, a streaked one more; scattered pixels and slanting stripes
-less."""
+"""Least share of its bounding box that a candidate fills. A disc fills pi/4, a streaked one more;
+scattered pixels and slanting stripes less."""
 FASTEST = 3.5
 """m/s, the fastest ball that is looked for."""
 
 
-class Detector(Protocol):
-    """Candidates in one image."""
+class BallDetector(Protocol):
+    """Finds candidates in one image."""
 
     def detect(self, pixels: Pixels) -> Array:
-        """Candidate centres (n, 2) px."""
+        """Return candidate centres (n, 2) px."""
 
 
 class Background:
     """Mean grey levels of the empty table, learned from images and kept between runs.
 
-    The first `first` images count equally, each later one `rate`: slow light is followed, and a
-    ball that passes leaves less than a detector's threshold.
+    The first `first` images count equally, each later one with weight `rate`: slow changes of light
+    are followed, and a passing ball leaves less than a detector's threshold.
     """
 
     def __init__(self, first: int = 5, rate: float = 0.08) -> None:
@@ -63,7 +63,7 @@ class Background:
         return self.images >= self._first
 
     def learn(self, pixels: Pixels) -> None:
-        """Take an image into the mean."""
+        """Include an image in the mean."""
         self.images += 1
         if self._mean is None or self._mean.shape != pixels.shape:
             self._mean, self.images = pixels.astype(np.float32), 1
@@ -73,9 +73,9 @@ class Background:
 
 
 def ball_blobs(mask: Pixels, radius: float, streak: float) -> Array:
-    """Centroids (n, 2) of the regions of a mask (0 or 255) that have a ball's size and shape;
-    radius and streak in its px."""
-    if cv2.countNonZero(mask) == 0:  # most often: nothing rolls
+    """Return the centroids (n, 2) of the regions of a mask (0 or 255) that have a ball's size and
+    shape; radius and streak in its px."""
+    if cv2.countNonZero(mask) == 0:  # Usually nothing rolls.
         return NOTHING
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count <= 1:
@@ -97,8 +97,8 @@ def ball_blobs(mask: Pixels, radius: float, streak: float) -> Array:
 
 
 class _WholeTable:
-    """What detectors over the whole table share: the cut-out of the table, at half size, and the
-    way back to pixels."""
+    """Common part of the detectors over the whole table: the region of the table at half size, and
+    the conversion back to pixels."""
 
     def __init__(self, view: TableView) -> None:
         self.view = view
@@ -108,7 +108,7 @@ class _WholeTable:
         self._half_size = ((columns.stop - columns.start) // HALF, (rows.stop - rows.start) // HALF)
 
     def half(self, pixels: Pixels) -> Pixels:
-        """The table at half the size, each pixel the mean of four."""
+        """Return the table at half the size, each pixel the mean of four."""
         return np.asarray(
             cv2.resize(
                 pixels[self._rows, self._columns], self._half_size, interpolation=cv2.INTER_AREA
@@ -117,23 +117,24 @@ class _WholeTable:
         )
 
     def blobs(self, mask: Pixels) -> Array:
-        """Ball-like regions of a half-size mask, as pixels of the image, on the table only."""
+        """Return ball-like regions of a half-size mask as pixels of the image, only those on the
+        table."""
         streak = self.view.streak_px(FASTEST) / HALF
         return self.on_table(self.from_half(ball_blobs(mask, self.view.radius_px / HALF, streak)))
 
     def from_half(self, centres: Array) -> Array:
-        """Pixels of the image from those of the half-size cut-out (pixel centres at whole numbers
-        in both)."""
+        """Convert pixels of the half-size region to pixels of the image (pixel centres at whole
+        numbers in both)."""
         return np.asarray(centres * HALF + (HALF - 1) / 2.0 + self._corner)
 
     def on_table(self, pixels: Array) -> Array:
-        """Those whose place is on the table."""
+        """Keep the pixels whose position is on the table."""
         return pixels[self.view.on_table(self.view.to_table(pixels))] if len(pixels) else pixels
 
 
 class BackgroundSubtraction(_WholeTable):
-    """What is brighter than the stored picture of the empty table. Cheap and accurate; blind when
-    the light has changed by more than its threshold since the picture was learned."""
+    """Finds what is brighter than the stored picture of the empty table. Cheap and accurate; blind
+    when the light has changed by more than its threshold since the picture was learned."""
 
     THRESHOLD = 24.0
     """Grey levels: 16 sigma of the half-size noise, a fifth of a ball's contrast in full light."""
@@ -141,16 +142,16 @@ class BackgroundSubtraction(_WholeTable):
     def __init__(self, view: TableView, background: Background) -> None:
         super().__init__(view)
         self._background = background
-        self._window = Window(view)
+        self._window = BallWindow(view)
         self._halved: Pixels | None = None
         self._half_picture: Pixels = np.empty((0, 0), np.uint8)
 
     def detect(self, pixels: Pixels) -> Array:
-        """Candidates, refined to parts of a pixel; none before the background is known."""
+        """Return candidates, refined to parts of a pixel; none before the background is known."""
         picture = self._background.picture
         if picture is None or not self._background.known:
             return NOTHING
-        if picture is not self._halved:  # a new one each time it learns
+        if picture is not self._halved:  # The background makes a new picture each time it learns.
             self._halved, self._half_picture = picture, self.half(picture)
         found = []
         for centre in self.blobs(self._mask(self.half(pixels), self._half_picture)):
@@ -162,7 +163,7 @@ class BackgroundSubtraction(_WholeTable):
         return np.array(found) if found else NOTHING
 
     def _mask(self, half: Pixels, empty: Pixels) -> Pixels:
-        """Where an image is brighter than the empty table (0 or 255), both at half size."""
+        """Return where an image is brighter than the empty table (0 or 255), both at half size."""
         brighter = cv2.subtract(half, empty)
         return np.asarray(
             cv2.threshold(brighter, self.THRESHOLD, 255, cv2.THRESH_BINARY)[1], np.uint8
@@ -170,9 +171,12 @@ class BackgroundSubtraction(_WholeTable):
 
 
 class CompensatedSubtraction(BackgroundSubtraction):
-    """What is brighter than the stored picture in the light of this very image: the picture is
-    scaled by how much brighter the whole table has become. Stands light that beats, switches or
-    drifts, as long as all of the table is lit alike."""
+    """Finds what is brighter than the stored picture in the light of this very image.
+
+    The picture is scaled by the ratio of the medians, that is by how much brighter the whole table
+    has become. Works in light that flickers, switches or drifts, as long as the whole table is lit
+    alike.
+    """
 
     LEAST_THRESHOLD = 10.0
     """Grey levels: 6 sigma of the half-size noise."""
@@ -185,11 +189,13 @@ class CompensatedSubtraction(BackgroundSubtraction):
 
 
 class MixtureOfGaussians(_WholeTable):
-    """OpenCV's MOG2 (Zivkovic 2004): several grey levels a pixel, each with its own spread, learned
-    all the time. Follows changing light; costs most, and needs some images before it knows the
+    """OpenCV's MOG2 (Z. Zivkovic, "Improved adaptive Gaussian mixture model for background
+    subtraction", 2004): several grey levels per pixel, each with its own spread, learned
+    continuously. Follows changing light; costs most, and needs some images before it knows the
     table."""
 
     WARM_UP = 6
+    """Images that only teach the model."""
 
     def __init__(self, view: TableView) -> None:
         super().__init__(view)
@@ -199,29 +205,29 @@ class MixtureOfGaussians(_WholeTable):
         self._images = 0
 
     def forget(self) -> None:
-        """Images stopped for a while: learn quickly again."""
+        """Learn quickly again: there were no images for a while."""
         self._images = 0
 
     def detect(self, pixels: Pixels) -> Array:
-        """Candidates, accurate to about half a pixel; none during the first images."""
+        """Return candidates, accurate to about half a pixel; none during the first images."""
         self._images += 1
         rate = 0.4 if self._images <= 3 else 0.04
         mask = self._model.apply(self.half(pixels), None, rate)
         if self._images < self.WARM_UP:
             return NOTHING
-        mask = cv2.threshold(mask, 200, 255, cv2.THRESH_BINARY)[1]  # shadows are marked 127
+        mask = cv2.threshold(mask, 200, 255, cv2.THRESH_BINARY)[1]  # OpenCV marks shadows with 127.
         return self.blobs(np.asarray(cv2.medianBlur(mask, 3), np.uint8))
 
 
 class HoughCircles(_WholeTable):
-    """Circles of the ball's size by OpenCV's gradient Hough transform. Needs no background and no
-    certain light; coarse, and every round thing is a candidate."""
+    """Finds circles of the ball's size by OpenCV's gradient Hough transform. Needs neither a
+    background nor a certain light; coarse, and every round thing is a candidate."""
 
     EDGE, VOTES = 60.0, 11.0
     MOST = 12
 
     def detect(self, pixels: Pixels) -> Array:
-        """The most voted circles."""
+        """Return the circles with the most votes."""
         radius = self.view.radius_px
         smooth = cv2.GaussianBlur(pixels[self._rows, self._columns], (5, 5), 1.2)
         circles = cv2.HoughCircles(
@@ -242,36 +248,39 @@ class HoughCircles(_WholeTable):
 
 
 class FixedThreshold(_WholeTable):
-    """All that is brighter than one grey level. Cheapest, needs no background; fails where the
-    light is uneven or changes."""
+    """Finds all that is brighter than one grey level. Cheapest, needs no background; fails where
+    the light is uneven or changes."""
 
     def __init__(self, view: TableView, level: float = 160.0) -> None:
         super().__init__(view)
         self._level = level
 
     def detect(self, pixels: Pixels) -> Array:
-        """Candidates, accurate to about half a pixel."""
+        """Return candidates, accurate to about half a pixel."""
         mask = cv2.threshold(self.half(pixels), self._level, 255, cv2.THRESH_BINARY)[1]
         return self.blobs(np.asarray(mask, np.uint8))
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """A ball measured in a window: `centre` (2,) px, `cover`: seen area relative to the expected
-    one."""
+class MeasuredBall:
+    """A ball measured in a window: `centre` (2,) px; `cover`: measured area relative to the
+    expected one."""
 
     centre: Array
     cover: float
 
 
-class Window:
-    """Measures a ball whose place is about known. The light's change since the background was
-    learned is taken from the window itself; a ball partly hidden by arm or cup, or merged with
-    them, is not measured."""
+class BallWindow:
+    """Measures a ball whose position is roughly known.
+
+    The change of light since the background was learned is taken from the window itself. A ball
+    that is partly hidden by arm or cup, or merged with them, is not measured.
+    """
 
     CONTRAST = 25.0
-    """Grey levels that a ball is brighter than the background at least."""
+    """Grey levels by which a ball must be brighter than the background."""
     LEAST_COVER, MOST_COVER = 0.72, 1.30
+    """Smallest and largest area relative to the expected one."""
 
     def __init__(self, view: TableView) -> None:
         self.view = view
@@ -283,11 +292,11 @@ class Window:
         expected: Array,
         streak: float = 0.0,
         spread: float = 4.0,
-    ) -> Seen | None:
-        """The ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its longest
-        way during the exposure (px).
+    ) -> MeasuredBall | None:
+        """Return the ball nearest to `expected` (2,) px, at most `spread` px away; `streak`: its
+        longest path during the exposure (px).
 
-        None where no ball is seen whole.
+        None where no whole ball is in view.
         """
         radius = self.view.radius_px
         reach = int(np.ceil(spread + 1.5 * radius + streak / 2.0 + 3.0))
@@ -327,8 +336,8 @@ class Window:
         return slice(top, bottom), slice(left, right)
 
     def _cover(self, region: Pixels, background: Pixels) -> NDArray[np.float32] | None:
-        """How much of each pixel the ball covers: 0 background, 1 ball; from its own grey level
-        where it is brightest."""
+        """Return how much of each pixel the ball covers: 0 background, 1 ball. The ball's own grey
+        level is taken where it is brightest."""
         gain = _median(region) / max(_median(background), 1.0)
         empty = background.astype(np.float32) * gain
         brighter = region - empty
@@ -348,7 +357,8 @@ class Window:
         largest: float,
         spread: float,
     ) -> int | None:
-        """The region of a whole ball's area that is nearest to the expected place."""
+        """Return the region with the area of a whole ball that is nearest to the expected
+        position."""
         (u, v), best, least = middle.tolist(), None, math.inf
         low, high = self.LEAST_COVER * smallest, self.MOST_COVER * largest
         for number, (size, (x, y)) in enumerate(zip(area.tolist(), centres.tolist(), strict=True)):
@@ -363,23 +373,23 @@ class Window:
         mine: NDArray[np.bool_],
         stats: NDArray[Any],
         box: tuple[slice, slice],
-    ) -> Seen | None:
+    ) -> MeasuredBall | None:
         left, top, wide, high, area = (int(value) for value in stats)
         if left == 0 or top == 0 or left + wide == cover.shape[1] or top + high == cover.shape[0]:
-            return None  # cut by the window or the image's border
+            return None  # Cut off by the border of the window or the image.
         part = slice(top - 1, top + high + 1), slice(left - 1, left + wide + 1)
-        # pixels of the rim count by the part that is covered, all others fully, also on the ball's
-        # shaded side
+        # Pixels of the rim count by the part that is covered, all others fully, even on the ball's
+        # shaded side.
         weight = np.minimum(np.maximum((cover[part] - 0.15) / 0.30, 0.0), 1.0)
         weight *= cv2.dilate(mine[part].view(np.uint8), _NEIGHBOURS)
         total = float(weight.sum())
         u = float(weight.sum(axis=0) @ np.arange(left - 1, left + wide + 1)) / total
         v = float(weight.sum(axis=1) @ np.arange(top - 1, top + high + 1)) / total
         centre = np.array([u + box[1].start, v + box[0].start])
-        return Seen(centre, area / (np.pi * self.view.radius_px**2))
+        return MeasuredBall(centre, area / (np.pi * self.view.radius_px**2))
 
 
 def _median(region: Pixels) -> float:
-    """Median of every third grey level along both axes."""
+    """Return the median of every third grey level along both axes."""
     sample = region[::3, ::3].ravel()
     return float(np.partition(sample, sample.size // 2)[sample.size // 2])

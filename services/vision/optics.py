@@ -1,5 +1,5 @@
-"""The camera as its calibration knows it: base-frame points to pixels, and pixels back to a plane
-above the table, exactly.
+"""The camera as its calibration describes it: base-frame points to pixels, and pixels back to a
+plane above the table, exactly.
 
 Pinhole with Brown's distortion in OpenCV's order k1 k2 p1 p2 (D. C. Brown, "Decentering distortion
 of lenses", 1966). Lengths in m, base frame; pixels are (u, v), u to the right, whole numbers at
@@ -19,14 +19,17 @@ Array = NDArray[np.float64]
 Number = TypeVar("Number", float, Array)
 
 NEWTON_STEPS = 4
-"""Newton's method on the distortion: 4 steps leave less than 1e-9 px inside the image
+"""Steps of Newton's method on the distortion: 4 leave less than 1e-9 px inside the image
 (tests/vision/test_optics.py)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """A calibrated camera: `focal` and `centre` (px), `distortion` k1 k2 p1 p2, and its pose: a
-    base-frame point p has camera coordinates `rotation @ (p - position)`."""
+    """A calibrated camera.
+
+    `focal` and `centre` (px), `distortion` k1 k2 p1 p2, and its pose: a base-frame point p has
+    camera coordinates `rotation @ (p - position)`.
+    """
 
     focal: tuple[float, float]
     centre: tuple[float, float]
@@ -36,7 +39,7 @@ class Optics:
 
     @classmethod
     def nominal(cls, cell: Mapping[str, Any]) -> Optics:
-        """The camera as its designers meant it: `[camera]` of cell.toml."""
+        """Return the camera as designed: `[camera]` of cell.toml."""
         camera = cell["camera"]
         right, down = np.asarray(camera["image_x"], float), np.array([0.0, 0.0, -1.0])
         focal = float(camera["focal_px"])
@@ -56,7 +59,7 @@ class Optics:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) before the camera."""
+        """Return pixels (..., 2) of points (..., 3) in front of the camera."""
         at = np.asarray(points, float)
         if at.ndim == 1:
             return np.array(self._pixel(*at.tolist()))
@@ -69,7 +72,8 @@ class Optics:
         )
 
     def _pixel(self, px: float, py: float, pz: float) -> tuple[float, float]:
-        """One point, as in tracking: plain floats are much faster than arrays without dimension."""
+        """Project one point, as in tracking: plain floats are much faster than arrays without
+        dimension."""
         ox, oy, oz = self.position.tolist()
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self.rotation.tolist()
         dx, dy, dz = px - ox, py - oy, pz - oz
@@ -80,7 +84,7 @@ class Optics:
         return self.focal[0] * bent_x + self.centre[0], self.focal[1] * bent_y + self.centre[1]
 
     def _place(self, u: float, v: float, z: float) -> tuple[float, float]:
-        """One pixel through the plane."""
+        """Return where one pixel meets the plane."""
         x, y = self._straighten(
             (u - self.centre[0]) / self.focal[0], (v - self.centre[1]) / self.focal[1]
         )
@@ -90,8 +94,8 @@ class Optics:
         return ox + distance * (x * xx + y * yx + zx), oy + distance * (x * xy + y * yy + zy)
 
     def to_plane(self, pixels: ArrayLike, z: float) -> Array:
-        """Points (..., 2), x and y, where pixels (..., 2) look through the horizontal plane at
-        height `z` (m)."""
+        """Return the points (..., 2), x and y, where pixels (..., 2) look through the horizontal
+        plane at height `z` (m)."""
         at = np.asarray(pixels, float)
         if at.ndim == 1:
             u, v = at.tolist()
@@ -105,13 +109,14 @@ class Optics:
         return np.asarray(self.position[:2] + distance[..., None] * direction[..., :2])
 
     def scale(self, point: ArrayLike) -> float:
-        """Pixels per metre near a point (3,): its size in the image is about so many pixels a metre
+        """Return pixels per metre near a point (3,): the size in the image of something one metre
         across."""
         depth = float(self.rotation[2] @ (np.asarray(point, float) - self.position))
         return (self.focal[0] + self.focal[1]) / 2.0 / depth
 
     def _bend(self, x: Number, y: Number) -> tuple[Number, Number, Number, Number, Number]:
-        """Distorted image-plane coordinates and their derivatives by x and y (xx, xy = yx, yy)."""
+        """Return distorted image-plane coordinates and their derivatives by x and y (xx, xy = yx,
+        yy)."""
         k1, k2, p1, p2 = self.distortion
         square = x * x + y * y
         radial = 1.0 + square * (k1 + k2 * square)
@@ -124,7 +129,7 @@ class Optics:
         return bent_x, bent_y, xx, xy, yy
 
     def _straighten(self, bent_x: Number, bent_y: Number) -> tuple[Number, Number]:
-        """Inverse of the distortion by Newton's method."""
+        """Invert the distortion by Newton's method."""
         x, y = bent_x, bent_y
         for _ in range(NEWTON_STEPS):
             at_x, at_y, xx, xy, yy = self._bend(x, y)

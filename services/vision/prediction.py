@@ -1,10 +1,11 @@
 """Where and when a rolling ball leaves the table, from where it was seen: three predictors of
-different effort.
+different cost.
 
-A ball on a table first slides while its spin is less than that of pure rolling (a hollow ball with
-spin share s settles at (3 + 2 s) / 5 of its speed), then rolls and loses a constant c g of speed a
-second, on a straight line all the while. The coefficient c is known to +-30 % only; sliding ends
-some tenths of a second after the release. Pure; s, m, base frame.
+A ball on a table first slides, while its spin is less than that of pure rolling: a hollow ball with
+spin share s settles at (3 + 2 s) / 5 of its speed (conservation of angular momentum about the
+contact point, with I = 2/3 m r^2). Then it rolls and loses a constant c g of speed per second. It
+stays on a straight line all the time. The coefficient c is known to +-30 % only; sliding ends some
+tenths of a second after the release. Pure; s, m, base frame.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SLIDING, SLIDING_SIGMA = 2.5, 1.5
-"""m/s^2, deceleration of a sliding ball before anything is known: friction coefficient 0.25 +-
-0.15."""
+"""m/s^2, deceleration of a sliding ball before anything is known: friction coefficient 0.25 +- 0.15
+times g."""
 LARGEST_LOSS, LOSS_SIGMA = 0.12, 0.02
-"""Share of its speed that a ball loses by sliding at most, and how sharp that bound is: a thrown
+"""Largest share of its speed that a ball loses by sliding, and how sharp that bound is. A thrown
 ball has at least 70 % of the spin of pure rolling, so it settles at 88 % of its speed or more."""
 
 
-class Way(StrEnum):
+class ExitWay(StrEnum):
     """How a ball leaves the table, if it does."""
 
     NEAR_EDGE = "near_edge"
@@ -39,12 +40,14 @@ class Way(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Exit:
-    """Prediction of where the ball's centre passes the edge: `time` on the observations' clock,
-    `point` and `velocity` (2,), standard deviations of the time and of the place along the edge.
-    For `Way.STAYS` time is inf."""
+class PredictedExit:
+    """Prediction of where the ball's centre passes the edge.
 
-    way: Way
+    `time` on the clock of the observations, `point` and `velocity` (2,), standard deviations of the
+    time and of the place along the edge. For `ExitWay.STAYS` the time is inf.
+    """
+
+    way: ExitWay
     time: float
     point: Array
     velocity: Array
@@ -54,9 +57,11 @@ class Exit:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """The table as the ball's centre meets it, and how it slows the ball. `rolling` and
-    `rolling_sigma`: deceleration of a rolling ball and how uncertain it is (m/s^2); `noise`:
-    standard deviation of a seen place (m)."""
+    """The table as the ball's centre meets it, and how it slows the ball.
+
+    `rolling` and `rolling_sigma`: deceleration of a rolling ball and its uncertainty (m/s^2);
+    `noise`: standard deviation of a measured place (m).
+    """
 
     near_edge: float
     half_width: float
@@ -66,7 +71,7 @@ class Surface:
 
     @classmethod
     def of(cls, cell: Mapping[str, Any], spread: float = 0.30) -> Surface:
-        """From the cell's data; `spread`: the rolling resistance lies evenly within +- this part of
+        """Read the cell's data; `spread`: the rolling resistance is uniform within +- this share of
         the nominal."""
         table, ball = cell["table"], cell["ball"]
         rolling = float(ball["rolling_resistance"]) * float(ball["gravity"])
@@ -77,38 +82,40 @@ class Surface:
             spread / np.sqrt(3.0) * rolling,
         )
 
-    def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, Way]:
-        """Way along `heading` (2,) from `place` (2,) to the edge that comes first, and which one;
-        inf when none does."""
+    def gap(self, place: Array, heading: Sequence[float] | Array) -> tuple[float, ExitWay]:
+        """Return the distance along `heading` (2,) from `place` (2,) to the edge that comes first,
+        and which one; inf when none does."""
         side = np.inf
         if abs(heading[1]) > 1e-9:
             side = (np.copysign(self.half_width, heading[1]) - place[1]) / heading[1]
         if heading[0] > -1e-9:
-            return (float(side), Way.SIDE) if np.isfinite(side) else (float("inf"), Way.STAYS)
+            return (
+                (float(side), ExitWay.SIDE) if np.isfinite(side) else (float("inf"), ExitWay.STAYS)
+            )
         near = (self.near_edge - place[0]) / heading[0]
-        return (float(near), Way.NEAR_EDGE) if near <= side else (float(side), Way.SIDE)
+        return (float(near), ExitWay.NEAR_EDGE) if near <= side else (float(side), ExitWay.SIDE)
 
 
 class Predictor(Protocol):
-    """Takes places one by one and predicts at any time. Costs the same for every observation."""
+    """Takes places one by one and predicts at any time. Every observation costs the same."""
 
     count: int
-    """Observations taken."""
+    """Number of observations."""
 
     def add(self, time: float, x: float, y: float, sigma: float | None = None) -> None:
         """Take the place (m) where the ball was seen at a time (s, rising), with its standard
         deviation (m; None: the surface's)."""
 
     def place(self, time: float) -> Array:
-        """Where the ball is expected (2,). Needs two observations."""
+        """Return where the ball is expected (2,). Needs two observations."""
 
-    def exit(self) -> Exit | None:
-        """How it leaves the table; None before three observations."""
+    def exit(self) -> PredictedExit | None:
+        """Return how it leaves the table; None before three observations."""
 
 
 class ConstantVelocity:
-    """A straight line of even speed through the last places. The cheapest; knows neither sliding
-    nor rolling resistance."""
+    """A straight line of constant speed through the last places. The cheapest; models neither
+    sliding nor rolling resistance."""
 
     def __init__(self, surface: Surface, last: int = 10) -> None:
         self._surface = surface
@@ -128,24 +135,24 @@ class ConstantVelocity:
         return middle, off[:, 0] @ off[:, 1:] / max(square, 1e-12), square
 
     def place(self, time: float) -> Array:
-        """Where the ball is expected (2,) m."""
+        """Return where the ball is expected (2,) m."""
         middle, velocity, _ = self._fit()
         return np.asarray(middle[1:] + velocity * (time - middle[0]))
 
-    def exit(self) -> Exit | None:
-        """How it leaves the table."""
+    def exit(self) -> PredictedExit | None:
+        """Return how it leaves the table."""
         if len(self._rows) < 3:
             return None
         middle, velocity, square = self._fit()
         speed = float(np.hypot(*velocity))
         heading = velocity / max(speed, 1e-9)
         gap, way = self._surface.gap(middle[1:], heading)
-        if way is Way.STAYS or speed < 1e-3:
+        if way is ExitWay.STAYS or speed < 1e-3:
             return _stays(middle[1:], velocity)
         ahead = gap / speed
         sigma = self._surface.noise * float(np.sqrt(1.0 / len(self._rows) + ahead * ahead / square))
-        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
-        return Exit(
+        facing = abs(heading[0] if way is ExitWay.NEAR_EDGE else heading[1])
+        return PredictedExit(
             way,
             float(middle[0]) + ahead,
             middle[1:] + gap * heading,
@@ -155,12 +162,12 @@ class ConstantVelocity:
         )
 
 
-def _stays(place: Array, velocity: Array) -> Exit:
-    return Exit(Way.STAYS, float("inf"), place, velocity, float("inf"), float("inf"))
+def _stays(place: Array, velocity: Array) -> PredictedExit:
+    return PredictedExit(ExitWay.STAYS, float("inf"), place, velocity, float("inf"), float("inf"))
 
 
 _PLACES = np.ix_((0, 4, 5), (0, 4, 5))
-"""Of a model's sums: weight, x and y."""
+"""Indices of weight, x and y in the sums of a model."""
 
 
 class _Solution(NamedTuple):
@@ -173,20 +180,20 @@ class _Solution(NamedTuple):
 
 
 class LeastSquares:
-    """Least squares over all places since the ball was first seen: a straight line in space; along
-    it a start, a speed, the rolling deceleration (known to its prior), and sliding until one of
-    several moments.
+    """Least squares over all places since the ball was first seen.
 
-    Each moment is a linear model with its own normal equations, kept up by addition; models are
-    weighed by their evidence (Bayesian model averaging), so no moment has to be guessed and the
-    effort for a place never grows.
+    The model is a straight line in space; along it a start, a speed, the rolling deceleration (with
+    a prior), and sliding that ends at one of several moments. For each moment this is a linear
+    model with its own normal equations, which grow by addition. The models are weighted by their
+    evidence (Bayesian model averaging; Hoeting et al. 1999), so no moment has to be guessed, and
+    the cost per place never grows.
     """
 
     MOMENTS = np.array([0.0, 0.02, 0.04, 0.06, 0.08, 0.10, 0.13, 0.16, 0.20, 0.26])
-    """s after the first place: sliding ends there."""
+    """s after the first place at which sliding may end."""
 
     def __init__(self, surface: Surface, rolling_sigma: float | None = None) -> None:
-        """`rolling_sigma`: 0 takes the surface's rolling deceleration for known; None takes its
+        """`rolling_sigma`: 0 treats the surface's rolling deceleration as known; None uses its
         uncertainty."""
         self._surface = surface
         sigma = max(surface.rolling_sigma if rolling_sigma is None else rolling_sigma, 1e-6)
@@ -200,7 +207,7 @@ class LeastSquares:
         self.count = 0
 
     def _basis(self, t: float | Array) -> Array:
-        """(models, 4) at one time or at each model's own: start, speed, rolling and sliding
+        """Return (models, 4) at one time or at each model's own: start, speed, rolling and sliding
         deceleration."""
         basis = np.empty((len(self.MOMENTS), 4))
         self._fill(basis, t)
@@ -223,22 +230,22 @@ class LeastSquares:
         self._solved = None
 
     def _middle(self) -> tuple[float, float]:
-        """Mean of the places, from the first one on."""
+        """Return the mean of the places, relative to the first one."""
         weight, x, y = self._sums[0, 0, (0, 4, 5)].tolist()
         return x / weight, y / weight
 
     def _scatter(self) -> tuple[float, float, float]:
-        """Sums of squares of the places about their mean: xx, xy, yy."""
+        """Return the sums of squares of the places about their mean: xx, xy, yy."""
         (weight, x, y), (_, xx, xy), (_, _, yy) = self._sums[0][_PLACES].tolist()
         return xx - x * x / weight, xy - x * y / weight, yy - y * y / weight
 
     def _heading(self) -> tuple[float, float]:
-        """Direction of the ball's straight way: principal axis of the places, turned the way the
-        ball goes."""
+        """Return the direction of the ball's straight path: principal axis of the places, pointing
+        the way the ball moves."""
         xx, xy, yy = self._scatter()
         turn = 0.5 * math.atan2(2.0 * xy, xx - yy)
         hx, hy = math.cos(turn), math.sin(turn)
-        # the speed's normal equation of the model without sliding says which way
+        # The normal equation of the speed, in the model without sliding, tells the direction.
         (weight, t, x, y), (_, _, tx, ty) = self._sums[0, :2][:, (0, 1, 4, 5)].tolist()
         forward = (tx - t / weight * x) * hx + (ty - t / weight * y) * hy
         return (hx, hy) if forward >= 0.0 else (-hx, -hy)
@@ -250,9 +257,10 @@ class LeastSquares:
             b = (self._sums[:, :4, 4:] @ heading) * precision + self._drawn
             covariance = np.linalg.inv(P)
             solution = (covariance @ b[:, :, None])[:, :, 0]
-            # evidence of a linear model with Gaussian prior; the terms that all models share are
-            # left out
+            # Log evidence of a linear model with a Gaussian prior; terms that all models share are
+            # left out.
             evidence = 0.5 * ((solution * b).sum(axis=1) - np.linalg.slogdet(P)[1])
+            # A soft upper bound on the speed lost by sliding rules out implausible models.
             lost = solution[:, 3] * self.MOMENTS / np.maximum(solution[:, 1], 0.05)
             evidence -= 0.5 * np.square(np.maximum(lost - LARGEST_LOSS, 0.0) / LOSS_SIGMA)
             weight = np.exp(evidence - evidence.max())
@@ -260,22 +268,22 @@ class LeastSquares:
         return self._solved
 
     def place(self, time: float) -> Array:
-        """Where the ball is expected (2,) m."""
+        """Return where the ball is expected (2,) m."""
         (hx, hy), solution, _, weight = self._solve()
         along = float(weight @ (self._basis(time - self._origin[0]) * solution).sum(axis=1))
         x, y = self._middle()
         ahead = along - (x * hx + y * hy)
         return np.array([self._origin[1] + x + hx * ahead, self._origin[2] + y + hy * ahead])
 
-    def exit(self) -> Exit | None:
-        """How it leaves the table."""
+    def exit(self) -> PredictedExit | None:
+        """Return how it leaves the table."""
         if self.count < 3:
             return None
         heading, solution, covariance, weight = self._solve()
         x, y = self._middle()
         middle = np.array([self._origin[1] + x, self._origin[2] + y])
         gap, way = self._surface.gap(middle, heading)
-        if way is Way.STAYS:
+        if way is ExitWay.STAYS:
             return _stays(middle, np.zeros(2))
         along = gap + x * heading[0] + y * heading[1]
         ahead, speed, variance = self._arrivals(along, solution, covariance)
@@ -285,8 +293,8 @@ class LeastSquares:
         weight, ahead, speed = weight[usual] / weight[usual].sum(), ahead[usual], speed[usual]
         mean = float(weight @ ahead)
         sigma = float(np.sqrt(weight @ (variance[usual] + (ahead - mean) ** 2)))
-        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
-        return Exit(
+        facing = abs(heading[0] if way is ExitWay.NEAR_EDGE else heading[1])
+        return PredictedExit(
             way,
             self._origin[0] + mean,
             middle + gap * np.array(heading),
@@ -298,8 +306,8 @@ class LeastSquares:
     def _arrivals(
         self, along: float, solution: Array, covariance: Array
     ) -> tuple[Array, Array, Array]:
-        """Time, speed and variance of the time at which each model's ball has gone `along` m; inf
-        where it stops before."""
+        """Return time, speed and variance of the time at which each model's ball has rolled `along`
+        m; inf where it stops before."""
         start, speed, rolling, _ = solution.T
         under = speed * speed - 2.0 * rolling * (along - start)
         last = np.sqrt(np.maximum(under, 1e-6))
@@ -314,8 +322,8 @@ class LeastSquares:
         return ahead, last, variance / last**2
 
     def _place_sigma(self, heading: tuple[float, float], gap: float) -> float:
-        """Standard deviation, across the way, of the point `gap` m beyond the middle of the
-        places."""
+        """Return the standard deviation, across the path, of the point `gap` m beyond the middle of
+        the places."""
         (hx, hy), (xx, xy, yy) = heading, self._scatter()
         scatter = xx * hx * hx + 2.0 * xy * hx * hy + yy * hy * hy
         return self._surface.noise * math.sqrt(
@@ -324,18 +332,18 @@ class LeastSquares:
 
 
 class Kalman:
-    """Extended Kalman filter over place, velocity, rolling deceleration and what sliding adds to
-    it, which dies away.
+    """Extended Kalman filter over place, velocity, rolling deceleration, and a sliding deceleration
+    that decays.
 
-    State: x, y, vx, vy, rolling, sliding. Sliding ends at a moment that the filter does not know;
-    it is taken to decay with `FADE` seconds while its noise lets the filter follow the true, sudden
-    end.
+    State: x, y, vx, vy, rolling, sliding. Sliding ends at a moment that the filter does not know.
+    It is assumed to decay within `FADE` seconds, and its noise lets the filter follow the true,
+    sudden end.
     """
 
     FADE = 0.10
-    """s."""
+    """s, time constant of the sliding deceleration."""
     SLIDING_NOISE = 1.2
-    """m/s^2 per root s, driving the sliding deceleration; less and less as time goes by."""
+    """m/s^2 per root s, noise that drives the sliding deceleration; it decreases with time."""
     VELOCITY_NOISE = 0.002
     """m/s per root s: an uneven table."""
 
@@ -366,12 +374,12 @@ class Kalman:
             rest = np.eye(6) - K @ H
             self._P = rest @ self._P @ rest.T + variance * (
                 K @ K.T
-            )  # Joseph's form keeps it symmetric and positive
+            )  # Joseph's form keeps it symmetric and positive.
         self._time = time
         self.count += 1
 
     def _ahead(self, step: float) -> tuple[Array, Array]:
-        """State and covariance `step` s later."""
+        """Return state and covariance `step` s later."""
         velocity = self._x[2:4]
         heading = velocity / max(float(np.hypot(*velocity)), 1e-9)
         fade = float(np.exp(-step / self.FADE))
@@ -390,18 +398,18 @@ class Kalman:
         return F @ self._x, F @ self._P @ F.T + Q
 
     def place(self, time: float) -> Array:
-        """Where the ball is expected (2,) m."""
+        """Return where the ball is expected (2,) m."""
         return np.asarray(self._ahead(time - self._time)[0][:2])
 
-    def exit(self) -> Exit | None:
-        """How it leaves the table."""
+    def exit(self) -> PredictedExit | None:
+        """Return how it leaves the table."""
         if self.count < 3:
             return None
         velocity = self._x[2:4]
         speed = float(np.hypot(*velocity))
         heading = velocity / max(speed, 1e-9)
         gap, way = self._surface.gap(self._x[:2], heading)
-        ahead = self._arrival(gap, speed) if way is not Way.STAYS else float("inf")
+        ahead = self._arrival(gap, speed) if way is not ExitWay.STAYS else float("inf")
         if not np.isfinite(ahead):
             return _stays(self._x[:2].copy(), velocity.copy())
         state, covariance = self._ahead(ahead)
@@ -409,8 +417,8 @@ class Kalman:
         along = float(heading @ covariance[:2, :2] @ heading)
         normal = np.array([-heading[1], heading[0]])
         across = float(normal @ covariance[:2, :2] @ normal)
-        facing = abs(heading[0] if way is Way.NEAR_EDGE else heading[1])
-        return Exit(
+        facing = abs(heading[0] if way is ExitWay.NEAR_EDGE else heading[1])
+        return PredictedExit(
             way,
             self._time + ahead,
             self._x[:2] + gap * heading,
@@ -420,7 +428,8 @@ class Kalman:
         )
 
     def _arrival(self, gap: float, speed: float) -> float:
-        """Seconds until the ball has gone `gap` m, by Newton's method; inf when it stops before."""
+        """Return the seconds until the ball has rolled `gap` m, by Newton's method; inf when it
+        stops before."""
         rolling, sliding = float(self._x[4]), float(self._x[5])
         t = gap / max(speed, 1e-6)
         for _ in range(6):

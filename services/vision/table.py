@@ -16,7 +16,7 @@ from petrobot.services.vision.optics import Array, Optics
 
 @dataclass(frozen=True)
 class TableView:
-    """Table and ball (m, base frame) before a calibrated camera. `height` is that of a rolling
+    """Table and ball (m, base frame) in front of a calibrated camera. `height` is that of a rolling
     ball's centre."""
 
     optics: Optics
@@ -28,11 +28,11 @@ class TableView:
     height: float
     radius: float
     exposure: float
-    """s."""
+    """s, exposure time of an image."""
 
     @classmethod
     def of(cls, cell: Mapping[str, Any], optics: Optics) -> TableView:
-        """From the cell's data. Raises KeyError for a missing key."""
+        """Read the cell's data. Raises KeyError for a missing key."""
         table, camera, radius = cell["table"], cell["camera"], float(cell["ball"]["radius"])
         return cls(
             optics,
@@ -47,11 +47,11 @@ class TableView:
         )
 
     def to_table(self, pixels: ArrayLike) -> Array:
-        """x and y (..., 2), m, of a rolling ball whose centre is seen at pixels (..., 2)."""
+        """Return x and y (..., 2), m, of a rolling ball whose centre is seen at pixels (..., 2)."""
         return self.optics.to_plane(pixels, self.height)
 
     def to_pixels(self, places: ArrayLike) -> Array:
-        """Pixels (..., 2) of a rolling ball's centre at x and y (..., 2), m."""
+        """Return pixels (..., 2) of a rolling ball's centre at x and y (..., 2), m."""
         at = np.asarray(places, float)
         if at.ndim == 1:
             return self.optics.project((*at.tolist(), self.height))
@@ -60,7 +60,7 @@ class TableView:
         )
 
     def on_table(self, places: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Which places (..., 2) lie on the table, or at most `margin` m beside it."""
+        """Return which places (..., 2) lie on the table, or at most `margin` m beside it."""
         at = np.asarray(places, float)
         inside: NDArray[np.bool_] = (
             (at[..., 0] >= self.near_edge - margin)
@@ -77,12 +77,13 @@ class TableView:
         return self.radius * self.optics.scale(middle)
 
     def streak_px(self, speed: float) -> float:
-        """px that a ball of this speed (m/s) moves during an exposure."""
+        """Return the px that a ball of this speed (m/s) moves during an exposure."""
         return abs(speed) * self.exposure * self.radius_px / self.radius
 
     @cached_property
     def region(self) -> tuple[slice, slice]:
-        """Rows and columns of the image that hold the table, at even bounds."""
+        """Rows and columns of the image that contain the table, at even bounds so that half the
+        size is exact."""
         near, far, side = self.near_edge, self.near_edge + self.length, self.half_width
         middle = (near + far) / 2.0
         rim = [(x, y) for x in (near, middle, far) for y in (-side, 0.0, side)]

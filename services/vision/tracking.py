@@ -12,18 +12,19 @@ import numpy as np
 from petrobot.services.action import Cancelled, Context, Result, error, failure, success
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.vision.camera import Camera, CameraError, Mark
-from petrobot.services.vision.location import Window
-from petrobot.services.vision.prediction import Exit, Predictor, Surface, Way
+from petrobot.services.vision.location import BallWindow
+from petrobot.services.vision.prediction import ExitWay, PredictedExit, Predictor, Surface
 from petrobot.services.vision.specification import Specification
 
 HIDDEN = 0.20
 """m before the near edge in which arm and cup may hide the ball."""
 SPREAD_PX = 5.0
-"""px around the expected place in which the ball is looked for; grows with each image in which it
-was not seen."""
+"""px around the expected place in which the ball is searched."""
 GROWTH_PX = 4.0
+"""px by which that grows with each image in which the ball was not seen."""
 OTHERWISE = 5
-"""Images in a row that predict another way out than the near edge before the ball is given up."""
+"""Images in a row that predict another exit than over the near edge, after which the ball is given
+up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +34,11 @@ class TrackSpecification(Specification):
     rate: float = 0.0
     """Images/s; 0: the camera's usual rate."""
     image_timeout: float = 0.5
-    """s without an image until the camera counts as dead."""
+    """s without an image after which the camera counts as dead."""
     lost_after: float = 0.20
     """s without a sight of a ball that should be in plain view."""
     lead: float = 0.45
-    """s before the ball leaves: from then on predictions must agree with the last one."""
+    """s before the ball leaves; from then on predictions must agree with the last one."""
     max_time_spread: float = 0.010
     """s, else FAILURE `unsteady`."""
     max_place_spread: float = 0.008
@@ -51,8 +52,8 @@ async def track(
     stream: str,
     specification: TrackSpecification,
 ) -> Result:
-    """Track `ball` (as a locator gave it) with the predictor that `make` makes; images end with the
-    run."""
+    """Track `ball` (as a locator returned it) with the predictor that `make` makes; the images end
+    with the run."""
     camera: Camera = ctx.device
     chase = _Chase(ctx, camera, make(camera.surface), stream, specification)
     try:
@@ -90,8 +91,8 @@ class _Chase:
         self._predictor = predictor
         self._stream = stream
         self._specification = specification
-        self._window = Window(camera.view)
-        self._exit: Exit | None = None
+        self._window = BallWindow(camera.view)
+        self._exit: PredictedExit | None = None
         self._made: list[tuple[float, float, float]] = []
         self._latencies: list[float] = []
         """s from the middle of an exposure to the set point that it led to."""
@@ -99,7 +100,8 @@ class _Chase:
         self._seen_at = 0.0
 
     def begin(self, ball: Mapping[str, Any]) -> None:
-        """Take the located places. Raises KeyError, TypeError or ValueError when they are none."""
+        """Take the located places. Raises KeyError, TypeError or ValueError when they are
+        malformed."""
         time = self._camera.time_of(int(ball["sequence"]))
         if time is None:
             time = self._ctx.now - float(ball["age"])
@@ -112,7 +114,7 @@ class _Chase:
         self._exit = self._predictor.exit()
 
     async def run(self) -> Result:
-        """Read images until the ball has left, is lost, or goes another way."""
+        """Read images until the ball has left, is lost, or leaves another way."""
         asked = self._specification
         self._camera.start(asked.rate)
         pause = 1.5 / self._camera.rate
@@ -133,12 +135,13 @@ class _Chase:
     def _left(self) -> bool:
         return (
             self._exit is not None
-            and self._exit.way is Way.NEAR_EDGE
+            and self._exit.way is ExitWay.NEAR_EDGE
             and self._exit.time <= self._ctx.now
         )
 
     def _look(self, image: Image) -> Result | None:
-        """Measure the ball where it is expected; a result when the chase ends with this image."""
+        """Measure the ball where it is expected; return a result when the run finishes with this
+        image."""
         self._images += 1
         view, picture = self._camera.view, self._camera.background.picture
         if picture is None:
@@ -159,7 +162,7 @@ class _Chase:
         return ended
 
     def _mark(self, centres: tuple[Any, ...], place: tuple[float, float]) -> None:
-        """For the operator: where the ball is seen, and the way to where it is predicted to
+        """Show the operator where the ball is seen, and the path to where it is predicted to
         leave."""
         exit_ = self._exit
         ahead = () if exit_ is None else (place, (float(exit_.point[0]), float(exit_.point[1])))
@@ -181,10 +184,10 @@ class _Chase:
         return error("ball_lost", text, **self._values())
 
     def _predicted(self, time: float) -> Result | None:
-        """Take a fresh prediction; a result when the ball will surely not come over the near
-        edge."""
+        """Use a fresh prediction; return a result when the ball will certainly not leave over the
+        near edge."""
         exit_ = self._predictor.exit()
-        if exit_ is None or exit_.way is Way.NEAR_EDGE:
+        if exit_ is None or exit_.way is ExitWay.NEAR_EDGE:
             self._otherwise = 0
             if exit_ is not None:
                 self._exit = exit_
@@ -196,16 +199,17 @@ class _Chase:
             return None
         self._exit = exit_
         where = f"({exit_.point[0]:.3f}, {exit_.point[1]:.3f}) m"
-        if exit_.way is Way.SIDE:
+        if exit_.way is ExitWay.SIDE:
             return failure("side_exit", f"the ball leaves by the side at {where}", **self._values())
         return failure(
             "stays", f"the ball stops on the table or turns away at {where}", **self._values()
         )
 
     def _publish(self) -> None:
-        """Stream the newest prediction; its time to go is right now, however old the image was."""
+        """Stream the newest prediction; its time to go is correct now, however old the image
+        was."""
         exit_ = self._exit
-        if exit_ is None or exit_.way is not Way.NEAR_EDGE:
+        if exit_ is None or exit_.way is not ExitWay.NEAR_EDGE:
             return
         view = self._camera.view
         to_go = exit_.time - self._ctx.now
@@ -216,7 +220,7 @@ class _Chase:
         )
 
     def _judge(self) -> Result:
-        """The ball has left: did the predictions of the last moments agree with the last one?"""
+        """Compare the predictions of the last moments with the last one: the ball has left."""
         asked = self._specification
         if self._exit is None or not self._made:
             return failure("late", "the ball left before it was predicted", **self._values())
@@ -225,7 +229,7 @@ class _Chase:
         if first > left - asked.lead:
             text = f"first prediction {left - first:.2f} s before the ball left, not {asked.lead} s"
             return failure("late", text, **self._values())
-        # the prediction in force at the lead time and all later ones
+        # The prediction in force at the lead time, and all later ones.
         begin = max(made for made, _, _ in self._made if made <= left - asked.lead)
         judged = [(time, y) for made, time, y in self._made if made >= begin]
         time_spread = max(abs(time - left) for time, _ in judged)
@@ -239,7 +243,7 @@ class _Chase:
         return success(**values)
 
     def _values(self) -> dict[str, Any]:
-        """What every result tells."""
+        """Return the values of every result."""
         values: dict[str, Any] = {"images": self._images, "seen": self._seen}
         if self._latencies:
             values["latency"] = float(np.mean(self._latencies))

@@ -1,5 +1,5 @@
-"""A CANopen device (CiA 301) as a machine: object dictionary from an EDS file, SDO server, NMT,
-heartbeats, one PDO each way."""
+"""A CANopen device (CiA 301), sans-I/O: object dictionary from an EDS file, SDO server, NMT,
+heartbeats, one PDO in each direction."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class Entry:
 
 @cache
 def _objects(eds: str) -> tuple[Mapping[Key, Entry], Mapping[Key, str]]:
-    """Objects and their default values, as an EDS text writes them: read once, however many devices
-    are of this kind."""
+    """Return objects and their default values from an EDS text; parsed once for all devices of this
+    kind."""
     parser = configparser.ConfigParser(interpolation=None)
     parser.read_string(eds)
     entries: dict[Key, Entry] = {}
@@ -106,11 +106,11 @@ class Dictionary:
         self._records = {index for index, sub in self.entries if sub}
 
     def reset(self) -> None:
-        """All values as at power-on."""
+        """Set all values as at power-on."""
         self.values.update(self._defaults)
 
     def entry(self, index: int, sub: int) -> Entry:
-        """The object; raises SdoAbortError if there is none."""
+        """Return the object. Raises SdoAbortError if there is none."""
         found = self.entries.get((index, sub))
         if found is None:
             known = index in self._records or (index, 0) in self.entries
@@ -118,14 +118,14 @@ class Dictionary:
         return found
 
     def read(self, index: int, sub: int) -> bytes:
-        """Bytes of an object's value."""
+        """Return the bytes of an object's value."""
         entry = self.entry(index, sub)
         if entry.access.startswith("wo"):
             raise SdoAbortError(Abort.WRITE_ONLY, index, sub)
         return entry.type.pack(self.values[index, sub])
 
     def checked(self, index: int, sub: int, data: bytes) -> int:
-        """The value that a write of these bytes gives; raises SdoAbortError if it may not be
+        """Return the value that a write of these bytes sets. Raises SdoAbortError if it must not be
         written."""
         entry = self.entry(index, sub)
         if not entry.writable:
@@ -141,7 +141,7 @@ class Dictionary:
 
 
 class Pdo:
-    """A PDO's COB-ID, transmission type and layout, kept in step with its two records of the
+    """A PDO's COB-ID, transmission type and layout, kept consistent with its two records of the
     dictionary."""
 
     def __init__(self, dictionary: Dictionary, parameters: int, mapping: int) -> None:
@@ -153,7 +153,7 @@ class Pdo:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take over what the dictionary says."""
+        """Read the records of the dictionary again."""
         if not self.exists:
             self.on, self.cob_id, self.synchronous = False, -1, False
             return
@@ -169,7 +169,7 @@ class Pdo:
         self._mapped = itemgetter(*self.keys) if len(self.keys) > 1 else None
 
     def pack(self) -> bytes:
-        """The values of the mapped objects as they travel."""
+        """Return the values of the mapped objects as they are sent."""
         values = self._values
         many = self._mapped
         return self.layout.pack(
@@ -177,7 +177,7 @@ class Pdo:
         )
 
     def mapped(self, entry: int) -> Mapped:
-        """A mapping entry taken apart; raises SdoAbortError if it cannot be mapped."""
+        """Decode a mapping entry. Raises SdoAbortError if the object cannot be mapped."""
         index, sub, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
         found = self._dictionary.entry(index, sub)
         if not found.mappable or found.type.size * 8 != bits:
@@ -208,10 +208,10 @@ class Pdo:
 
 
 class CanopenNode:
-    """One device on the bus. Subclasses fill `before_sending`, act in `after_receiving` and the
-    other hooks.
+    """One device on the bus. Subclasses override `before_sending`, `after_receiving` and the other
+    hooks.
 
-    Times are seconds on the caller's clock; `drain` gives the frames to send.
+    Times are seconds on the caller's clock; `drain` returns the frames to send.
     """
 
     def __init__(self, node: int, eds: str) -> None:
@@ -232,27 +232,26 @@ class CanopenNode:
 
     # What a device adds.
     def before_sending(self) -> None:
-        """Bring the objects that a TPDO may carry up to date; call `changed` if one of them is
-        another than before."""
+        """Update the objects that a TPDO may contain; call `changed` if one of them has changed."""
 
     def before_reading(self) -> None:
-        """Bring all objects that change by themselves up to date."""
+        """Update all objects that change by themselves."""
         self.before_sending()
 
     def after_configuring(self) -> None:
-        """Take over what an SDO write has changed."""
+        """Use what an SDO write has changed."""
 
     def after_receiving(self, now: float) -> None:
-        """Act on the objects that an RPDO, or an SDO write, has just brought."""
+        """Act on the objects that an RPDO or an SDO write has just set."""
 
     def on_sync(self, now: float) -> None:
         """Act on SYNC, after a synchronous RPDO was applied and before the TPDO is built."""
 
     def on_master_lost(self, now: float) -> None:
-        """The heartbeat that 1016h asks for has not come in time."""
+        """Act on a missing heartbeat (1016h)."""
 
     def on_nmt(self, now: float, before: NmtState) -> None:
-        """The NMT state has changed; after power-on or a reset it was BOOT_UP before."""
+        """Act on a change of the NMT state; after power-on or a reset it was BOOT_UP before."""
 
     def check_write(self, index: int, sub: int, value: int) -> None:
         """Raise SdoAbortError if the device's state forbids this write."""
@@ -272,7 +271,7 @@ class CanopenNode:
         self.on_nmt(now, NmtState.BOOT_UP)
 
     def receive(self, now: float, frame: Frame) -> None:
-        """Take a frame off the bus."""
+        """Process a frame from the bus."""
         cob_id = frame.id
         if cob_id == self.rpdo.cob_id and self.rpdo.on:
             self.take_rpdo(now, frame.data)
@@ -289,7 +288,7 @@ class CanopenNode:
             self._master_due = now + (self.values[0x1016, 1] & 0xFFFF) / 1e3
 
     def advance(self, now: float) -> None:
-        """Send the heartbeat that is due and watch the master's."""
+        """Send the heartbeat that is due, and watch that of the master."""
         period = self.values[0x1017, 0]
         if period and now >= self._beat_due and self.nmt is not NmtState.BOOT_UP:
             self.outbox.append(heartbeat(self.node, self.nmt))
@@ -299,12 +298,12 @@ class CanopenNode:
             self.on_master_lost(now)
 
     def due(self) -> float:
-        """When `advance` has something to do next, as far as is known now (s)."""
+        """Return when `advance` has something to do next, as far as is known now (s)."""
         beat = self._beat_due if self.values[0x1017, 0] else math.inf
         return beat if self._master_due is None else min(beat, self._master_due)
 
     def drain(self) -> Sequence[Frame]:
-        """Frames to send, oldest first."""
+        """Return the frames to send, oldest first."""
         frames, self.outbox = self.outbox, []
         return frames
 
@@ -324,7 +323,7 @@ class CanopenNode:
             self.outbox.append(frame)
 
     def changed(self) -> None:
-        """What a TPDO may carry is another than before."""
+        """Note that the content of a TPDO may have changed."""
         self._tpdo_frame = None
 
     def take_rpdo(self, now: float, data: bytes) -> None:
@@ -349,7 +348,7 @@ class CanopenNode:
         self.after_receiving(now)
 
     def sync(self, now: float) -> None:
-        """SYNC has come."""
+        """Process SYNC."""
         if self.nmt is NmtState.OPERATIONAL:
             if self._latched is not None:
                 self._apply_rpdo(now)
@@ -373,7 +372,7 @@ class CanopenNode:
             self.on_nmt(now, before)
 
     def _serve(self, now: float, frame: Frame) -> None:
-        """The SDO server, expedited transfers only."""
+        """Serve SDO requests, expedited transfers only."""
         if self.nmt is NmtState.STOPPED or len(frame.data) != 8:
             return
         index, sub = frame.data[1] | frame.data[2] << 8, frame.data[3]
@@ -414,12 +413,12 @@ class CanopenNode:
         if pdo is not None and (sub == 0 or index == pdo.parameters):
             pdo.refresh()
         if (index, sub) == (0x1016, 1):
-            self._master_due = None  # watched from the next heartbeat on
+            self._master_due = None  # Watched from the next heartbeat on.
         self.after_configuring()
         self.after_receiving(now)
 
     @staticmethod
     def _may_use(cob_id: int) -> bool:
-        """Whether a PDO may have this identifier: none of NMT, SYNC, EMCY, SDO and heartbeat (CiA
-        301, table 54)."""
+        """Return whether a PDO may have this identifier: not one of NMT, SYNC, EMCY, SDO and
+        heartbeat (CiA 301, table 54)."""
         return TPDO1_BASE < cob_id < SDO_REPLY_BASE and cob_id not in _PREDEFINED

@@ -1,5 +1,5 @@
-"""A CiA 402 drive's power state machine, whatever its mode of operation: commands, faults, quick
-stop, loss of master and SYNC."""
+"""Power state machine of a CiA 402 drive in any mode of operation: commands, faults, quick stop,
+loss of master and SYNC (CiA 402-2, state machine of the power drive system)."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ from petrobot.sim.bus.canopen_node import CanopenNode
 
 _REGISTERS: Final = {
     Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,
-    Fault.HEARTBEAT: 0x11, Fault.SYNC_LOST: 0x11, Fault.CAN_PASSIVE: 0x11, Fault.BUS_OFF_RECOVERED: 0x11,
+    Fault.HEARTBEAT: 0x11, Fault.SYNC_LOST: 0x11, Fault.CAN_PASSIVE: 0x11,
+    Fault.BUS_OFF_RECOVERED: 0x11,
 }  # fmt: skip
 _POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
-"""Faults after which a drive cannot brake by its motor: the brake takes over at once."""
+"""Faults after which a drive cannot brake by its motor: the brake engages at once."""
 _CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
 POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 """States in which the motor has torque."""
@@ -41,21 +42,21 @@ _REMOTE, _VOLTAGE, _FOLLOWS = (
 RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
 """Statusword of a drive that follows its set points, without the bits of its mode."""
 ENABLE_MASK, ENABLE = Command.ENABLE_OPERATION.value
-"""Bits of a controlword that count for the command to follow set points, and their value."""
+"""Bits of a controlword that matter for the command to follow set points, and their value."""
 
 
 def _calm() -> None:
-    """Nobody wants to know."""
+    """Do nothing: the default of `stir`."""
 
 
 class PowerDrive(CanopenNode, ABC):
-    """One drive without its motor. A motor's drive names its `mode` and says how it begins, ramps
+    """One drive without its motor. A subclass names its `mode` and says how the motor begins, ramps
     down and loses its torque."""
 
     mode: ClassVar[Mode]
-    """The one mode of operation that it knows."""
+    """The only mode of operation that it supports."""
     fixed: ClassVar[tuple[Object, ...]] = (Object.MODE,)
-    """What must not be written while the motor has torque."""
+    """Objects that must not be written while the motor has torque."""
 
     def __init__(
         self, node: int, eds: str, sync_patience: int, stir: Callable[[], None] = _calm
@@ -75,7 +76,7 @@ class PowerDrive(CanopenNode, ABC):
     # What a motor and its mode of operation add.
     @abstractmethod
     def begin(self, resumed: bool) -> None:
-        """Operation is enabled: let the brake go and take set points; `resumed`: out of a quick
+        """Enable operation: release the brake and take set points; `resumed`: after a quick
         stop."""
 
     @abstractmethod
@@ -84,20 +85,20 @@ class PowerDrive(CanopenNode, ABC):
 
     @abstractmethod
     def cut_power(self) -> None:
-        """No torque any more: the brake holds."""
+        """Switch the torque off: the brake holds."""
 
     def flags(self) -> int:
-        """Bits of the statusword that depend on the mode, while operation is enabled."""
+        """Return the bits of the statusword that depend on the mode, while operation is enabled."""
         return 0
 
     def refresh(self) -> None:
-        """The objects have their defaults again, or the network state has changed: show what is
-        so."""
+        """Update the objects after they were reset to their defaults, or after the network state
+        changed."""
 
     # Hooks of the CANopen node.
     def on_nmt(self, now: float, before: NmtState) -> None:
-        """A reset starts the state machine anew; leaving OPERATIONAL while enabled stops the motion
-        (6007h = 2)."""
+        """Restart the state machine after a reset; stop the motion when an enabled drive leaves
+        OPERATIONAL (6007h = 2)."""
         if before is NmtState.BOOT_UP:
             if self.state not in _DOWN:
                 self._enter(State.SWITCH_ON_DISABLED)
@@ -123,22 +124,22 @@ class PowerDrive(CanopenNode, ABC):
         self.trip(Fault.HEARTBEAT)
 
     def after_configuring(self) -> None:
-        """Take over how the drive watches itself."""
+        """Store how the drive monitors itself."""
         self._sync_patience = (
             self._patient_periods * self.values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
         )
 
     def check_write(self, index: int, sub: int, value: int) -> None:
-        """No other mode than its own, and no change of configuration while the motor has torque."""
+        """Refuse any other mode, and any change of configuration while the motor has torque."""
         if index == Object.MODE and value not in (Mode.NONE, self.mode):
             raise SdoAbortError(Abort.VALUE, index, sub)
         if index in self.fixed and self.state in POWERED:
             raise SdoAbortError(Abort.STATE, index, sub)
 
-    # What happens to a drive.
+    # Events of a drive.
     def trip(self, fault: Fault) -> None:
-        """A fault occurs: EMCY, then a ramp to rest (the brake at once if there is no power for
-        it), then FAULT."""
+        """Raise a fault: EMCY, then a ramp to rest (the brake at once if there is no power for a
+        ramp), then FAULT."""
         if self.state in _DOWN:
             return
         self.fault = fault
@@ -152,11 +153,11 @@ class PowerDrive(CanopenNode, ABC):
             self._quick_stop(State.FAULT_REACTION_ACTIVE)
 
     def ramp_ended(self) -> None:
-        """The motor has come to rest after a fault."""
+        """Enter FAULT: the motor has come to rest after a fault."""
         self._enter(State.FAULT)
 
     def statusword(self) -> int:
-        """Object 6041h."""
+        """Return object 6041h."""
         if self.state is _ENABLED and self.powered:
             return RUNNING | self.flags()
         word: int = self.state.word | _REMOTE
@@ -167,7 +168,7 @@ class PowerDrive(CanopenNode, ABC):
         return word
 
     def late(self, now: float) -> bool:
-        """Whether SYNC has not come for too long."""
+        """Return whether SYNC is overdue."""
         return now - self._synced > self._sync_patience + 1e-9
 
     @property
@@ -203,7 +204,7 @@ class PowerDrive(CanopenNode, ABC):
         self.stir()
 
     def _enter(self, state: State) -> None:
-        """A state without torque: the brake holds."""
+        """Enter a state without torque: the brake holds."""
         self.cut_power()
         self.state = state
         self.stir()

@@ -1,5 +1,5 @@
-"""A step of the arm's joints as pure numbers: motors, semi-implicit Euler, dry friction, hard
-stops. A kernel of sim/catching/puma.py."""
+"""One step of the arm's joints as pure numbers: motors, semi-implicit Euler, dry friction, hard
+stops. Kernels of sim/catching/puma.py."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import Sequence
 from petrobot.services.host.numba_kernels import kernel
 
 Six = tuple[float, float, float, float, float, float]
-"""One number a joint, base to flange."""
+"""One number per joint, base to flange."""
 Matrix = tuple[Six, Six, Six, Six, Six, Six]
 
 STILL = 1e-4
-"""rad/s; slower than this and held by friction, a joint stops."""
+"""rad/s; a joint that is slower than this and held by friction stops."""
 FADE = 0.15
-"""Above its greatest speed the motor's torque fades to nothing within this share of it (back
-EMF)."""
+"""Share of its greatest speed within which the motor's torque fades to nothing above that speed
+(back EMF)."""
 
 
 @kernel
 def motor(tau: float, limit: float, speed: float, greatest: float) -> float:
-    """Torque (N m) of a motor that is asked for `tau`: within its limit, and beyond its greatest
-    speed less, at last none, for what would speed it up."""
+    """Return the torque (N m) of a motor for the requested torque `tau`: within its limit; beyond
+    its greatest speed less, finally none, of what would accelerate it."""
     high = low = limit
     if speed > greatest:
         high = max(0.0, 1.0 - (speed / greatest - 1.0) / FADE) * limit
@@ -32,7 +32,7 @@ def motor(tau: float, limit: float, speed: float, greatest: float) -> float:
 
 @kernel
 def motors(tau: Six, limit: Six, speed: Six, greatest: Six) -> Six:
-    """The same of six motors."""
+    """Return the torques of six motors."""
     return (
         motor(tau[0], limit[0], speed[0], greatest[0]),
         motor(tau[1], limit[1], speed[1], greatest[1]),
@@ -45,7 +45,7 @@ def motors(tau: Six, limit: Six, speed: Six, greatest: Six) -> Six:
 
 @kernel
 def held(drive: Six, bias: Six, hold: Six) -> bool:
-    """Whether friction and brakes can hold a standing arm against what pulls at it."""
+    """Return whether friction and brakes hold a standing arm against the torques on it."""
     return (
         -hold[0] <= drive[0] - bias[0] <= hold[0]
         and -hold[1] <= drive[1] - bias[1] <= hold[1]
@@ -70,7 +70,8 @@ def _row(row: Six, t: Six) -> float:
 
 @kernel
 def pushed(dt: float, speed: Six, inverse: Matrix, t: Six) -> Six:
-    """Speeds (rad/s) after `dt` (s) under torques `t` (N m), by the inverse of the mass matrix."""
+    """Return the speeds (rad/s) after `dt` (s) under torques `t` (N m), by the inverse of the mass
+    matrix."""
     return (
         speed[0] + dt * _row(inverse[0], t),
         speed[1] + dt * _row(inverse[1], t),
@@ -83,19 +84,20 @@ def pushed(dt: float, speed: Six, inverse: Matrix, t: Six) -> Six:
 
 @kernel
 def _stopping(friction: float, speed: float, gain: float, hold: float) -> float:
-    """The friction that stops a joint within the step, at most what friction can hold."""
+    """Return the friction that stops a joint within the step, at most what friction can hold."""
     f = friction - speed / gain
     return hold if f > hold else -hold if f < -hold else f
 
 
 @kernel
 def rubbed(dt: float, speed: Six, inverse: Matrix, before: Six, hold: Six) -> tuple[Six, Six]:
-    """Dry friction (N m) and the speeds that it leaves: the torque that would stop a joint within
-    the step, at most `hold`.
+    """Return the dry friction (N m) and the speeds that it leaves: the torque that would stop a
+    joint within the step, at most `hold` (Coulomb friction as an impulse with a bound, as in
+    time-stepping contact solvers).
 
-    Last step's friction `before` is the first guess (already in `speed`), so the coupling of the
-    joints settles over a few steps. Where the guess was right, as it is while all joints slide,
-    there is nothing to take off.
+    The friction of the last step, `before`, is the first guess (already in `speed`), so the
+    coupling of the joints converges over a few steps. Where the guess was right, as it is while all
+    joints slide, nothing changes.
     """
     friction = (
         _stopping(before[0], speed[0], dt * inverse[0][0], hold[0]),
@@ -110,7 +112,7 @@ def rubbed(dt: float, speed: Six, inverse: Matrix, before: Six, hold: Six) -> tu
     v0, v1, v2, v3, v4, v5 = speed
     for f, last, row in zip(friction, before, inverse):  # noqa: B905 - numba knows no strict zip
         if f != last:
-            push = dt * (f - last)  # the matrix is symmetric: a row is a column
+            push = dt * (f - last)  # The matrix is symmetric: a row is a column.
             v0, v1, v2 = v0 + push * row[0], v1 + push * row[1], v2 + push * row[2]
             v3, v4, v5 = v3 + push * row[3], v4 + push * row[4], v5 + push * row[5]
     return friction, (v0, v1, v2, v3, v4, v5)
@@ -127,11 +129,11 @@ def accelerated(
     friction: Six,
     hold: Six,
 ) -> tuple[Six, Six]:
-    """Dry friction (N m) and speeds (rad/s) after `dt` (s).
+    """Return dry friction (N m) and speeds (rad/s) after `dt` (s).
 
     `drive`: the motors' torques; `bias`: those of gravity, Coriolis and centrifugal forces;
-    `viscous` (N m s/rad); `friction`: the last step's; `hold`: what friction and brakes can hold at
-    most.
+    `viscous` (N m s/rad); `friction`: that of the last step; `hold`: most that friction and brakes
+    can hold.
     """
     torque = (
         drive[0] - bias[0] - viscous[0] * qd[0] + friction[0],
@@ -151,7 +153,7 @@ def _stopped(q: float, v: float, low: float, high: float) -> tuple[float, float]
 
 @kernel
 def moved(dt: float, q: Six, speed: Six, lower: Six, upper: Six) -> tuple[Six, Six]:
-    """Angles (rad) and speeds after `dt` (s); a joint that comes to an end of its range stops
+    """Return angles (rad) and speeds after `dt` (s); a joint that reaches an end of its range stops
     there."""
     q0, v0 = _stopped(q[0] + dt * speed[0], speed[0], lower[0], upper[0])
     q1, v1 = _stopped(q[1] + dt * speed[1], speed[1], lower[1], upper[1])
@@ -179,10 +181,11 @@ def stepped(
     lower: Six,
     upper: Six,
 ) -> tuple[Six, Six, Six, bool]:
-    """Angles, speeds and dry friction after `dt` (s), and whether the arm stands still from now on.
+    """Return angles, speeds and dry friction after `dt` (s), and whether the arm stands still from
+    now on.
 
-    `tau`: what the motors are asked for; `limit` (N m), `greatest` (rad/s): theirs; `stick` (N m):
-    what holds a joint at rest.
+    `tau`: requested torques; `limit` (N m) and `greatest` (rad/s): those of the motors; `stick` (N
+    m): what holds a joint at rest.
     """
     drive = motors(tau, limit, qd, greatest)
     friction, speed = accelerated(dt, qd, drive, bias, inverse, viscous, friction, hold)
@@ -227,9 +230,9 @@ def stepped_packed(
     inverse: Sequence[float],
     numbers: Sequence[float],
 ) -> tuple[Six, Six, Six, bool]:
-    """`stepped`, where what seldom changes comes packed: the matrix row by row, then limit,
-    greatest, viscous, hold, stick, lower and upper in one. Compiled, handing those over as tuples
-    takes as long as the step itself."""
+    """Call `stepped` with packed arguments: the matrix row by row, then limit, greatest, viscous,
+    hold, stick, lower and upper in one sequence. In compiled code, passing these as tuples takes as
+    long as the step itself."""
     limit, greatest, viscous = _six(numbers, 0), _six(numbers, 6), _six(numbers, 12)
     hold, stick, lower, upper = (
         _six(numbers, 18),
@@ -245,6 +248,6 @@ def stepped_packed(
 
 @kernel
 def held_packed(tau: Six, speed: Six, bias: Six, numbers: Sequence[float]) -> bool:
-    """Whether friction and brakes hold an arm that stands, its motors asked for `tau`; `numbers` as
-    in `stepped_packed`."""
+    """Return whether friction and brakes hold a standing arm under the requested torques `tau`;
+    `numbers` as in `stepped_packed`."""
     return held(motors(tau, _six(numbers, 0), speed, _six(numbers, 6)), bias, _six(numbers, 24))

@@ -1,11 +1,11 @@
-"""The ball's motion where it is known exactly: sliding and rolling on the flat table, and free
+"""Motion of the ball where it is known exactly: sliding and rolling on the flat table, and free
 flight.
 
 A ball on a table slides while its lowest point moves, then rolls. With sliding friction mu the slip
-velocity keeps its direction and shrinks at mu g (1 + 1/k), where k = I / (m r^2); a rolling ball
-then loses c g of speed each second (c: coefficient of rolling resistance). Both phases have closed
-forms, so no step size enters. Source: rigid-body mechanics of a sphere on a plane (e.g. Marlow,
-"The Physics of Pocket Billiards", 1995).
+velocity keeps its direction and decreases at mu g (1 + 1/k), where k = I / (m r^2); a rolling ball
+then loses c g of speed per second (c: coefficient of rolling resistance). Both phases have closed
+forms, so there is no step size. Source: rigid-body mechanics of a sphere on a plane (e.g. W. C.
+Marlow, "The Physics of Pocket Billiards", 1995).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class BallState(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BallModel:
-    """What does not change from throw to throw; `inertia_factor` is k = I / (m r^2), `friction` the
+    """Constants of the ball for all throws; `inertia_factor` is k = I / (m r^2), `friction` the
     sliding coefficient."""
 
     radius: float
@@ -37,13 +37,14 @@ class BallModel:
 
     @classmethod
     def of(cls, ball: Mapping[str, Any], friction: float) -> BallModel:
-        """From the `[ball]` table of cell.toml and the true friction."""
+        """Read the `[ball]` table of cell.toml; `friction` is the true one."""
         return cls(ball["radius"], ball["mass"], ball["inertia_factor"], ball["gravity"], friction)
 
     def spin_of_rolling(
         self, vx: float, vy: float, share: float = 1.0
     ) -> tuple[float, float, float]:
-        """Spin (rad/s) of a ball that rolls with horizontal velocity (vx, vy), times `share`."""
+        """Return the spin (rad/s) of a ball that rolls with horizontal velocity (vx, vy), times
+        `share`."""
         return (-share * vy / self.radius, share * vx / self.radius, 0.0)
 
 
@@ -87,7 +88,7 @@ class TableMotion:
         return self._v[0] - lost * self._slip[0], self._v[1] - lost * self._slip[1]
 
     def state(self, t: float) -> BallState:
-        """State `t` >= 0 seconds after the start."""
+        """Return the state `t` >= 0 seconds after the start."""
         z = self._p[2]
         if t < self.rolls_after:
             x, y = self._slide_position(t)
@@ -108,8 +109,8 @@ class TableMotion:
         return BallState((x, y, z), (vx, vy, 0.0), (wx, wy, self._w[2]))
 
     def first_crossing(self, axis: int, value: float) -> float:
-        """Seconds until the centre's x (axis 0) or y (axis 1) first equals `value`; inf if
-        never."""
+        """Return the seconds until the centre's x (axis 0) or y (axis 1) first equals `value`; inf
+        if never."""
         sliding = _first_root(
             self._p[axis] - value,
             self._v[axis],
@@ -128,21 +129,22 @@ class TableMotion:
 
 
 def _first_root(c: float, b: float, a: float, until: float) -> float:
-    """Smallest t in [0, until] with a t^2 + b t + c = 0; inf if there is none."""
+    """Return the smallest t in [0, until] with a t^2 + b t + c = 0; inf if there is none."""
     if a == 0.0:
         roots = [-c / b] if b != 0.0 else []
     else:
         discriminant = b * b - 4.0 * a * c
         if discriminant < 0.0:
             return math.inf
-        # the stable form: no difference of nearly equal numbers
+        # The stable form: no difference of nearly equal numbers (Press et al., Numerical Recipes,
+        # section 5.6).
         q = -0.5 * (b + math.copysign(math.sqrt(discriminant), b))
         roots = [q / a] + ([c / q] if q != 0.0 else [])
     return min((t for t in roots if 0.0 <= t <= until), default=math.inf)
 
 
 def fly(start: BallState, t: float, gravity: float) -> BallState:
-    """Free flight without air drag, `t` seconds after `start`; spin is kept."""
+    """Return the state after `t` seconds of free flight without air drag; the spin is kept."""
     (x, y, z), (vx, vy, vz), spin = start
     return BallState(
         (x + vx * t, y + vy * t, z + vz * t - 0.5 * gravity * t * t),

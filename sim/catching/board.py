@@ -1,7 +1,8 @@
-"""Board images as somebody would take them in the simulated laboratory: laid on the table at
+"""Board images of the simulated laboratory, as an operator would take them: laid on the table at
 measured places, and held by hand.
 
-`python -m petrobot.sim.catching.board DIR` saves them as `petrobot calibrate --views DIR` reads them.
+`python -m petrobot.sim.catching.board DIR` saves them in the format of `petrobot calibrate --views
+DIR`.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from petrobot.sim.catching.truth import read_toml, read_truth
 CELL = Path(__file__).parents[2] / "services" / "cell.toml"
 
 PLACEMENT = 0.0003
-"""m, standard deviation of where the board really lies around where it was measured to lie."""
+"""m, standard deviation of where the board really lies around the measured place."""
 DIRECTION = 0.0005
-"""rad, the same of its direction."""
+"""rad, the same for its direction."""
 LAID = (
     (0.20, -0.24, 1.6),
     (0.20, 0.20, 1.5),
@@ -58,7 +59,7 @@ def board_views(
     rng: np.random.Generator,
     board: Chessboard | None = None,
 ) -> Iterator[tuple[NDArray[np.uint8], Array | None]]:
-    """Images of the board with its pose (4, 4) in the base frame as measured, None for a held
+    """Yield images of the board with its measured pose (4, 4) in the base frame, None for a held
     board."""
     board = board or Chessboard()
     table = cell["table"]
@@ -79,8 +80,8 @@ def board_views(
 def save_board_views(
     folder: Path, cell: Mapping[str, Any], camera: PinholeCamera, rng: np.random.Generator
 ) -> None:
-    """Take the images and save them with the measured poses: view01.png, ... and views.toml, as
-    `petrobot calibrate` reads them."""
+    """Take the images and save them with the measured poses: view01.png, ... and views.toml, in the
+    format of `petrobot calibrate`."""
     board = Chessboard()
     folder.mkdir(parents=True, exist_ok=True)
     lines = [
@@ -100,7 +101,7 @@ def save_board_views(
 
 
 def _centred(place: Array, rotation: Array, board: Chessboard) -> Array:
-    """Pose of a board whose middle is at `place`."""
+    """Return the pose of a board whose middle is at `place`."""
     middle = np.array([(board.columns - 1) / 2, (board.rows - 1) / 2, 0.0]) * board.square
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, place - rotation @ middle
@@ -108,7 +109,7 @@ def _centred(place: Array, rotation: Array, board: Chessboard) -> Array:
 
 
 def _turned(x: float, y: float, z: float) -> Array:
-    """Rotation by z, then y, then x about the moving axes (rad)."""
+    """Return the rotation by z, then y, then x about the moving axes (rad)."""
     (cx, sx), (cy, sy), (cz, sz) = ((np.cos(angle), np.sin(angle)) for angle in (x, y, z))
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
     about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
@@ -117,11 +118,12 @@ def _turned(x: float, y: float, z: float) -> Array:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Save board images of the simulated camera as it truly hangs; gives the exit code."""
+    """Save board images of the simulated camera in its true pose; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m petrobot.sim.catching.board",
         description="Save images of a calibration board taken by the simulated camera.",
-        epilog="example:\n  python -m petrobot.sim.catching.board board_images && petrobot calibrate "
+        epilog="example:\n  python -m petrobot.sim.catching.board board_images && petrobot "
+        "calibrate "
         "--views board_images",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

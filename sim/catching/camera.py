@@ -1,11 +1,11 @@
-"""The simulated camera: a pinhole with lens distortion looks at the cell and gives grey images as a
-real one would.
+"""The simulated camera: a pinhole with lens distortion looks at the cell and returns grey images
+like a real one.
 
-The static scene is drawn once; each image copies it, paints ball, shadow, arm and cup into their
-regions of interest and adds light and noise in one pass. Geometry: pinhole with the distortion of
-Brown (1966) in OpenCV's order k1 k2 p1 p2; the ball is an exact sphere (its distance from each
-pixel's ray), blurred over the exposure. Lengths in m, base frame; pixels are (u, v), u to the
-right, whole numbers at pixel centres.
+The static scene is drawn once. Each image copies it, paints ball, shadow, arm and cup into their
+regions, and adds light and noise in one pass. Geometry: pinhole with Brown's distortion (1966) in
+OpenCV's order k1 k2 p1 p2; the ball is an exact sphere (its distance from each pixel's ray),
+blurred over the exposure. Lengths in m, base frame; pixels are (u, v), u to the right, whole
+numbers at pixel centres.
 """
 
 from __future__ import annotations
@@ -21,25 +21,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from petrobot.sim.catching.occluders import Box, Occluders, fill
-from petrobot.sim.catching.scenery import Chessboard, Table, floor_grey, stripes, supersampled
+from petrobot.sim.catching.scenery import Chessboard, TableArea, floor_grey, stripes, supersampled
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 BALL_GREY = 215.0
 SHADOW_DEPTH = 0.35
-"""Part of the light that the ball takes from the table right below it."""
+"""Share of the light that the ball takes from the table right below it."""
 NOISE_ZERO = 128
 NOISE_SIZE = 1280
 LIGHT_DIRECTION = np.array([-0.25, 0.35, 0.90]) / np.linalg.norm([-0.25, 0.35, 0.90])
-"""Towards the lamp, base frame."""
+"""Direction to the lamp, base frame."""
 _TO_LAMP: Sequence[float] = LIGHT_DIRECTION.tolist()
 LENS_STEPS = 6
+"""Steps of the fixed-point inverse of the distortion."""
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """The true camera and light, where they differ from the cell's nominal ones. None: nominal."""
+class CameraView:
+    """True pose, lens and light of the camera, where they differ from the cell's nominal ones.
+    None: nominal."""
 
     position: Sequence[float] | None = None
     """(3,) optical centre, m, base frame."""
@@ -51,20 +53,20 @@ class View:
     distortion: Sequence[float] | None = None
     """k1 k2 p1 p2."""
     table_top: float | None = None
-    """m."""
+    """m, height of the table top."""
     near_edge: float | None = None
-    """m."""
+    """m, x of the near edge."""
     light_gradient: Sequence[float] = (-0.50, 0.10)
     """Relative change of the light from one side of the image to the other, along u and v: the far
     end is dimmer."""
     vignetting: float = 0.20
-    """Relative loss of light in the image's corners."""
+    """Relative loss of light in the corners of the image."""
     noise: float | None = None
     """Grey levels, sigma."""
 
     @classmethod
-    def of(cls, truth: Mapping[str, Any]) -> View:
-        """Read from a mapping with these names as keys. An unknown key raises ValueError."""
+    def of(cls, truth: Mapping[str, Any]) -> CameraView:
+        """Read a mapping with these names as keys. Raises ValueError for an unknown key."""
         unknown = sorted(set(truth) - set(cls.__slots__))
         if unknown:
             raise ValueError(
@@ -74,16 +76,16 @@ class View:
 
 
 class PinholeCamera:
-    """The camera of the simulated laboratory. The same generator state and the same calls give the
-    same images."""
+    """The camera of the simulated laboratory. The same generator state and the same calls return
+    the same images."""
 
     def __init__(
         self, cell: Mapping[str, Any], truth: Mapping[str, Any], rng: np.random.Generator
     ) -> None:
-        camera, view = cell["camera"], View.of(truth)
+        camera, view = cell["camera"], CameraView.of(truth)
         self.view = view
         self.width, self.height = int(camera["width"]), int(camera["height"])
-        self.table = Table.of(cell, view.table_top, view.near_edge)
+        self.table = TableArea.of(cell, view.table_top, view.near_edge)
         self.ball_radius = float(cell["ball"]["radius"])
         self.cup_radius, self.cup_depth = float(cell["cup"]["radius"]), float(cell["cup"]["depth"])
         self.exposure = float(camera["exposure"])
@@ -114,22 +116,22 @@ class PinholeCamera:
         """The noise to add, modulo 256."""
 
     def reseed(self, rng: np.random.Generator) -> None:
-        """Choose noise by another generator from now on."""
+        """Choose noise with another generator from now on."""
         self._rng = rng
 
     # Geometry
 
     def to_camera(self, points: ArrayLike) -> Array:
-        """Base-frame points (..., 3) in the camera's frame."""
+        """Return base-frame points (..., 3) in the camera's frame."""
         return np.asarray((np.asarray(points, float) - self.position) @ self.rotation.T)
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels (..., 2) of base-frame points (..., 3)."""
+        """Return pixels (..., 2) of base-frame points (..., 3)."""
         return self._pixels(self.to_camera(points))
 
     def pixel(self, point: Sequence[float]) -> tuple[float, float, float]:
-        """Pixel (u, v) of one base-frame point (3,) and its depth (m): as `project`, in plain
-        floats."""
+        """Return pixel (u, v) of one base-frame point (3,) and its depth (m): as `project`, in
+        plain floats."""
         ax, ay, az = point[0] - self._at[0], point[1] - self._at[1], point[2] - self._at[2]
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._turn
         depth = ax * zx + ay * zy + az * zz
@@ -142,7 +144,7 @@ class PinholeCamera:
         return self.focal * u + self.cx, self.focal * v + self.cy, depth
 
     def _pixels(self, seen: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3) in the camera's frame."""
+        """Return pixels (..., 2) of points (..., 3) in the camera's frame."""
         x, y = seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
         k1, k2, p1, p2 = self.distortion
         square = x * x + y * y
@@ -154,8 +156,8 @@ class PinholeCamera:
         return pixels
 
     def rays(self, pixels: Array) -> Array:
-        """Unit directions (..., 3), camera frame, in which pixels (..., 2) look; fixed-point
-        inverse of the distortion."""
+        """Return the unit directions (..., 3), camera frame, in which pixels (..., 2) look;
+        fixed-point inverse of the distortion."""
         du = (pixels[..., 0] - self.cx) / self.focal
         dv = (pixels[..., 1] - self.cy) / self.focal
         x, y = du, dv
@@ -177,12 +179,12 @@ class PinholeCamera:
         return direction
 
     def _on_plane(self, pixels: Array, origin: Array, normal: Array) -> Array:
-        """Base-frame points (..., 3) where pixels look through a plane."""
+        """Return base-frame points (..., 3) where pixels look through a plane."""
         return self._through(self.rays(pixels) @ self.rotation, origin, normal)
 
     def _through(self, direction: Array, origin: Array, normal: Array) -> Array:
-        """Points (..., 3) where base-frame directions (..., 3) from the optical centre pass a
-        plane."""
+        """Return points (..., 3) where base-frame directions (..., 3) from the optical centre meet
+        a plane."""
         distance = ((origin - self.position) @ normal) / (direction @ normal)
         return np.asarray(self.position + distance[..., None] * direction)
 
@@ -203,7 +205,7 @@ class PinholeCamera:
 
     @cached_property
     def _to_lamp(self) -> NDArray[np.float32]:
-        """Those directions' part towards the lamp (height, width)."""
+        """Component of those directions towards the lamp (height, width)."""
         return np.asarray(np.tensordot(self._lamp, self._rays, 1), np.float32)
 
     @cached_property
@@ -240,8 +242,8 @@ class PinholeCamera:
     # Images
 
     def warm_up(self) -> None:
-        """Make all that is made once: in real time the first image must not take longer than the
-        others."""
+        """Make everything that is made once: in real time the first image must not take longer than
+        the others."""
         _ = self.background, self._canvas, self._to_lamp
 
     def render(
@@ -253,7 +255,7 @@ class PinholeCamera:
         cup_pose: ArrayLike | None = None,
         light: float = 1.0,
     ) -> Picture:
-        """One image (height, width) uint8.
+        """Return one image (height, width) uint8.
 
         ball: centre at mid-exposure (3,) m, None: no ball; ball_velocity (3,) m/s; arm_points (n,
         2, 3): both ends of each capsule of the arm, arm_radii (n,) m; cup_pose (4, 4): the cup's
@@ -290,13 +292,14 @@ class PinholeCamera:
 
     @cached_property
     def _canvas(self) -> Picture:
-        """The background, on which an image is painted; `render` puts back what it changes."""
+        """Copy of the background on which an image is painted; `render` restores what it
+        changes."""
         return self.background.copy()
 
     @cached_property
     def _sound(self) -> bool:
         """Whether noise never takes the background beyond black or white, so that it may be added
-        without a look."""
+        without a check."""
         return self._bears_noise(float(self.background.min())) and self._bears_noise(
             float(self.background.max())
         )
@@ -307,15 +310,15 @@ class PinholeCamera:
         return int(self._noise.min()) - NOISE_ZERO, int(self._noise.max()) - NOISE_ZERO
 
     def _bears_noise(self, grey: float) -> bool:
-        """Whether noise never takes this grey level, rounded either way, beyond black or white.
-        Edges drawn smooth lie between two such levels."""
+        """Return whether noise never takes this grey level, rounded either way, beyond black or
+        white. Smooth edges lie between two such levels."""
         least, most = self._noise_range
         return math.floor(grey) + least >= 0 and math.ceil(grey) + most <= 255
 
     def render_board(
         self, pose: ArrayLike, board: Chessboard | None = None, light: float = 1.0
     ) -> Picture:
-        """One image of a calibration board held at `pose` (4, 4), board frame to base frame;
+        """Return one image of a calibration board held at `pose` (4, 4), board frame to base frame;
         nothing else in view."""
         board = board or Chessboard()
         frame = np.asarray(pose, float)
@@ -344,16 +347,19 @@ class PinholeCamera:
         return self._expose(picture, light, None)
 
     def _expose(self, picture: Picture, light: float, glaring: Sequence[Box] | None) -> Picture:
-        """Light and noise over the whole image: a window of the noise field that the generator
-        chooses. Outside the boxes `glaring` the picture bears noise as the background does (None:
-        it may be as bright or dark as it likes anywhere)."""
+        """Add light and noise to the whole image; the generator chooses a window of the noise
+        field.
+
+        Outside the boxes `glaring` the picture tolerates noise as the background does (None: it may
+        be arbitrarily bright or dark anywhere).
+        """
         row = int(self._rng.integers(NOISE_SIZE - self.height + 1))
         column = int(self._rng.integers(NOISE_SIZE - self.width + 1))
         window = slice(row, row + self.height), slice(column, column + self.width)
         noise = self._noise[window]
         if light != 1.0 or glaring is None or not self._sound:
             return np.asarray(cv2.addWeighted(picture, light, noise, 1.0, -NOISE_ZERO), np.uint8)
-        image = picture + self._grain[window]  # the same sum in a tenth of the time
+        image = picture + self._grain[window]  # The same sum in a tenth of the time.
         for box in glaring:
             image[box] = cv2.addWeighted(picture[box], 1.0, noise[box], 1.0, -NOISE_ZERO)
         return image
@@ -361,7 +367,7 @@ class PinholeCamera:
     # Moving things
 
     def _paint_ball(self, picture: Picture, ball: Array, velocity: Array) -> Box | None:
-        """Ball and shadow; gives the box that they may have changed."""
+        """Paint ball and shadow; return the box that they may have changed."""
         at, (lx, ly, lz), half = ball.tolist(), _TO_LAMP, 0.5 * self.exposure
         height = at[2] - self.table.top
         fall = height / lz
@@ -396,10 +402,10 @@ class PinholeCamera:
     def _sphere(
         self, centre: Array, velocity: Array, travel: float, box: tuple[slice, slice]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Part of each pixel that the ball covers, averaged over the exposure, and that part times
-        its shading.
+        """Return the share of each pixel that the ball covers, averaged over the exposure, and that
+        share times its shading.
 
-        Centre and velocity in the camera's frame; `travel`: half the ball's way in the image (px).
+        Centre and velocity in the camera's frame; `travel`: half the ball's path in the image (px).
         """
         steps = 1 + 2 * math.ceil(travel)
         moments = ((np.arange(steps) + 0.5) / steps - 0.5) * self.exposure
@@ -420,7 +426,8 @@ class PinholeCamera:
         along -= np.sqrt(
             np.maximum(radius * radius - square, 0.0)
         )  # now the distance of the ball's surface
-        # the surface normal's part towards the lamp: (ray * distance - centre) . lamp / radius
+        # Lambert's law: the component of the surface normal towards the lamp, (ray * distance -
+        # centre) . lamp / radius.
         facing = (along * to_lamp.ravel() - (centres @ self._lamp)[:, None]) / radius
         np.minimum(np.maximum(facing, 0.0, out=facing), 1.0, out=facing)
         shade = cover * (np.float32(0.70) + np.float32(0.30) * facing)
@@ -443,8 +450,8 @@ class PinholeCamera:
 
 
 def _shadow(u: float, v: float, size: float, box: tuple[slice, slice]) -> NDArray[np.float32]:
-    """Factor on the light of the table around the ball: soft, the ball's `size` (px) wide, about
-    the pixel (u, v)."""
+    """Return the factor on the light of the table around the ball: soft, the ball's `size` (px)
+    wide, about the pixel (u, v)."""
     rows, columns = box
     du = (np.arange(columns.start, columns.stop, dtype=np.float32) - u) / size
     dv = (np.arange(rows.start, rows.stop, dtype=np.float32) - v) / size
@@ -453,6 +460,6 @@ def _shadow(u: float, v: float, size: float, box: tuple[slice, slice]) -> NDArra
 
 
 def _looking_down(camera: Mapping[str, Any]) -> Array:
-    """Nominal camera-from-base rotation: straight down, image x along `image_x`."""
+    """Return the nominal camera-from-base rotation: straight down, image x along `image_x`."""
     right, down = np.asarray(camera["image_x"], float), np.array([0.0, 0.0, -1.0])
     return np.array([right, np.cross(down, right), down])

@@ -1,16 +1,16 @@
 """Where the ball may touch something: a small PyBullet space of ball, table and cup, stepped at 1
 kHz.
 
-The cup is 16 flat boxes and a disc, moved along with the arm. Bullet gives bodies without mass no
-velocity in a contact, so the cup is a free body of a mass (1 t) that no ball can move; each step
-puts it where the arm holds it, with the velocity that takes it where it will hold it next. It comes
-as URDF, since a body made otherwise has 16 shapes at most, and with two bodies a step takes more
-than twice the time (21 us instead of 9).
+The cup is 16 flat boxes and a disc that move with the arm. Bullet gives bodies without mass no
+velocity in a contact, so the cup is a free body with a mass (1 t) that no ball can move; each step
+puts it where the arm holds it, with the velocity that takes it to where the arm will hold it next.
+It is loaded as URDF, since a body made otherwise has 16 shapes at most, and with two bodies a step
+takes more than twice the time (21 us instead of 9).
 
 Restitution: Bullet lets contacts act before bodies touch and then forgets the bounce, and its
-push-out of overlap adds speed. With a breaking threshold of 10 um and a push-out of 2 % a step,
-impacts at 0.2 to 2.4 m/s on a resting or moving cup come back with 0.30 to 0.33 of their speed for
-a coefficient of 0.3 (tests/sim/test_contact.py).
+correction of overlap adds speed. With a breaking threshold of 10 um and a correction of 2 % per
+step, impacts at 0.2 to 2.4 m/s on a resting or moving cup return with 0.30 to 0.33 of their speed
+for a coefficient of 0.3 (tests/sim/test_contact.py).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from petrobot.sim.catching.truth import CupTruth, TableTruth
 _ANVIL = 1000.0
 """kg, mass of the cup."""
 _HULL_MARGIN = 0.001
-"""m by which Bullet makes a cylinder of a URDF larger all around."""
+"""m by which Bullet enlarges a cylinder of a URDF in all directions."""
 _SLAB = 0.030
 """m, thickness of the table top."""
 Quaternion = tuple[float, float, float, float]
@@ -70,7 +70,7 @@ class ContactSpace:
         self._make_table(table, settings["ball"])
         self._cup = self._load(cup_urdf(cup, wall, int(settings["cup"]["walls"])))
         self._surface(self._cup, cup.restitution, float(settings["cup"]["friction"]))
-        # Bullet's rolling friction is a lever arm (m)
+        # Bullet's rolling friction is a lever arm (m).
         lever = float(settings["cup"]["rolling_resistance"]) * model.radius
         pybullet.changeDynamics(self._cup, -1, rollingFriction=lever, physicsClientId=self._client)
         pybullet.setCollisionFilterPair(
@@ -121,24 +121,24 @@ class ContactSpace:
         )
 
     def ball(self) -> BallState:
-        """The ball's state."""
+        """Return the ball's state."""
         position, _ = pybullet.getBasePositionAndOrientation(
             self._ball, self._client
-        )  # by place: a third faster
+        )  # Positional arguments are a third faster.
         velocity, spin = pybullet.getBaseVelocity(self._ball, self._client)
         return BallState(position, velocity, spin)
 
     def step(self, before: Frame3, after: Frame3) -> BallState:
-        """One step of `dt` while the cup goes from `before` to `after` (origin: mouth centre, z out
-        of the mouth)."""
+        """Step by `dt` while the cup moves from `before` to `after` (origin: mouth centre, z out of
+        the mouth)."""
         (vx, vy, vz), (wx, wy, wz) = twist(before, after, self.dt)
         (zx, zy, zz), (ox, oy, oz), depth = before.z, before.origin, self._cup_depth
         rx, ry, rz = (
             -depth * zx,
             -depth * zy,
             -depth * zz,
-        )  # from the mouth to the body's origin, the inner bottom
-        # the last summand: the step takes gravity's part off again before contacts are solved
+        )  # From the mouth to the body's origin, the inner bottom.
+        # The last term: the step subtracts the effect of gravity again before contacts are solved.
         speed = (
             vx + wy * rz - wz * ry,
             vy + wz * rx - wx * rz,
@@ -153,15 +153,15 @@ class ContactSpace:
         return self.ball()
 
     def close(self) -> None:
-        """End the physics client."""
+        """Disconnect the physics client."""
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
 
 
 def cup_urdf(cup: CupTruth, wall: float, count: int) -> str:
-    """The cup as URDF: `count` boxes around the z axis and a disc below; origin in the middle of
-    the inner bottom."""
+    """Return the cup as URDF: `count` boxes around the z axis and a disc below; origin in the
+    middle of the inner bottom."""
     reach, width = cup.radius + wall / 2.0, 2.0 * (cup.radius + wall) * math.tan(math.pi / count)
     shapes = []
     for k in range(count):
@@ -188,8 +188,8 @@ def cup_urdf(cup: CupTruth, wall: float, count: int) -> str:
 
 
 def quaternion(frame: Frame3) -> Quaternion:
-    """Orientation of a frame as (x, y, z, w); the largest component first, so nothing is divided by
-    a small one."""
+    """Return the orientation of a frame as (x, y, z, w); the largest component comes first, so
+    nothing is divided by a small one."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz), _ = frame
     trace = xx + yy + zz
     if trace > 0.0:

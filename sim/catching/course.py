@@ -1,4 +1,4 @@
-"""What becomes of one throw, and the light barrier that tells."""
+"""What happens to one throw, and the light barrier that detects the ball."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from petrobot.sim.catching.ball import BallState
 from petrobot.sim.catching.thrower import Throw
 
 
-class Outcome(StrEnum):
-    """What became of a throw."""
+class ThrowOutcome(StrEnum):
+    """What happened to a throw."""
 
     ROLLING = "rolling"
     """Not decided yet."""
@@ -22,19 +22,19 @@ class Outcome(StrEnum):
 
 
 @dataclass(slots=True)
-class Course:
+class ThrowCourse:
     """What was seen of one throw so far. Times are seconds after its release, lengths m, base
     frame."""
 
     throw: Throw
     released_at: float
-    outcome: Outcome = Outcome.ROLLING
+    outcome: ThrowOutcome = ThrowOutcome.ROLLING
     exit_time: float = math.inf
     """When the centre left the near edge; inf if it did not."""
     exit_state: BallState | None = None
     crossing: float = math.inf
     """Least distance from the centre of the cup's mouth at which the ball's centre, once off the
-    table, went through the plane of the mouth from outside; inf if it never did."""
+    table, passed the plane of the mouth from outside; inf if it never did."""
     approach: float = math.inf
     """Least distance of the ball's centre from the centre of the mouth."""
     caught_at: float = math.inf
@@ -43,22 +43,22 @@ class Course:
 
     @property
     def miss(self) -> float:
-        """How far from the middle of the mouth the ball came to it (m): in the plane of the mouth
-        where it crossed that, else its closest approach."""
+        """Distance of the ball from the middle of the mouth (m): in the plane of the mouth where it
+        crossed that, else its closest approach."""
         return self.crossing if self.crossing < math.inf else self.approach
 
 
 @dataclass(slots=True)
-class Barrier:
-    """A light barrier with a filter: its output follows what it sees after `delay` seconds without
-    a change."""
+class LightBarrier:
+    """A light barrier with a filter: its output follows the beam after `delay` seconds without a
+    change."""
 
     delay: float
     output: bool = False
     _since: float = field(default=0.0)
 
     def see(self, now: float, interrupted: bool) -> None:
-        """What it sees at `now` (s); call it at least once a tick."""
+        """Set the state of the beam at `now` (s); call it at least once per tick."""
         if interrupted == self.output:
             self._since = now
         elif now - self._since >= self.delay:

@@ -47,13 +47,13 @@ class DigitalInputs(CanopenNode):
         self.inputs = self.inputs | mask if on else self.inputs & ~mask
 
     def before_sending(self) -> None:
-        """Show the inputs."""
+        """Update object 6000h:1."""
         if self.values[0x6000, 1] != self.inputs:
             self.values[0x6000, 1] = self.inputs
             self.changed()
 
     def due(self) -> float:
-        """At once while a change is still to be sent."""
+        """Return when to act next: at once while a change is not sent yet."""
         if self.tpdo.synchronous:
             return super().due()
         if self.inputs != self._sent:
@@ -61,7 +61,7 @@ class DigitalInputs(CanopenNode):
         return min(super().due(), self._due) if self.values[0x1800, 5] else super().due()
 
     def advance(self, now: float) -> None:
-        """Send on change, and again when the event timer says so."""
+        """Send on change, and again when the event timer is due."""
         super().advance(now)
         timer = self.values[0x1800, 5] * 1e-3
         if not self.tpdo.synchronous and (
@@ -77,9 +77,9 @@ INPUTS_NODE: Final = 7
 """Node id of the digital inputs; the drives have 1 to 6, base to flange."""
 
 SYNC_PATIENCE: Final = 10
-"""Periods of 1006h without SYNC after which an enabled drive stops by itself: 40 ms at 250 Hz,
-shorter than three periods of the set-point stream, longer than what a master on an ordinary Linux
-is now and then late."""
+"""Periods of 1006h without SYNC after which an enabled drive stops by itself. 40 ms at 250 Hz:
+shorter than three periods of the set-point stream, longer than the occasional delay of a master on
+ordinary Linux."""
 
 _STATUSWORD: Final = (int(Object.STATUSWORD), 0)
 _CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
@@ -98,7 +98,7 @@ _LIMIT, _ERROR = int(StatusBit.INTERNAL_LIMIT), int(StatusBit.FOLLOWING_ERROR)
 
 
 class Plant(Protocol):
-    """The arm as its drives feel it: angles (rad), speeds (rad/s) and torques (N m) by joint, and
+    """The arm as its drives see it: angles (rad), speeds (rad/s) and torques (N m) per joint, and
     the joints' brakes."""
 
     @property
@@ -110,20 +110,20 @@ class Plant(Protocol):
         """Speeds."""
 
     def brake(self, joint: int) -> None:
-        """Engage a joint's brake and take its torque away."""
+        """Engage a joint's brake and switch its torque off."""
 
     def release(self, joint: int) -> None:
         """Release a joint's brake."""
 
     def slow_down(self, factor: float) -> None:
-        """From now on the joints reach this share of their greatest speeds."""
+        """Limit the joints to this share of their greatest speeds from now on."""
 
     def step(self, dt: float, tau: Sequence[float]) -> None:
-        """Move on by `dt` seconds under six torques."""
+        """Advance by `dt` seconds under six torques."""
 
 
 def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
-    """The drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and
+    """Return the drives of an arm whose `[[joint]]` tables give torque (N m), speed (degrees/s) and
     inertia (kg m^2)."""
     return tuple(
         DriveRating(float(joint["torque"]), math.radians(joint["speed"]), float(joint["inertia"]))
@@ -131,8 +131,8 @@ def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
     )
 
 
-class Drive(PowerDrive):
-    """One joint's drive: cyclic synchronous position mode around a `JointServo`."""
+class ServoDrive(PowerDrive):
+    """Drive of one joint: cyclic synchronous position mode around a `JointServo`."""
 
     mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
     fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
@@ -150,7 +150,8 @@ class Drive(PowerDrive):
         """Status, angle and torque in the TPDO that `sync` made last, if no object has changed
         since."""
         self._usual = False
-        """Whether both PDOs are laid out as masters of this profile do it, and go by SYNC."""
+        """Whether both PDOs have the layout that masters of this profile use, and are
+        synchronous."""
         self.servo = JointServo(rating, plant.q[joint])
         self._speed_factor = 1.0
         self._torque = 0.0
@@ -159,7 +160,7 @@ class Drive(PowerDrive):
 
     # Hooks of the CANopen node.
     def before_sending(self) -> None:
-        """Bring status, position, speed and torque up to date."""
+        """Update status, position, speed and torque."""
         plant, joint = self.plant, self.joint
         usual = (
             self.state is _ENABLED
@@ -180,22 +181,24 @@ class Drive(PowerDrive):
         self.changed()
 
     def before_reading(self) -> None:
-        """Bring what only an SDO reads up to date as well."""
+        """Also update what only an SDO reads."""
         self.before_sending()
         self.values[Object.FOLLOWING_ERROR, 0] = to_units(self.servo.error)
         self.values[Object.ERROR_CODE, 0] = self.fault
         self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
 
     def changed(self) -> None:
-        """What a TPDO may carry is another than before."""
+        """Note that the content of a TPDO may have changed."""
         self._said = None
         super().changed()
 
     def sync(self, now: float) -> None:
-        """SYNC has come. Of a drive that follows its set points, with PDOs laid out as usual, six
-        are asked for this in every cycle: it does in one go what the base class does in steps, to
-        the same bytes. Objects that nobody reads meanwhile are brought up to date when somebody
-        does."""
+        """Process SYNC.
+
+        Fast path for a drive that follows its set points with the usual PDOs, since six drives run
+        it in every cycle: it does at once what the base class does in steps, with the same bytes.
+        Objects that are not read in between are updated when they are read.
+        """
         if not (
             self._usual and self.state is _ENABLED and self.nmt is _OPERATIONAL and self._goes_on()
         ):
@@ -222,8 +225,8 @@ class Drive(PowerDrive):
         self.outbox.append(frame)
 
     def _goes_on(self) -> bool:
-        """Take over the RPDO's set point if its controlword orders nothing but to go on; else leave
-        all as it is."""
+        """Take the RPDO's set point if its controlword only continues the motion; else leave
+        everything unchanged."""
         data = self._latched
         if data is not None and data != self._applied:
             word, target = self.rpdo.layout.unpack_from(data)
@@ -238,7 +241,7 @@ class Drive(PowerDrive):
         return True
 
     def on_sync(self, now: float) -> None:
-        """A new set point is due."""
+        """Take a new set point."""
         self._synced = now
         if self.state is _ENABLED:
             self.servo.aim(self._target())
@@ -246,7 +249,7 @@ class Drive(PowerDrive):
                 self.stir()
 
     def repeat(self, now: float, answer: Frame) -> None:
-        """SYNC again with the same set point while the joint is at rest: the same answer again."""
+        """Answer SYNC with the same frame: the set point is the same and the joint is at rest."""
         self._synced = now
         self.outbox.append(answer)
 
@@ -257,7 +260,7 @@ class Drive(PowerDrive):
         return frame if frame is not None and self.outbox and self.outbox[-1] is frame else None
 
     def after_configuring(self) -> None:
-        """Take over how the drive watches itself."""
+        """Store how the drive monitors itself."""
         super().after_configuring()
         values, rpdo, tpdo = self.values, self.rpdo, self.tpdo
         self._usual = rpdo.synchronous and tpdo.on and tpdo.synchronous
@@ -274,7 +277,7 @@ class Drive(PowerDrive):
 
     # Hooks of the state machine.
     def begin(self, resumed: bool) -> None:
-        """Hold here, or take set points again from where the ramp has come to."""
+        """Hold here, or take set points again from where the ramp has ended."""
         if resumed:
             self.servo.follow(self._target())
         else:
@@ -287,17 +290,17 @@ class Drive(PowerDrive):
         self.servo.ramp_down(deceleration)
 
     def cut_power(self) -> None:
-        """The brake holds."""
+        """Let the brake hold."""
         self._torque = 0.0
         self.plant.brake(self.joint)
 
     def flags(self) -> int:
-        """Whether set points are cut, and whether the joint is too far off."""
+        """Return whether set points are cut, and whether the following error is too large."""
         limit = _LIMIT if self.servo.limited else 0
         return limit | _ERROR if self._error_since is not None else limit
 
     def refresh(self) -> None:
-        """Show everything anew, the greatest speed too."""
+        """Update all objects, the greatest speed too."""
         self._shown = None
         self.servo.limit = self.servo.rating.speed * self._speed_factor
         self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
@@ -305,13 +308,13 @@ class Drive(PowerDrive):
 
     # What the laboratory does to a drive.
     def slow_down(self, factor: float) -> None:
-        """Give a share of the rated speed from now on; object 607Fh tells."""
+        """Supply only a share of the rated speed from now on; object 607Fh reports it."""
         self._speed_factor = factor
         self.refresh()
 
     def torque(self, now: float, dt: float, q: float, qd: float) -> float:
-        """Torque of the next `dt` seconds (N m) from the joint's angle and speed; 0 without
-        power."""
+        """Return the torque of the next `dt` seconds (N m) from the joint's angle and speed; 0
+        without power."""
         state = self.state
         if state is not _ENABLED and state not in POWERED:
             return 0.0
@@ -331,7 +334,7 @@ class Drive(PowerDrive):
 
     @property
     def settled(self) -> bool:
-        """Whether the torque of a joint at rest stays as it is unless something happens."""
+        """Whether the torque of a joint at rest stays the same unless something happens."""
         if self.state not in POWERED:
             return True
         return (
@@ -341,7 +344,7 @@ class Drive(PowerDrive):
         )
 
     def _watch(self, now: float, late: bool) -> None:
-        """Following error (6065h, 6066h) and loss of SYNC (1006h)."""
+        """Watch following error (6065h, 6066h) and loss of SYNC (1006h)."""
         if late:
             self.trip(Fault.SYNC_LOST)
         elif -self._window <= self.servo.error <= self._window:
@@ -352,19 +355,19 @@ class Drive(PowerDrive):
             self.trip(Fault.FOLLOWING_ERROR)
 
     def _target(self) -> float:
-        """Object 607Ah within the software limits 607Dh, in rad."""
+        """Return object 607Ah within the software limits 607Dh, in rad."""
         (low, high), target = self._range, self.values[_TARGET]
         return (low if target < low else high if target > high else target) / UNITS
 
 
 class DriveBus:
-    """Everything on the arm's bus but the master: six drives (nodes 1 to 6) and the digital inputs
-    (node 7).
+    """Everything on the arm's bus except the master: six drives (nodes 1 to 6) and the digital
+    inputs (node 7).
 
-    In each step of the plant (1 kHz or faster): `receive` what came, then `step(now, dt)`, which
-    also moves the plant, then send what `drain` gives. Times are seconds on the caller's clock. An
-    arm that stands still under torques that do not change is at rest: until something stirs it, a
-    step would change nothing and is left out.
+    In each step of the plant (1 kHz or faster): `receive` the frames, then `step(now, dt)`, which
+    also moves the plant, then send what `drain` returns. Times are seconds on the caller's clock.
+    An arm that stands still under constant torques is at rest: until something stirs it, a step
+    would change nothing and is skipped.
     """
 
     def __init__(self, plant: Plant, drives: Sequence[DriveRating], now: float = 0.0) -> None:
@@ -375,10 +378,10 @@ class DriveBus:
         self._odd = False
         self._heard: Sequence[Frame] = ()
         self._echoes: Sequence[Frame] = ()
-        """The set points of the newest cycle that found and left the arm at rest, and the answers,
-        one a drive."""
+        """Set points of the newest cycle that found and left the arm at rest, and the answers, one
+        per drive."""
         self.drives = tuple(
-            Drive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
+            ServoDrive(joint, rating, plant, self._stir) for joint, rating in enumerate(drives)
         )
         self.inputs = DigitalInputs(INPUTS_NODE)
         self._nodes: tuple[CanopenNode, ...] = (*self.drives, self.inputs)
@@ -388,8 +391,8 @@ class DriveBus:
             node.boot(now)
 
     def receive_cycle(self, now: float, frames: Sequence[Frame]) -> None:
-        """The frames of one cycle of the master's. Drives at rest that hear what they have heard
-        before answer as before."""
+        """Process the frames of one cycle of the master. Drives at rest that receive the same
+        frames again repeat their answers."""
         if self._echoes and frames == self._heard and self._resting:
             for drive, echo in zip(self.drives, self._echoes, strict=True):
                 drive.repeat(now, echo)
@@ -402,12 +405,12 @@ class DriveBus:
             self._heard, self._echoes = frames, self._answers()
 
     def _answers(self) -> Sequence[Frame]:
-        """What each drive has just sent, nothing if one of them sent nothing."""
+        """Return what each drive has just sent, nothing if one of them sent nothing."""
         sent = [drive.tpdo_sent for drive in self.drives]
         return [frame for frame in sent if frame is not None] if None not in sent else ()
 
     def receive(self, now: float, frame: Frame) -> None:
-        """A frame of the master's."""
+        """Process one frame of the master."""
         cob_id = frame.id
         target = self._own.get(cob_id & 0x7F)
         if target is not None and target.rpdo.cob_id == cob_id and target.rpdo.on:
@@ -418,12 +421,12 @@ class DriveBus:
             self._rests_until = min([drive.waits_until for drive in self.drives])
         else:
             self._odd = True
-            self._due = -math.inf  # it may set any timer
+            self._due = -math.inf  # It may set any timer.
             for node in self._nodes:
                 node.receive(now, frame)
 
     def step(self, now: float, dt: float) -> None:
-        """Torques for `dt` seconds, the plant's motion, and what the devices do on time."""
+        """Compute torques for `dt` seconds, move the plant, and run what the devices do on time."""
         if now >= self._due:
             for node in self._nodes:
                 node.advance(now)
@@ -445,7 +448,7 @@ class DriveBus:
         self._echoes = ()
 
     def drain(self) -> list[Frame]:
-        """Frames to the master, oldest first."""
+        """Return the frames to the master, oldest first."""
         frames: list[Frame] = []
         for node in self._nodes:
             if node.outbox:
@@ -453,12 +456,12 @@ class DriveBus:
         return frames
 
     def ball(self, present: bool) -> None:
-        """The light barrier in the cup is interrupted, or free."""
+        """Set the light barrier in the cup: interrupted or free."""
         self._put(DigitalInputs.BALL, present)
 
     def power(self, closed: bool) -> None:
         """Close or open the arm-power chain (emergency stop). Open: the drives lose power and the
-        brakes fall in."""
+        brakes engage."""
         self._put(DigitalInputs.POWER, closed)
         self._echoes = ()
         for drive in self.drives:
@@ -472,12 +475,12 @@ class DriveBus:
             self._due = -math.inf
 
     def trip(self, joint: int, fault: Fault = Fault.OVERCURRENT) -> str:
-        """Make a drive (0 to 5) fail; gives the fault in words."""
+        """Make a drive (0 to 5) fail; return the fault in words."""
         self.drives[joint].trip(fault)
         return fault_text(fault)
 
     def slow_down(self, factor: float) -> None:
-        """A slow arm: drives and plant reach this share (0 to 1] of their speeds."""
+        """Limit drives and plant to this share (0 to 1] of their speeds."""
         self.plant.slow_down(factor)
         for drive in self.drives:
             drive.slow_down(factor)

@@ -1,8 +1,8 @@
-"""The laboratory: world, arm, drives, camera and thrower as one party, which answers on bus, camera
-and wire as hardware would.
+"""The catching laboratory: world, arm, drives, camera and thrower as one party, which answers on
+bus, camera and wire as hardware would.
 
-At a tick it takes what came, shows the camera the world as it is, and moves the world on by a tick;
-so a set point acts and is answered within the tick in which it arrives. Nothing here knows
+In each tick it processes what arrived, exposes the camera to the world as it is, and advances the
+world. So a set point acts and is answered within the tick in which it arrives. Nothing here uses
 wall-clock time: lock step and real time drive it alike.
 """
 
@@ -21,21 +21,21 @@ from petrobot.sim.catching.drives import DriveBus
 from petrobot.sim.catching.oracle import Oracle
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.puma_model import Frame3
-from petrobot.sim.catching.referee import Referee
+from petrobot.sim.catching.referee import CatchReferee
 from petrobot.sim.catching.site import CupMount, Site, site_of
 from petrobot.sim.catching.thrower import Thrower
 from petrobot.sim.catching.truth import Truth
-from petrobot.sim.catching.world import World
+from petrobot.sim.catching.world import BallWorld
 from petrobot.sim.exposures import camera_of
-from petrobot.sim.faults import Fault, FaultPlan, read_fault
+from petrobot.sim.faults import FaultPlan, InjectedFault, read_fault
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
 
 _NOISE, _FAULTS = 0x6361, 0x6661
-"""Keep the draws of camera noise and of faults apart from other draws of the same seed."""
+"""Keep the draws of camera noise and of faults separate from other draws of the same seed."""
 
 
-class Laboratory(LaboratoryParty):
-    """The party of the simulated node `name`. `where` gives the party of an endpoint
+class CatchingLaboratory(LaboratoryParty):
+    """The party of the simulated node `name`. `where` returns the party of an endpoint
     (`Directory.party`)."""
 
     def __init__(
@@ -50,8 +50,8 @@ class Laboratory(LaboratoryParty):
         boot: str = "laboratory",
         directory: str = "",
     ) -> None:
-        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in
-        services.comm.callee."""
+        """Raises LaboratoryError for an unknown regime. `boot`, `directory`: as in
+        services.comm.calls.callee."""
         super().__init__(name, where, boot, directory)
         self._site = site
         truth = site.truth(regime)
@@ -63,20 +63,20 @@ class Laboratory(LaboratoryParty):
         )
         self._home: list[float] = site.arm.poses["home"].tolist()
         self.bus = DriveBus(self.plant, site.drives)
-        self._world: World | None = None
+        self._world: BallWorld | None = None
         self._prepare(self.now, seed, truth, throws)
 
     def _prepare(self, now: float, seed: int, truth: Truth, throws: int | None) -> None:
-        """A new experiment: ball gone, score empty, everything drawn anew. The arm stays where it
-        is."""
+        """Begin a new experiment: no ball, empty score, everything drawn again. The arm stays where
+        it is."""
         if self._world is not None:
             self._world.close()
         self.truth = truth
         self._mount = CupMount(self._site.arm, truth)
         self._arm_dt = float(truth.settings["step"]["arm"])
-        self._world = self.world = World(self._site.cell, truth)
+        self._world = self.world = BallWorld(self._site.cell, truth)
         self.thrower = Thrower(self._site.cell, truth, seed, throws)
-        self.referee = Referee(
+        self.referee = CatchReferee(
             seed, truth.regime, Oracle(self._site.arm, truth, self._site.cell), now
         )
         self._faults = FaultPlan(np.random.default_rng((seed, _FAULTS)))
@@ -90,7 +90,7 @@ class Laboratory(LaboratoryParty):
     # The world, as lock step and real time drive it
 
     def tick(self, now: float) -> None:
-        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
         self._begin_faults(now)
         self._expose(now)
         self._throw(now)
@@ -100,11 +100,11 @@ class Laboratory(LaboratoryParty):
     # Bus
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """Frames of the master's."""
+        """Process frames of the master."""
         self.bus.receive_cycle(now, self._faults.passed(frames))
 
     def take_frames(self) -> Sequence[Frame]:
-        """Frames of drives and inputs since the last call."""
+        """Return the frames of drives and inputs since the last call."""
         return self._faults.passed(self.bus.drain())
 
     # Camera
@@ -116,16 +116,17 @@ class Laboratory(LaboratoryParty):
         self.exposures.put(now, ready, self._picture(now))
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Draw the still scene of a regime's camera ahead of its first image, which takes seconds.
+        """Draw the static scene of a regime's camera before its first image, which takes seconds.
         Raises LaboratoryError."""
         regime = str(arguments.get("regime", "A"))
         camera_of(self._site.cell, self._site.truth(regime), self._noise).warm_up()
 
     def camera(self) -> PinholeCamera:
-        """The camera as it hangs in this regime, ready for the next image."""
+        """Return the camera as it is mounted in this regime, ready for the next image."""
         if self._camera is None:
             self._camera = camera_of(self._site.cell, self.truth, self._noise)
-        self._camera.reseed(self._noise)  # others in this process may have used it since
+        # Other laboratories in this process may have used it since.
+        self._camera.reseed(self._noise)
         return self._camera
 
     def _picture(self, now: float) -> Picture:
@@ -151,8 +152,8 @@ class Laboratory(LaboratoryParty):
             self.referee.enter(course, self.plant.q)
 
     def _ready(self) -> bool:
-        """Images are taken, the last ball is gone, the cup is empty, the arm stands still at
-        home."""
+        """Return whether images are taken, the last ball is gone, the cup is empty, and the arm
+        stands still at home."""
         if self.exposures.rate <= 0.0 or self.world.ball is not None or self.world.barrier:
             return False
         rules = self.truth.settings["thrower"]
@@ -164,8 +165,8 @@ class Laboratory(LaboratoryParty):
         )
 
     def _move(self, now: float) -> None:
-        """The world goes on by a tick: in fine steps while the ball may touch something, else in
-        the arm's own."""
+        """Advance the world by a tick: in fine steps while the ball may touch something, else in
+        the steps of the arm."""
         world, bus = self.world, self.bus
         if world.ball is not None:
             world.begin(now, self._cup_now)
@@ -182,7 +183,7 @@ class Laboratory(LaboratoryParty):
         bus.ball(world.barrier)
 
     def _cup_now(self) -> Frame3:
-        """The cup's frame; the same object as long as the arm does not move."""
+        """Return the cup's frame; the same object as long as the arm does not move."""
         if self.plant.moves != self._moves:
             self._moves = self.plant.moves
             self._cup = self._mount.frame(self.plant.q)
@@ -206,19 +207,19 @@ class Laboratory(LaboratoryParty):
         if self._faults.active("arm_power") is not powerless:
             self.bus.power(powerless)
 
-    def _strike(self, fault: Fault) -> None:
+    def _strike(self, fault: InjectedFault) -> None:
         if fault.kind == "drive_fault":
             self.bus.trip(int(fault.value) - 1)
         elif fault.kind == "slow_arm":
             self.bus.slow_down(fault.value)
 
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for arguments
-        that cannot be.
+        """Answer one of `SERVICES`. Raises ValueError (LaboratoryError among them) for bad
+        arguments.
 
-        laboratory_prepare(seed=0, regime="A", throws=None): a new experiment, gives nothing; other
-        parameters of the task are not the laboratory's business; laboratory_score(cycles=[]): see
-        sim.referee; laboratory_fault(kind, after=0, ...): see sim.faults.
+        laboratory_prepare(seed=0, regime="A", throws=None): begin a new experiment, return nothing;
+        other parameters of the task do not concern the laboratory; laboratory_score(cycles=[]): see
+        `CatchReferee.score`; laboratory_fault(kind, after=0, ...): see sim.faults.
         """
         if service == SCORE:
             return self.referee.score(self.now, arguments.get("cycles", ()))
@@ -234,14 +235,15 @@ class Laboratory(LaboratoryParty):
         return {}
 
     def close(self) -> None:
-        """End the physics clients."""
+        """Disconnect the physics clients."""
         self.world.close()
         self.plant.close()
 
 
-def make_laboratory(directory: Directory, name: str) -> Laboratory:
-    """The laboratory of the simulated node `name` of services.toml. Raises LaboratoryError."""
+def make_laboratory(directory: Directory, name: str) -> CatchingLaboratory:
+    """Return the laboratory of the simulated node `name` of services.toml. Raises
+    LaboratoryError."""
     boot = f"{name} in lock step"
-    return Laboratory(
+    return CatchingLaboratory(
         name, site_of(directory), directory.party, boot=boot, directory=directory.hash
     )

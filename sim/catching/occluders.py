@@ -1,8 +1,8 @@
 """Arm and cup as the simulated camera sees them: patches of one grey level, each the convex hull of
 two rims.
 
-They are worked out anew only when arm or cup has moved. Plain floats decide what is in view: most
-parts never are.
+They are computed again only when arm or cup has moved. Plain floats decide what is in view, since
+most parts never are.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ CUP_GREY = 92.0
 CUP_INSIDE_GREY = 40.0
 CUP_WALL = 0.004
 SUBPIXEL_BITS = 4
-"""OpenCV draws polygons with corners in parts of a pixel: sixteenths."""
+"""OpenCV draws polygons with corners in fractions of a pixel: sixteenths."""
 _SUBPIXELS = float(1 << SUBPIXEL_BITS)
 _SOFT = 2
-"""px by which an edge drawn smooth may reach beyond its corners."""
+"""px by which a smooth edge may reach beyond its corners."""
 _STRETCH = 1.5
-"""More than the lens stretches or turns what lies around a point in view."""
+"""Factor larger than the stretch of the lens around any point in view."""
 CIRCLE = np.stack([f(np.linspace(0.0, 2.0 * np.pi, 13)[:-1]) for f in (np.cos, np.sin)], axis=-1)
 _RING = np.pad(CIRCLE, ((0, 0), (0, 1)))
 
 
 class Lens(Protocol):
-    """What must be known of the camera; lengths in m, base frame."""
+    """What is needed of the camera; lengths in m, base frame."""
 
     width: int
     height: int
@@ -50,16 +50,16 @@ class Lens(Protocol):
         """Relative light (height, width)."""
 
     def pixel(self, point: Sequence[float]) -> tuple[float, float, float]:
-        """Pixel (u, v) of a point (3,), and its depth before the lens (m)."""
+        """Return pixel (u, v) of a point (3,), and its depth in front of the lens (m)."""
 
     def project(self, points: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3)."""
+        """Return pixels (..., 2) of points (..., 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cover:
-    """What arm or cup hide: a convex hull (n, 1, 2) in sixteenths of a pixel, the box of the image
-    that holds it, its grey level, its height (m)."""
+    """A patch that hides the scene: convex hull (n, 1, 2) in sixteenths of a pixel, the box of the
+    image that contains it, its grey level, its height (m)."""
 
     hull: NDArray[np.int32]
     box: Box
@@ -69,7 +69,7 @@ class Cover:
 
 
 class Occluders:
-    """Keeps the covers of the newest pose of arm and cup."""
+    """Caches the covers of the newest pose of arm and cup."""
 
     def __init__(self, lens: Lens, cup_radius: float, cup_depth: float) -> None:
         """Radius and depth of the cup (m)."""
@@ -82,8 +82,8 @@ class Occluders:
         self._seen: tuple[bytes, list[Cover]] = (b"", [])
 
     def covers(self, points: Array, radii: Array, pose: Array | None) -> list[Cover]:
-        """What hides something now: capsules of the arm (points (n, 2, 3), radii (n,)), cup at
-        `pose` (4, 4) if not None."""
+        """Return what hides something now: capsules of the arm (points (n, 2, 3), radii (n,)), and
+        the cup at `pose` (4, 4) if not None."""
         key = points.tobytes() + radii.tobytes() + (b"" if pose is None else pose.tobytes())
         if key != self._seen[0]:
             if len(points) != len(radii):
@@ -94,7 +94,7 @@ class Occluders:
     def _arm(
         self, capsules: Sequence[Sequence[Sequence[float]]], radii: Sequence[float]
     ) -> list[Cover]:
-        """The hull of both ends' discs for each capsule in view."""
+        """Return the hull of both end discs of each capsule in view."""
         seen = [
             (disc, 0.5 * (a[2] + b[2]))
             for (a, b), r in zip(capsules, radii, strict=True)
@@ -113,11 +113,11 @@ class Occluders:
     def _discs(
         self, a: Sequence[float], b: Sequence[float], radius: float
     ) -> tuple[Disc, Disc] | None:
-        """Both ends of a capsule, None if it is not in view."""
+        """Return both ends of a capsule, None if it is not in view."""
         lens = self._lens
         (ua, va, near), (ub, vb, far) = lens.pixel(a), lens.pixel(b)
         if near <= 4.0 * radius or far <= 4.0 * radius:
-            return None  # at or behind the lens: out of focus anyway
+            return None  # At or behind the lens: out of focus anyway.
         ra, rb = radius * lens.focal / near, radius * lens.focal / far
         if not self._in_view(
             min(ua - ra, ub - rb),
@@ -129,7 +129,7 @@ class Occluders:
         return (ua, va, ra), (ub, vb, rb)
 
     def _cup(self, pose: Array | None) -> list[Cover]:
-        """The wall as the hull of both rims, then the dark mouth as far as it faces the camera."""
+        """Return the wall as the hull of both rims, then the dark mouth if it faces the camera."""
         if pose is None:
             return []
         lens, mouth = self._lens, pose[:3, 3].tolist()
@@ -151,7 +151,7 @@ class Occluders:
         return covers
 
     def _in_view(self, left: float, top: float, right: float, bottom: float) -> bool:
-        """Whether some of a box (px) is in the image."""
+        """Return whether a part of a box (px) is in the image."""
         return (
             right >= 0.0 and bottom >= 0.0 and left < self._lens.width and top < self._lens.height
         )
@@ -165,8 +165,8 @@ class Occluders:
         height: float,
         cup: bool = False,
     ) -> Cover:
-        """The convex hull of corners (n, 2), in sixteenths of a pixel, in the light of the pixel
-        (u, v)."""
+        """Return the convex hull of corners (n, 2), in sixteenths of a pixel, in the light of the
+        pixel (u, v)."""
         lens = self._lens
         light = lens.illumination[
             min(max(int(v), 0), lens.height - 1), min(max(int(u), 0), lens.width - 1)
@@ -178,7 +178,8 @@ class Occluders:
 
 
 def _within(size: int, low: int, high: int) -> slice:
-    """Whole pixels of an image side of `size` px around a stretch in sixteenths of a pixel."""
+    """Return whole pixels of an image side of `size` px around an interval in sixteenths of a
+    pixel."""
     return slice(
         max((low >> SUBPIXEL_BITS) - _SOFT, 0), min((high >> SUBPIXEL_BITS) + _SOFT + 1, size)
     )

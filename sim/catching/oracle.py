@@ -1,15 +1,15 @@
 """Which balls could be caught at all: an oracle that knows the trajectory at release and moves at
 the joint limits.
 
-A ball is *reachable* when there is a moment of its fall and a pose of the arm, within the joint
-limits, that holds the cup's mouth around the ball, turned to it, clear of the table, and every
-joint gets there from its angle at release, from rest to rest with the greatest joint speed and
-acceleration of the arm file, before the ball does.
+A ball is *reachable* if there is a moment of its fall and a pose of the arm, within the joint
+limits, that holds the cup's mouth around the ball, turned towards it, clear of the table, and if
+every joint gets there from its angle at release before the ball does, from rest to rest with the
+greatest joint speed and acceleration of the arm file.
 
 Poses are found numerically for all moments and tilts at once, independently of the closed form that
-motion uses: Gauss-Newton on five equations (mouth centre, two of its direction: a round cup may
-turn about its axis) for the joint displacement whose greatest travel time is least (iteratively
-reweighted least squares).
+motion uses: Gauss-Newton on five equations (mouth centre, and two of its direction, since a round
+cup may turn about its axis), for the joint displacement whose greatest travel time is least
+(iteratively reweighted least squares).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.sim.catching.ball import BallModel, TableMotion
-from petrobot.sim.catching.puma_model import ArmModel
+from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth, Vector
 
@@ -34,13 +34,13 @@ _WRIST_GUESSES = (0.0, 1.3, -1.3)
 """rad, turns of joint 4 (and back of joint 6) from which poses are searched until the ball is found
 reachable."""
 _NORM = 6.0
-"""Exponent of the norm of travel times that stands for their maximum."""
+"""Exponent of the norm of travel times that approximates their maximum."""
 _PLACE = 1e-3
-"""m and rad; a pose closer than this to what was asked counts as found."""
+"""m and rad within which a pose counts as found."""
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class OracleVerdict:
     """`margin` (s) is how much earlier than the ball the cup can be there, at best; negative: too
     late; -inf: no pose."""
 
@@ -49,24 +49,25 @@ class Verdict:
     pose: Vector | None
     """(6,) rad, the best catching pose found."""
     at: float
-    """s after release, when the ball comes to it."""
+    """s after release at which the ball reaches it."""
 
 
-_NEVER = Verdict(False, -math.inf, None, math.inf)
+_NEVER = OracleVerdict(False, -math.inf, None, math.inf)
 
 
 class Oracle:
-    """Judges throws for one truth. Rules stand in `[oracle]` of the laboratory file."""
+    """Judges throws for one truth. The rules stand in `[oracle]` of the laboratory file."""
 
-    def __init__(self, model: ArmModel, truth: Truth, cell: Mapping[str, Any]) -> None:
+    def __init__(self, model: PumaModel, truth: Truth, cell: Mapping[str, Any]) -> None:
         self._arm = model
         self._truth = truth
         self._ball = BallModel.of(cell["ball"], truth.settings["ball"]["friction"])
         self._rules = truth.settings["oracle"]
         self._rim = truth.cup.radius + float(cell["cup"]["wall"])
 
-    def judge(self, throw: Throw, q: Sequence[float]) -> Verdict:
-        """Verdict on a throw with the arm at encoder angles `q` (six, rad) at release."""
+    def judge(self, throw: Throw, q: Sequence[float]) -> OracleVerdict:
+        """Return the verdict on a throw with the arm at encoder angles `q` (six, rad) at
+        release."""
         motion = TableMotion(self._ball, throw.start, throw.rolling_resistance)
         table = self._truth.table
         leaves = motion.first_crossing(0, table.near_edge)
@@ -90,14 +91,14 @@ class Oracle:
             best = int(np.argmax(margins))
             if margins[best] > verdict.margin:
                 margin, pose = float(margins[best]), poses[best] - self._truth.joint_zero
-                verdict = Verdict(margin >= 0.0, margin, pose, leaves + float(fall[best]))
+                verdict = OracleVerdict(margin >= 0.0, margin, pose, leaves + float(fall[best]))
             if verdict.reachable:
                 break
         return verdict
 
     def _places(self, exit_point: Vector, velocity: Vector) -> tuple[Vector, Vector, Vector]:
-        """Moments of the fall (n,) s, the ball's centre then (n, 3) and directions of the cup's
-        mouth (n, 3)."""
+        """Return moments of the fall (n,) s, the ball's centre then (n, 3), and directions of the
+        cup's mouth (n, 3)."""
         rules, g = self._rules, self._ball.gravity
         fall = np.arange(rules["first"], rules["last"], rules["interval"])
         points = (
@@ -115,7 +116,7 @@ class Oracle:
         return fall[fits], points[fits], axes[fits]
 
     def _clear(self, mouths: Vector, axes: Vector) -> Vector:
-        """Which cups (n,) stand before the table's edge and over the floor."""
+        """Return which cups (n,) stand in front of the table's edge and above the floor."""
         across, upright = (
             self._rim * np.sqrt(np.maximum(0.0, 1.0 - axes[:, k] ** 2)) for k in (0, 2)
         )
@@ -130,9 +131,9 @@ class Oracle:
     def poses(
         self, mouths: Vector, axes: Vector, start: Vector, guess: Vector
     ) -> tuple[Vector, Vector]:
-        """Joint angles (n, 6) that hold the cup's mouth at `mouths` (n, 3), directed to `axes` (n,
-        3), reached soonest from `start` (6,), searched from `guess` (6,) on; and which of them are
-        right (n,). All are within the joint limits."""
+        """Return joint angles (n, 6) that hold the cup's mouth at `mouths` (n, 3), directed to
+        `axes` (n, 3), reached soonest from `start` (6,), searched from `guess` (6,); and which of
+        them are correct (n,). All are within the joint limits."""
         q = np.repeat(np.clip(guess, self._arm.lower, self._arm.upper)[None], len(mouths), axis=0)
         speed2 = self._arm.speed**2
         weight = np.repeat(speed2[None], len(mouths), axis=0)
@@ -146,7 +147,7 @@ class Oracle:
             q = np.clip(
                 q + np.clip(start + away - q, -_STRIDE, _STRIDE), self._arm.lower, self._arm.upper
             )
-            # a joint driven against its limit stays there and leaves the rest to the others
+            # A joint driven against its limit stays there; the others compensate.
             locked |= (q <= self._arm.lower) | (q >= self._arm.upper)
             times = np.abs(q - start) / self._arm.speed
             share = times / times.max(axis=1, keepdims=True).clip(1e-6) + 0.1
@@ -159,8 +160,8 @@ class Oracle:
     def _displacement(
         away: Vector, error: Vector, jacobian: Vector, weight: Vector, locked: Vector
     ) -> Vector:
-        """Displacement from the start (n, 6) of least weighted square that takes `error` away, to
-        first order; locked joints keep theirs."""
+        """Return the displacement from the start (n, 6) with the least weighted square that removes
+        `error`, to first order; locked joints keep theirs."""
         kept = np.where(locked, away, 0.0)
         wanted = np.einsum("nij,nj->ni", jacobian, away - kept) + error
         spread = weight[:, None, :] * jacobian
@@ -173,7 +174,7 @@ class Oracle:
     def _error(
         self, q: Vector, mouths: Vector, axes: Vector, across: Vector
     ) -> tuple[Vector, Vector]:
-        """What is left to the goal (n, 5), and its Jacobian (n, 5, 6); `across` are
+        """Return what is left to the goal (n, 5), and its Jacobian (n, 5, 6); `across` are
         `_two_normals(axes)`."""
         origin, turn, pivots, spins = self._chain(q)
         mouth = origin + turn @ self._truth.cup.mouth
@@ -191,7 +192,8 @@ class Oracle:
         return error, jacobian
 
     def _chain(self, q: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        """Frame 6 (origin (n, 3), rotation (n, 3, 3)) and each joint's pivot and axis (n, 6, 3)."""
+        """Return frame 6 (origin (n, 3), rotation (n, 3, 3)) and each joint's pivot and axis (n, 6,
+        3)."""
         n = len(q)
         origin = np.repeat(np.array([self._arm.base]), n, axis=0)
         x, y, z = (np.repeat(axis[None], n, axis=0) for axis in np.eye(3))
@@ -208,8 +210,8 @@ class Oracle:
         return origin, np.stack([x, y, z], axis=-1), pivots, spins
 
     def travel_time(self, way: Vector) -> Vector:
-        """Seconds (...,) for joint displacements (..., 6) rad from rest to rest, the slowest joint
-        deciding."""
+        """Return the seconds (...,) for joint displacements (..., 6) rad from rest to rest; the
+        slowest joint decides."""
         way, v, a = np.abs(way), self._arm.speed * self._truth.arm_speed, self._arm.acceleration
         ramps = v * v / a
         times = np.where(way < ramps, 2.0 * np.sqrt(way / a), way / v + v / a)
@@ -218,7 +220,7 @@ class Oracle:
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    """Vector products (..., 3) of vectors (..., 3): what numpy's own gives, in a third of its time
+    """Return vector products (..., 3) of vectors (..., 3): the same as numpy's, three times faster
     for so few."""
     product = np.empty(np.broadcast_shapes(a.shape, b.shape))
     for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
@@ -227,7 +229,8 @@ def _cross(a: Vector, b: Vector) -> Vector:
 
 
 def _two_normals(axes: Vector) -> Vector:
-    """Two unit vectors (n, 2, 3) at right angles to each of `axes` (n, 3) and to one another."""
+    """Return two unit vectors (n, 2, 3) perpendicular to each of `axes` (n, 3) and to each
+    other."""
     aside = np.where(np.abs(axes[:, 1:2]) < 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     first = np.cross(axes, aside)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

@@ -1,8 +1,9 @@
 """The arm as a body that torques move: rigid-body dynamics, rotors, friction, brakes, hard stops.
 
-Mass matrix and bias torques come from PyBullet on the published values; rotor inertia (up to 2.3 kg
-m^2 at the joint, more than most links) is added here, as URDF has no place for it. Integration is
-semi-implicit Euler. An arm that stands still, held by friction or brakes, costs next to nothing.
+Mass matrix and bias torques come from PyBullet with the published values; rotor inertia (up to 2.3
+kg m^2 at the joint, more than most links) is added here, since URDF cannot express it. The
+integration is semi-implicit Euler. An arm that stands still, held by friction or brakes, costs
+almost nothing.
 """
 
 from __future__ import annotations
@@ -25,21 +26,23 @@ from petrobot.sim.catching.arm_motion import (
     stepped,
     stepped_packed,
 )
-from petrobot.sim.catching.puma_model import JOINTS, ArmModel, Link
+from petrobot.sim.catching.puma_model import JOINTS, PrincipalInertia, PumaModel
 from petrobot.sim.catching.truth import Vector
 
-# Writes the arm as URDF, so that PyBullet computes its mass matrix and its gravity, Coriolis and centrifugal torques.
+# The arm as URDF: PyBullet computes its mass matrix and its gravity, Coriolis and centrifugal
+# torques from it.
 
 _LEAST_MASS = 1e-9
 _ZERO = (0.0, 0.0, 0.0)
 
 
-def urdf(model: ArmModel, flange_load: Link | None = None) -> str:
-    """The arm as URDF text: links base, link1 to link6; `flange_load`: what is bolted to link 6, in
-    frame 6."""
+def urdf(model: PumaModel, flange_load: PrincipalInertia | None = None) -> str:
+    """Return the arm as URDF text: links base, link1 to link6; `flange_load`: what is bolted to
+    link 6, in frame 6."""
+    base = _inertial_text(PrincipalInertia(0.0, _ZERO, _ZERO), _ZERO, 0.0)
     parts = [
         '<robot name="arm">',
-        f'<link name="base">{_inertial_text(Link(0.0, _ZERO, _ZERO), _ZERO, 0.0)}</link>',
+        f'<link name="base">{base}</link>',
     ]
     for i, link in enumerate(model.links):
         x, y, z = model.base if i == 0 else (model.a[i - 1], 0.0, model.d[i - 1])
@@ -65,9 +68,9 @@ def urdf(model: ArmModel, flange_load: Link | None = None) -> str:
     return "\n".join(parts)
 
 
-def _inertial(model: ArmModel, i: int, link: Link) -> str:
-    """The link's inertial element: its centre moved from DH frame i + 1 to the URDF link frame,
-    turned by the twist."""
+def _inertial(model: PumaModel, i: int, link: PrincipalInertia) -> str:
+    """Return the link's inertial element: its centre moved from DH frame i + 1 to the URDF link
+    frame, turned by the twist."""
     c, s = model.twists[i]
     x, y, z = link.centre
     return _inertial_text(
@@ -75,7 +78,7 @@ def _inertial(model: ArmModel, i: int, link: Link) -> str:
     )
 
 
-def _inertial_text(link: Link, centre: tuple[float, float, float], roll: float) -> str:
+def _inertial_text(link: PrincipalInertia, centre: tuple[float, float, float], roll: float) -> str:
     ixx, iyy, izz = _physical(link.inertia)
     x, y, z = centre
     return (
@@ -86,18 +89,18 @@ def _inertial_text(link: Link, centre: tuple[float, float, float], roll: float) 
 
 
 def _physical(inertia: tuple[float, float, float]) -> tuple[float, float, float]:
-    """The tensor with its lesser moments raised as little as makes it one of a real body; the
-    greatest is kept.
+    """Return the tensor with its lesser moments raised just enough to belong to a real body
+    (triangle inequality of principal moments); the greatest is kept.
 
     Where a lesser moment was left out because the link never turns about that axis (link 1),
-    raising it changes nothing; for link 3 it is 0.004 of 0.086 kg m^2, less than what the
-    publications differ by.
+    raising it changes nothing. For link 3 it is 0.004 of 0.086 kg m^2, less than the publications
+    differ.
     """
     order = sorted(range(3), key=lambda k: inertia[k])
     lack = inertia[order[2]] - inertia[order[0]] - inertia[order[1]]
     if lack <= 0.0:
         return inertia
-    # a little above equality: Bullet compares in rounded arithmetic
+    # A little above equality: Bullet compares in rounded arithmetic.
     share = 0.5 * lack * (1.0 + 1e-9) + 1e-12
     mended = list(inertia)
     mended[order[0]] += share
@@ -106,12 +109,12 @@ def _physical(inertia: tuple[float, float, float]) -> tuple[float, float, float]
 
 
 _REFRESH = (0.01, 0.01, 0.1, 0.1)
-"""rad, of joints 2 to 5; the mass matrix is computed anew when a joint has moved so far: it
-changes by less than 1 % meanwhile. It does not depend on joint 1, and on the wrist only by its
-light links."""
+"""rad, of joints 2 to 5; the mass matrix is computed again when a joint has moved so far, which
+changes it by less than 1 %. It does not depend on joint 1, and on the wrist only through light
+links."""
 _STICTION = 1.05
-"""Dry friction of a joint at rest as a multiple of that of a moving one: where sliding dies down,
-the joint sticks."""
+"""Dry friction of a joint at rest as a multiple of that of a moving joint: the joint sticks where
+sliding fades."""
 _REST: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 _BRAKE = 2.0
 """Torque of a joint's brake as a multiple of the motor's."""
@@ -121,7 +124,9 @@ class RigidBody:
     """Mass matrix and bias torques of the arm by PyBullet, without rotors and friction; a physics
     client of its own."""
 
-    def __init__(self, model: ArmModel, gravity: float, flange_load: Link | None = None) -> None:
+    def __init__(
+        self, model: PumaModel, gravity: float, flange_load: PrincipalInertia | None = None
+    ) -> None:
         self._client = pybullet.connect(pybullet.DIRECT)
         pybullet.setGravity(0.0, 0.0, -gravity, physicsClientId=self._client)
         with tempfile.TemporaryDirectory() as folder:
@@ -136,20 +141,21 @@ class RigidBody:
         self._zero = [0.0] * JOINTS
 
     def mass_matrix(self, q: Sequence[float]) -> Vector:
-        """(6, 6) kg m^2."""
+        """Return the mass matrix (6, 6) kg m^2."""
         return np.array(
             pybullet.calculateMassMatrix(self._body, list(q), physicsClientId=self._client)
         )
 
     def bias(self, q: Sequence[float], qd: Sequence[float]) -> Six:
-        """Six torques (N m) that hold the arm against gravity, Coriolis and centrifugal forces."""
+        """Return six torques (N m) that hold the arm against gravity, Coriolis and centrifugal
+        forces."""
         torques: Six = pybullet.calculateInverseDynamics(
             self._body, q, qd, self._zero, physicsClientId=self._client
         )
         return torques
 
     def link_frame(self, q: Sequence[float], link: int) -> tuple[Vector, Vector]:
-        """Origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for
+        """Return origin (3,) and rotation (3, 3) of a URDF link (0 to 5) as PyBullet places it; for
         checks."""
         for joint, angle in enumerate(q):
             pybullet.resetJointState(self._body, joint, angle, physicsClientId=self._client)
@@ -161,27 +167,27 @@ class RigidBody:
         )
 
     def close(self) -> None:
-        """End the physics client."""
+        """Disconnect the physics client."""
         if self._client >= 0:
             pybullet.disconnect(physicsClientId=self._client)
             self._client = -1
 
 
 class ArmPlant:
-    """The arm as its drives feel it: six torques in, six positions and speeds out.
+    """The arm as its drives see it: six torques in, six positions and speeds out.
 
-    `q` (rad) and `qd` (rad/s) are as the encoders show them. Drives put torques (N m at the joint)
-    into `tau` and engage or release brakes; `step` moves the arm on. Plain floats, as six numbers
-    are too few for an array to pay (11 us a step against 30).
+    `q` (rad) and `qd` (rad/s) are what the encoders show. Drives write torques (N m at the joint)
+    to `tau` and engage or release brakes; `step` moves the arm. Plain floats, since six numbers are
+    too few for an array to be faster (11 us a step against 30).
     """
 
     def __init__(
         self,
-        model: ArmModel,
+        model: PumaModel,
         gravity: float,
         start: Sequence[float],
         speed_factor: float = 1.0,
-        load: Link | None = None,
+        load: PrincipalInertia | None = None,
     ) -> None:
         """`speed_factor`: share of its joint speeds that the arm reaches (a slow arm); `load`: what
         the flange carries."""
@@ -202,8 +208,8 @@ class ArmPlant:
         self._hold = self._stick = _REST
         self._greatest = _six(model.speed)
         self._packs = hasattr(stepped_packed, "py_func")
-        """Whether kernels are compiled: then they are handed what seldom changes packed, else as it
-        stands."""
+        """Whether kernels are compiled: then they receive what seldom changes in packed form, else
+        as tuples."""
         for joint in range(JOINTS):
             self.brake(joint)
         self._friction = _REST
@@ -213,7 +219,7 @@ class ArmPlant:
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Kernels are compiled, or read from where they are kept, now and not when the arm first
+        """Compile the kernels, or load them from the cache, now and not when the arm first
         moves."""
         self._held(_REST)
         self._stepped(0.001, _REST, self._bias)
@@ -224,7 +230,7 @@ class ArmPlant:
         return tuple(self._braked)
 
     def brake(self, joint: int) -> None:
-        """Engage the brake of a joint (0 to 5) and take its torque away."""
+        """Engage the brake of a joint (0 to 5) and switch its torque off."""
         self.tau[joint] = 0.0
         self._braked[joint] = True
         hold = self._dry[joint] + _BRAKE * self._limit[joint]
@@ -239,14 +245,14 @@ class ArmPlant:
         self._pack()
 
     def slow_down(self, factor: float) -> None:
-        """From now on the joints reach this share (0 to 1] of their greatest speeds."""
+        """Limit the joints to this share (0 to 1] of their greatest speeds from now on."""
         if not 0.0 < factor <= 1.0:
-            raise ValueError(f"speed factor {factor}: must be above 0 and at most 1")
+            raise ValueError(f"speed factor: expected a number above 0 and at most 1, got {factor}")
         self._greatest = _six(self.model.speed * factor)
         self._pack()
 
     def _pack(self) -> None:
-        """The numbers that compiled kernels read have changed."""
+        """Pack the numbers that compiled kernels read, after one has changed."""
         if self._packs:
             groups = (
                 self._limit,
@@ -259,7 +265,7 @@ class ArmPlant:
             self._numbers = packed(stepped_packed, [number for group in groups for number in group])
 
     def step(self, dt: float, tau: Sequence[float] | None = None) -> None:
-        """Move on by `dt` (s) under torques `tau` (six, N m), those in `self.tau` if None."""
+        """Advance by `dt` (s) under torques `tau` (six, N m), those in `self.tau` if None."""
         if tau is not None:
             self.tau[:] = tau
         a, b, c, d, e, f = self.tau
@@ -273,13 +279,14 @@ class ArmPlant:
         self.q, self.qd, self._friction, self.still = self._stepped(dt, asked, bias)
 
     def _held(self, asked: Six) -> bool:
-        """Whether friction and brakes hold the standing arm under these torques."""
+        """Return whether friction and brakes hold the standing arm under these torques."""
         if self._packs:
             return held_packed(asked, self.qd, self._bias, self._numbers)
         return held(motors(asked, self._limit, self.qd, self._greatest), self._bias, self._stick)
 
     def _stepped(self, dt: float, asked: Six, bias: Six) -> tuple[Six, Six, Six, bool]:
-        """Angles, speeds and dry friction after `dt`, and whether the arm then stands still."""
+        """Return angles, speeds and dry friction after `dt`, and whether the arm then stands
+        still."""
         if self._packs:
             return stepped_packed(
                 dt, self.q, self.qd, asked, bias, self._friction, self._rows, self._numbers
@@ -301,7 +308,7 @@ class ArmPlant:
         )
 
     def _near(self, q: Six) -> bool:
-        """Whether the mass matrix is still good enough."""
+        """Return whether the mass matrix is still accurate enough."""
         _, a, b, c, d, _ = self._at
         u, v, w, x = _REFRESH
         return -u < q[1] - a < u and -v < q[2] - b < v and -w < q[3] - c < w and -x < q[4] - d < x
@@ -316,7 +323,7 @@ class ArmPlant:
         self._at = self.q
 
     def close(self) -> None:
-        """End the physics client."""
+        """Disconnect the physics client."""
         self._body.close()
 
 

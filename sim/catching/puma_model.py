@@ -30,11 +30,11 @@ class Frame3(NamedTuple):
     origin: tuple[float, float, float]
 
     def rotation(self) -> Vector:
-        """(3, 3), columns are the axes."""
+        """Return the rotation (3, 3); its columns are the axes."""
         return np.array((self.x, self.y, self.z)).T
 
     def point(self, p: tuple[float, float, float]) -> tuple[float, float, float]:
-        """A point given in this frame, in the base frame."""
+        """Return a point given in this frame in the base frame."""
         a, b, c = p
         x, y, z, o = self
         return (
@@ -44,7 +44,7 @@ class Frame3(NamedTuple):
         )
 
     def local(self, p: tuple[float, float, float]) -> tuple[float, float, float]:
-        """A point given in the base frame, in this frame."""
+        """Return a point given in the base frame in this frame."""
         x, y, z, o = self
         a, b, c = p[0] - o[0], p[1] - o[1], p[2] - o[2]
         return (
@@ -55,7 +55,7 @@ class Frame3(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class PrincipalInertia:
     """Mass (kg), centre of mass (m) and principal inertia about it (kg m^2) in the link's own DH
     frame."""
 
@@ -65,16 +65,16 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class ArmModel:
-    """One entry a joint, base to flange. `rotor`, `viscous`, `coulomb` are seen at the joint (kg
-    m^2, N m s/rad, N m)."""
+class PumaModel:
+    """One entry per joint, base to flange. `rotor`, `viscous`, `coulomb` are converted to the joint
+    (kg m^2, N m s/rad, N m)."""
 
     base: tuple[float, float, float]
     d: tuple[float, ...]
     a: tuple[float, ...]
     alpha: tuple[float, ...]
     twists: tuple[tuple[float, float], ...]
-    """Cosine and sine of each alpha, those of right angles exact."""
+    """Cosine and sine of each alpha, exact for right angles."""
     lower: Vector
     upper: Vector
     speed: Vector
@@ -83,20 +83,21 @@ class ArmModel:
     rotor: Vector
     viscous: Vector
     coulomb: Vector
-    links: tuple[Link, ...]
+    links: tuple[PrincipalInertia, ...]
     flange: float
     radii: Mapping[str, float]
-    """m, of the capsules that stand for the arm's solid parts: base, upper_arm, forearm, wrist."""
+    """m, of the capsules that stand for the solid parts of the arm: base, upper_arm, forearm,
+    wrist."""
     poses: Mapping[str, Vector]
 
     def frames(self, q: Sequence[float]) -> tuple[Frame3, ...]:
-        """Frames 0 to 6 at joint angles `q` (six, rad)."""
+        """Return frames 0 to 6 at joint angles `q` (six, rad)."""
         frames = [Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), self.base)]
         self._chain(q, frames)
         return tuple(frames)
 
     def _chain(self, q: Sequence[float], frames: list[Frame3] | None) -> Frame3:
-        """Frame 6, and all on the way to it appended to `frames` if one asks for them. Plain
+        """Return frame 6, and append all frames on the way to `frames` if it is given. Plain
         floats: 8 us a pose."""
         xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
         ox, oy, oz = self.base
@@ -112,14 +113,14 @@ class ArmModel:
         return Frame3((xx, xy, xz), (yx, yy, yz), (zx, zy, zz), (ox, oy, oz))
 
     def flange_frame(self, q: Sequence[float]) -> Frame3:
-        """Frame 6 at joint angles `q` (six, rad)."""
+        """Return frame 6 at joint angles `q` (six, rad)."""
         return self._chain(q, None)
 
     def solid_parts(
         self, q: Sequence[float], cup_bottom: tuple[float, float, float]
     ) -> tuple[Vector, Vector]:
-        """Capsules of the arm: end points (6, 2, 3) in the base frame and radii (6,), m; the last
-        holds the cup."""
+        """Return the capsules of the arm: end points (6, 2, 3) in the base frame and radii (6,), m;
+        the last one holds the cup."""
         frames = self.frames(q)
         shoulder, elbow, wrist = frames[1].origin, frames[2].origin, frames[4].origin
         beside = frames[2].point((0.0, 0.0, self.d[2]))
@@ -138,16 +139,16 @@ class ArmModel:
         )
 
 
-def read_arm(path: Path) -> ArmModel:
-    """The arm of a file like services/motion/puma560.toml. Raises LaboratoryError naming file, key
-    and remedy."""
+def read_arm(path: Path) -> PumaModel:
+    """Read the arm of a file like services/motion/puma560.toml. Raises LaboratoryError naming file,
+    key and remedy."""
     table = read_toml(path)
     try:
         joints, links = table["joint"], table["link"]
         if len(joints) != JOINTS or len(links) != JOINTS:
             raise LaboratoryError(
-                f"{path}: {len(joints)} [[joint]] and {len(links)} [[link]]; there must be "
-                f"{JOINTS} of each"
+                f"{path}: expected {JOINTS} tables [[joint]] and [[link]] each, got {len(joints)} "
+                f"and {len(links)}"
             )
         return _model(table, joints, links)
     except KeyError as fault:
@@ -162,14 +163,14 @@ def read_arm(path: Path) -> ArmModel:
 
 def _model(
     table: Mapping[str, Any], joints: list[dict[str, Any]], links: list[dict[str, Any]]
-) -> ArmModel:
+) -> PumaModel:
     def column(key: str) -> Vector:
         return np.array([float(joint[key]) for joint in joints])
 
     gear = column("gear")
     limits = np.array([joint["limits"] for joint in joints], dtype=float) * _DEGREE
     x, y, z = table["frame"]["base"]
-    return ArmModel(
+    return PumaModel(
         base=(float(x), float(y), float(z)),
         d=tuple(column("d").tolist()),
         a=tuple(column("a").tolist()),
@@ -186,7 +187,10 @@ def _model(
         rotor=gear**2 * column("rotor_inertia"),
         viscous=gear**2 * column("viscous"),
         coulomb=gear * column("coulomb"),
-        links=tuple(Link(float(n["mass"]), tuple(n["centre"]), tuple(n["inertia"])) for n in links),
+        links=tuple(
+            PrincipalInertia(float(n["mass"]), tuple(n["centre"]), tuple(n["inertia"]))
+            for n in links
+        ),
         flange=float(table["frame"]["flange"]),
         radii={key: float(value) for key, value in table["body"].items()},
         poses={

@@ -1,5 +1,5 @@
-"""Keeps the score: what was thrown, what could have been caught, what was, and how far off the rest
-went by."""
+"""Keeps the score: what was thrown, what could have been caught, what was caught, and how far off
+the others passed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from petrobot.sim.catching.course import Course, Outcome
-from petrobot.sim.catching.oracle import Oracle, Verdict
+from petrobot.sim.catching.course import ThrowCourse, ThrowOutcome
+from petrobot.sim.catching.oracle import Oracle, OracleVerdict
 
 PLOTS: Final = {
     "catch_map": {
@@ -47,13 +47,13 @@ PLOTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    course: Course
-    verdict: Verdict
+    course: ThrowCourse
+    verdict: OracleVerdict
 
 
-class Referee:
-    """Writes down each throw from its release on. `began` is the simulated time (s) from which
-    releases are counted."""
+class CatchReferee:
+    """Records each throw from its release on. `began` is the simulated time (s) from which releases
+    are counted."""
 
     def __init__(self, seed: int, regime: str, oracle: Oracle, began: float) -> None:
         self._seed = seed
@@ -62,28 +62,28 @@ class Referee:
         self._began = began
         self._entries: list[_Entry] = []
 
-    def enter(self, course: Course, q: Sequence[float]) -> Verdict:
-        """A ball was released with the arm's encoders at `q` (six, rad); its `course` is read again
-        for the score."""
+    def enter(self, course: ThrowCourse, q: Sequence[float]) -> OracleVerdict:
+        """Record a ball that was released with the arm's encoders at `q` (six, rad); its `course`
+        is read again for the score."""
         verdict = self._oracle.judge(course.throw, q)
         self._entries.append(_Entry(course, verdict))
         return verdict
 
     @property
-    def last(self) -> Verdict | None:
+    def last(self) -> OracleVerdict | None:
         """Verdict on the newest throw."""
         return self._entries[-1].verdict if self._entries else None
 
     def score(self, now: float, cycles: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
-        """All throws so far in plain data: `throws` (see `_row`) and, for those who look closer,
-        `courses` (see `_course`); counts are of throws that are over.
+        """Return all throws so far as plain data: `throws` (see `_row`) and, with more detail,
+        `courses` (see `_course`); counts are of finished throws.
 
         `cycles` are the caller's cycles: `begun_ago`, `ended_ago` (s before `now`), `status` and
         `cause`. A throw takes the status of the cycle in which it was released, None if it was
         released in none.
         """
         rows = [_row(entry) | _status(entry.course, now, cycles) for entry in self._entries]
-        over = [row for row in rows if row["outcome"] != Outcome.ROLLING]
+        over = [row for row in rows if row["outcome"] != ThrowOutcome.ROLLING]
         return {
             "seed": self._seed,
             "regime": self._regime,
@@ -100,7 +100,7 @@ class Referee:
         }
 
 
-def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _status(course: ThrowCourse, now: float, cycles: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     age = now - course.released_at
     for cycle in cycles:
         if cycle["begun_ago"] >= age >= cycle["ended_ago"]:
@@ -113,13 +113,13 @@ def _status(course: Course, now: float, cycles: Sequence[Mapping[str, Any]]) -> 
 
 
 def _row(entry: _Entry) -> dict[str, Any]:
-    """One throw: its speed at release (m/s), what became of it, how far from the middle of the
+    """Return one throw: its speed at release (m/s), its outcome, how far from the middle of the
     mouth it came (mm)."""
     course, verdict = entry.course, entry.verdict
     return {
         "n": course.throw.n,
         "speed": course.throw.speed,
-        "caught": course.outcome is Outcome.CAUGHT,
+        "caught": course.outcome is ThrowOutcome.CAUGHT,
         "outcome": str(course.outcome),
         "miss_mm": _finite(1000.0 * course.miss),
         "reachable": verdict.reachable,
@@ -127,8 +127,8 @@ def _row(entry: _Entry) -> dict[str, Any]:
 
 
 def _course(entry: _Entry, began: float, run: int | None) -> dict[str, Any]:
-    """How one throw went, in m, m/s and s; durations count from its release, None: it did not
-    happen."""
+    """Return the details of one throw in m, m/s and s; durations count from its release, None: it
+    did not happen."""
     course, exit_state = entry.course, entry.course.exit_state
     return {
         "n": course.throw.n,

@@ -1,8 +1,8 @@
-"""What stands still before the simulated camera: floor, table with its lines and marks, and the
+"""The static scene in front of the simulated camera: floor, table with its lines and marks, and the
 calibration board.
 
-Surfaces are planes with a grey level under even light; `sim/catching/camera.py` adds light, lens and noise.
-Lengths in m.
+Surfaces are planes with a grey level under even light; sim/catching/camera.py adds light, lens and
+noise. Lengths in m.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ TILE = 0.40
 JOINT = 0.008
 MARK_RADIUS = 0.018
 STRIPE = 8
-"""Rows of an image that are worked out at a time."""
+"""Rows of an image that are computed at a time."""
 MARKS = ((0.25, 0.22), (0.25, -0.30), (0.80, 0.36), (0.80, -0.20), (1.30, 0.28), (1.30, -0.36))
-"""Round stickers on the table, as large as a ball: (m from the near edge, y); they tempt a detector
-that looks for circles."""
+"""Round stickers on the table, as large as a ball: (m from the near edge, y); they deceive a
+detector that looks for circles."""
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class TableArea:
     """The table of the cell: height of its top, x of the near edge, length along x, width along y
     (m)."""
 
@@ -49,8 +49,8 @@ class Table:
     @classmethod
     def of(
         cls, cell: Mapping[str, Any], top: float | None = None, near_edge: float | None = None
-    ) -> Table:
-        """Read from the cell's `[table]`; `top` and `near_edge` (m) replace the nominal ones."""
+    ) -> TableArea:
+        """Read the cell's `[table]`; `top` and `near_edge` (m) replace the nominal ones."""
         table = cell["table"]
         return cls(
             float(table["top"] if top is None else top),
@@ -60,7 +60,7 @@ class Table:
         )
 
     def contains(self, x: Array, y: Array) -> NDArray[np.bool_]:
-        """Where points of the table's plane lie on the table."""
+        """Return which points of the table's plane lie on the table."""
         inside: NDArray[np.bool_] = (
             (x >= self.near_edge)
             & (x <= self.near_edge + self.length)
@@ -69,7 +69,7 @@ class Table:
         return inside
 
     def grey(self, x: Array, y: Array) -> Array:
-        """Grey level of the table top under even light at points (m, base frame)."""
+        """Return the grey level of the table top under even light at points (m, base frame)."""
         along = x - self.near_edge
         grain = 3.0 * np.sin(23.0 * along + 2.0 * np.sin(3.0 * y)) * np.sin(140.0 * y)
         grey = TABLE_GREY + grain
@@ -81,7 +81,7 @@ class Table:
 
 
 def floor_grey(x: Array, y: Array) -> Array:
-    """Grey level of the tiled floor at points (m, base frame)."""
+    """Return the grey level of the tiled floor at points (m, base frame)."""
     joint = (np.mod(x, TILE) < JOINT) | (np.mod(y, TILE) < JOINT)
     tiles = FLOOR_GREY + 5.0 * np.mod(np.floor(x / TILE) + 2.0 * np.floor(y / TILE), 3.0)
     return np.where(joint, FLOOR_JOINT_GREY, tiles)
@@ -102,19 +102,19 @@ class Chessboard:
     square: float = 0.060
 
     def grey(self, points: Array) -> Array:
-        """Grey level at points (..., 3) of the board's plane, board frame."""
+        """Return the grey level at points (..., 3) of the board's plane, board frame."""
         i, j = np.floor(points[..., 0] / self.square), np.floor(points[..., 1] / self.square)
         printed = (i >= -1) & (i < self.columns) & (j >= -1) & (j < self.rows)
         return np.where(printed & (np.mod(i + j, 2.0) == 0), 25.0, 205.0)
 
     def covers(self, points: Array) -> NDArray[np.bool_]:
-        """Where points (..., 3) of the board's plane lie on the board."""
+        """Return which points (..., 3) of the board's plane lie on the board."""
         i, j = np.floor(points[..., 0] / self.square), np.floor(points[..., 1] / self.square)
         covered: NDArray[np.bool_] = (i >= -2) & (i <= self.columns) & (j >= -2) & (j <= self.rows)
         return covered
 
     def outline(self) -> Array:
-        """The board's four outer corners (4, 3), board frame."""
+        """Return the board's four outer corners (4, 3), board frame."""
         near, right, far = (
             -2 * self.square,
             (self.columns + 1) * self.square,
@@ -126,7 +126,7 @@ class Chessboard:
 
 
 def stripes(rows: int) -> Iterator[slice]:
-    """An image's rows, a few at a time: what is worked out of so many pixels fits into a core's
+    """Return an image's rows, a few at a time: the data of so many pixels fits into a core's
     cache."""
     return (slice(first, first + STRIPE) for first in range(0, rows, STRIPE))
 
@@ -134,8 +134,8 @@ def stripes(rows: int) -> Iterator[slice]:
 def supersampled(
     pixels: NDArray[np.float64], grey_at: Callable[[NDArray[np.float64]], Array], samples: int
 ) -> Array:
-    """Mean grey level of each pixel from `samples` x `samples` points inside it; `pixels` (..., 2),
-    result (...)."""
+    """Return the mean grey level of each pixel from `samples` x `samples` points inside it;
+    `pixels` (..., 2), result (...)."""
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     offsets = [np.array([du, dv]) for dv in steps for du in steps]
     mean: Array = np.empty(pixels.shape[:-1])

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 @dataclass(frozen=True, slots=True)
 class DriveRating:
     """What a drive was sized and commissioned for, at the joint: torque (N m), speed (rad/s),
-    inertia it expects (kg m^2)."""
+    expected inertia (kg m^2)."""
 
     torque: float
     speed: float
@@ -20,25 +20,28 @@ class DriveRating:
 POSITION_GAIN = 45.0
 """1/s, of the position loop."""
 VELOCITY_GAIN = 180.0
-"""1/s, of the velocity loop; with the inertia it gives a torque."""
+"""1/s, of the velocity loop; multiplied by the inertia it gives a torque."""
 INTEGRAL_GAIN = 40.0
-"""1/s, of the velocity loop's integrator: carries gravity and friction, as drives without a model
-of the arm must."""
+"""1/s, of the velocity loop's integrator: it carries gravity and friction, as in drives without a
+model of the arm."""
 CYCLE = 0.001
-"""s, of the loop inside the drive: it compares the angle with where the joint is to be at the
-cycle's end, however long the steps are in which the plant is computed. So steps of 2 ms lead to the
-same path as those of 1 ms, to 0.2 mm at the cup (tests/sim/test_puma.py)."""
-DEAD_BAND = 1e-4
-"""rad; while the set point stands and the error is smaller, the integrator keeps its value, as
-commercial drives do so that integrator and dry friction do not hunt for ever.
+"""s, cycle of the loop inside the drive.
 
-This project's choice, small beside the 0.5 degrees in which the arm counts as being at home; no
-data sheet says it.
+The loop compares the angle with where the joint is to be at the end of its cycle, whatever the step
+size of the plant. So steps of 2 ms lead to the same path as steps of 1 ms, to 0.2 mm at the cup
+(tests/sim/test_puma.py).
+"""
+DEAD_BAND = 1e-4
+"""rad; while the set point is constant and the error is smaller, the integrator keeps its value, as
+in commercial drives, so that integrator and dry friction do not oscillate.
+
+This project's choice, small compared with the 0.5 degrees within which the arm counts as being at
+home; no data sheet states it.
 """
 
 
 class JointServo:
-    """Torque for one joint from set points that come once a period.
+    """Torque for one joint from set points that arrive once per period.
 
     Between set points the reference is a uniform quadratic B-spline of the last three: continuous
     in velocity, exact at rest, one and a half periods behind. Torque = J (a + Kv (v + Kp e - qd)) +
@@ -63,8 +66,8 @@ class JointServo:
         self.error = 0.0
 
     def aim(self, target: float) -> None:
-        """Take the next set point (rad); one that asks for more than the greatest speed is cut and
-        marks `limited`."""
+        """Take the next set point (rad); one that requires more than the greatest speed is cut and
+        sets `limited`."""
         if self._ramp is not None:
             return
         _, before, last = self._points
@@ -85,7 +88,7 @@ class JointServo:
 
     @property
     def ramped_down(self) -> bool:
-        """Whether a ramp has come to its end."""
+        """Whether a ramp has ended."""
         return self._ramp is not None and self.velocity == 0.0
 
     def follow(self, target: float) -> None:
@@ -95,7 +98,7 @@ class JointServo:
         self.aim(target)
 
     def torque(self, q: float, qd: float, dt: float) -> float:
-        """Torque (N m) for the next `dt` seconds from the measured angle and speed."""
+        """Return the torque (N m) for the next `dt` seconds from the measured angle and speed."""
         if self._ramp is not None:
             self._decelerate(dt)
         elif not self.standing:
@@ -117,7 +120,7 @@ class JointServo:
         return self.standing and -DEAD_BAND < self.error < DEAD_BAND
 
     def _pass(self, a: float, b: float, c: float) -> None:
-        """Interpolate from here on between these set points."""
+        """Interpolate between these set points from now on."""
         self._points = a, b, c
         self.standing = a == b == c
         self.reference = self._from = 0.5 * (a + b)
@@ -126,7 +129,8 @@ class JointServo:
 
     def _interpolate(self, dt: float) -> None:
         since = self._since + dt
-        if since > self.period + 1e-9:  # a SYNC is missing: as if the last set point had come again
+        # A SYNC is missing: as if the last set point had come again.
+        if since > self.period + 1e-9:
             _, b, c = self._points
             self._pass(b, c, c)
             since -= self.period

@@ -1,5 +1,5 @@
 """One laboratory site: the nominal cell, the arm and the drives' ratings, read from the files that
-services.toml names."""
+services.toml names; and where the cup is for the arm's joint angles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from petrobot.services.comm.location_file import Directory
 from petrobot.services.host.numba_kernels import kernel, packed
 from petrobot.sim.catching.arm_motion import Six
 from petrobot.sim.catching.drives import ratings
-from petrobot.sim.catching.puma_model import ArmModel, Frame3, Link, read_arm
+from petrobot.sim.catching.puma_model import Frame3, PrincipalInertia, PumaModel, read_arm
 from petrobot.sim.catching.servo import DriveRating
 from petrobot.sim.catching.truth import (
     LABORATORY_FILE,
@@ -23,17 +23,17 @@ from petrobot.sim.catching.truth import (
     read_truth,
 )
 
-# Where the cup is for the arm's joint angles, as pure numbers: a kernel of sim/catching/site.py.
+# Where the cup is for the arm's joint angles, as pure numbers.
 
 
 @kernel
 def carried(q: Six, numbers: Sequence[float]) -> tuple[Triple, Triple, Triple, Triple]:
-    """Axes x, y, z and origin (m, base frame) of a frame mounted on the flange, at encoder angles
-    `q` (rad).
+    """Return axes x, y, z and origin (m, base frame) of a frame mounted on the flange, at encoder
+    angles `q` (rad).
 
-    `numbers` (see `numbers_of`): five a joint (zero of its encoder in rad, d and a in m, cosine and
-    sine of alpha), the base (m), then the frame's axes and origin in the flange's frame. The same
-    sums in the same order as `ArmModel.flange_frame` and `Frame3.point`, which say what they mean.
+    `numbers` (see `numbers_of`): five per joint (zero of its encoder in rad, d and a in m, cosine
+    and sine of alpha), the base (m), then the frame's axes and origin in the flange's frame. The
+    same sums in the same order as `PumaModel.flange_frame` and `Frame3.point`, which explain them.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
     ox, oy, oz = numbers[30], numbers[31], numbers[32]
@@ -80,10 +80,10 @@ def carried(q: Six, numbers: Sequence[float]) -> tuple[Triple, Triple, Triple, T
 
 
 def numbers_of(
-    arm: ArmModel, zero: Sequence[float], axes: Sequence[Triple], origin: Triple
+    arm: PumaModel, zero: Sequence[float], axes: Sequence[Triple], origin: Triple
 ) -> Sequence[float]:
-    """What `carried` reads: an arm with encoders that show `zero` (six, rad) too little, and a
-    frame mounted on its flange."""
+    """Return the argument of `carried`: an arm with encoders that show `zero` (six, rad) too
+    little, and a frame mounted on its flange."""
     joints = zip(zero, arm.d, arm.a, arm.twists, strict=True)
     each = [
         number for angle, d, a, (cosine, sine) in joints for number in (angle, d, a, cosine, sine)
@@ -95,22 +95,22 @@ def numbers_of(
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What the laboratory stands on. `laboratory` is the file of errors, regimes and
+    """The nominal data of the laboratory. `laboratory` is the file of errors, regimes and
     disturbances."""
 
     cell: Mapping[str, Any]
-    arm: ArmModel
+    arm: PumaModel
     drives: tuple[DriveRating, ...]
     laboratory: Path = LABORATORY_FILE
 
     def truth(self, regime: str) -> Truth:
-        """The truth in a regime. Raises LaboratoryError for a name that means nothing."""
+        """Return the truth in a regime. Raises LaboratoryError for an unknown name."""
         return read_truth(self.cell, regime, self.laboratory)
 
 
 def read_site(cell_file: Path, laboratory: Path = LABORATORY_FILE) -> Site:
-    """Read the site from a file like services/cell.toml; the arm's file is named there, relative to
-    it."""
+    """Read the site from a file like services/cell.toml; it names the arm's file, relative to
+    itself."""
     cell = read_toml(cell_file)
     try:
         arm_file = cell_file.parent / cell["arm"]["model"]
@@ -123,14 +123,15 @@ def read_site(cell_file: Path, laboratory: Path = LABORATORY_FILE) -> Site:
         drives = ratings(read_toml(arm_file))
     except KeyError as fault:
         raise LaboratoryError(
-            f"{arm_file}: a [[joint]] lacks {fault}; drives need torque, speed and inertia"
+            f"{arm_file}: key {fault} of a [[joint]] is missing; drives need torque, speed "
+            "and inertia"
         ) from fault
     return Site(cell, arm, drives, laboratory)
 
 
 def site_of(directory: Directory) -> Site:
-    """The site that services.toml names: `[parameters] cell`, and `laboratory` if it is not the
-    shipped one."""
+    """Return the site that services.toml names: `[parameters] cell`, and `laboratory` if it is not
+    the shipped one."""
     if "cell" not in directory.parameters:
         raise LaboratoryError(
             f'{directory.source}: [parameters] cell is missing; write cell = "services/cell.toml"'
@@ -145,7 +146,7 @@ def site_of(directory: Directory) -> Site:
 class CupMount:
     """Where the cup really is for encoder angles: the arm's flange and the true mount."""
 
-    def __init__(self, arm: ArmModel, truth: Truth) -> None:
+    def __init__(self, arm: PumaModel, truth: Truth) -> None:
         self._arm = arm
         self._zero: list[float] = truth.joint_zero.tolist()
         axis, mouth = truth.cup.axis, truth.cup.mouth
@@ -158,22 +159,24 @@ class CupMount:
         self._numbers = numbers_of(arm, self._zero, (self._x, self._y, self._z), self._mouth)
 
     def frame(self, q: Six) -> Frame3:
-        """The cup's frame at encoder angles (rad): origin in the middle of the mouth, z out of
-        it."""
+        """Return the cup's frame at encoder angles (rad): origin in the middle of the mouth, z out
+        of it."""
         x, y, z, origin = carried(q, self._numbers)
         return Frame3(x, y, z, origin)
 
     def solid_parts(self, q: Sequence[float]) -> tuple[Any, Any]:
-        """Capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m, base
-        frame."""
+        """Return the capsules of the arm at encoder angles: end points (6, 2, 3) and radii (6,), m,
+        base frame."""
         return self._arm.solid_parts(self._true(q), self._bottom)
 
-    def load(self, mass: float, radius: float, depth: float) -> Link:
-        """The cup as a body on the flange (kg, m): a thin tube around its axis."""
+    def load(self, mass: float, radius: float, depth: float) -> PrincipalInertia:
+        """Return the cup as a body on the flange (kg, m): a thin tube around its axis."""
         middle = tuple(0.5 * (m + b) for m, b in zip(self._mouth, self._bottom, strict=True))
         along, across = mass * radius**2, mass * (0.5 * radius**2 + depth**2 / 12.0)
         inertia = tuple(along * a * a + across * (1.0 - a * a) for a in self._z)
-        return Link(mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2]))
+        return PrincipalInertia(
+            mass, (middle[0], middle[1], middle[2]), (inertia[0], inertia[1], inertia[2])
+        )
 
     def _true(self, q: Sequence[float]) -> list[float]:
         return [angle + zero for angle, zero in zip(q, self._zero, strict=True)]

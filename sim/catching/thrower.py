@@ -15,13 +15,13 @@ import numpy as np
 from petrobot.sim.catching.ball import BallModel, BallState
 from petrobot.sim.catching.truth import Truth
 
-_STREAM = 0x7468  # keeps the thrower's draws apart from other draws of the same seed
+_STREAM = 0x7468  # Keeps the thrower's draws separate from other draws of the same seed.
 
 
 @dataclass(frozen=True, slots=True)
 class Throw:
-    """One throw: `speed` (m/s) and `start` at release, where it is aimed at (`exit_y`, m) and what
-    the ball meets."""
+    """One throw: `speed` (m/s) and `start` at release, the point at which it is aimed (`exit_y`,
+    m), and the resistance that the ball meets."""
 
     n: int
     delay: float
@@ -35,8 +35,8 @@ class Throw:
 
 
 def draw_throw(seed: int, n: int, cell: Mapping[str, Any], truth: Truth) -> Throw:
-    """Throw `n` (1, 2, ...) of `seed`: from 0.1 m before the far edge towards a point of the near
-    edge."""
+    """Return throw `n` (1, 2, ...) of `seed`: from 0.1 m before the far edge towards a point of the
+    near edge."""
     rng = np.random.default_rng((seed, n, _STREAM))
     ball, settings = cell["ball"], truth.settings
     delay = float(rng.uniform(*settings["thrower"]["delay"]))
@@ -59,8 +59,8 @@ def draw_throw(seed: int, n: int, cell: Mapping[str, Any], truth: Truth) -> Thro
 
 
 class Thrower:
-    """Releases one throw after the other, each a seeded delay after all was ready for it without a
-    break."""
+    """Releases one throw after the other, each a random delay (by seed) after everything has become
+    ready for it."""
 
     def __init__(
         self, cell: Mapping[str, Any], truth: Truth, seed: int, throws: int | None = None
@@ -84,8 +84,8 @@ class Thrower:
         return self._next is None
 
     def advance(self, now: float, ready: bool) -> Throw | None:
-        """The throw to release at `now` (s), None while there is none. `ready`: images are taken,
-        the last ball is gone, the cup is empty and the arm stands still at home."""
+        """Return the throw to release at `now` (s), None if there is none. `ready`: images are
+        taken, the last ball is gone, the cup is empty and the arm stands still at home."""
         if not ready or self._next is None:
             self._ready_since = None
             return None

@@ -1,4 +1,4 @@
-"""What the simulated cell really is: the nominal cell, one installation's seeded errors, and a
+"""What the simulated cell really is: the nominal cell, one installation's random errors, and a
 regime's disturbances.
 
 Only the laboratory reads this. A regime name is a regime and any number of disturbances of
@@ -22,14 +22,14 @@ LABORATORY_FILE = Path(__file__).with_name("laboratory.toml")
 
 
 class LaboratoryError(ValueError):
-    """A laboratory or cell file, or a regime name, that cannot be used; the text names file, key
-    and remedy."""
+    """A laboratory or cell file, or a regime name, cannot be used; the message names file, key and
+    remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraTruth:
-    """The camera as it really hangs: a point p (base frame, m) has camera coordinates `rotation @
-    (p - position)`."""
+    """The camera as it is really mounted: a point p (base frame, m) has camera coordinates
+    `rotation @ (p - position)`."""
 
     position: Vector
     """(3,) optical centre in the base frame, m."""
@@ -43,7 +43,7 @@ class CameraTruth:
 
 @dataclass(frozen=True, slots=True)
 class CupTruth:
-    """The cup as it really is mounted: in the flange frame (frame 6 of the arm)."""
+    """The cup as it is really mounted, in the flange frame (frame 6 of the arm)."""
 
     mouth: Vector
     """(3,) centre of the mouth, m."""
@@ -81,26 +81,26 @@ class Truth:
     light_gradient: tuple[float, float]
     """Relative change of the light from one side of the image to the other, along u and v."""
     vignetting: float
-    """Relative loss of light in the image's corners."""
+    """Relative loss of light in the corners of the image."""
     light_level: float
     light_drift: float
     light_period: float
     image_latency: float
-    """s, beyond the camera's own readout."""
+    """s, in addition to the camera's own readout."""
     arm_speed: float
     settings: Mapping[str, Any]
-    """The whole laboratory file, for what is no error: steps, thrower, friction."""
+    """The whole laboratory file, for what is not an error: steps, thrower, friction."""
 
     def light(self, time: float) -> float:
-        """Relative brightness at `time` (s); 1 is nominal."""
+        """Return the relative brightness at `time` (s); 1 is nominal."""
         return self.light_level * (
             1.0 + self.light_drift * float(np.sin(2.0 * np.pi * time / self.light_period))
         )
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as a dict. Raises LaboratoryError naming the file when it is missing or not
-    TOML."""
+    """Return a TOML file as a dict. Raises LaboratoryError naming the file when it is missing or
+    not TOML."""
     try:
         with path.open("rb") as file:
             return tomllib.load(file)
@@ -109,12 +109,12 @@ def read_toml(path: Path) -> dict[str, Any]:
             f"{path}: cannot be read ({fault.strerror}); give the path of an existing file"
         ) from fault
     except tomllib.TOMLDecodeError as fault:
-        raise LaboratoryError(f"{path}: no TOML ({fault}); mend that line") from fault
+        raise LaboratoryError(f"{path}: not valid TOML ({fault}); correct it") from fault
 
 
 def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, float], dict[str, Any]]:
-    """Speed range and the disturbed values of a regime name. Raises LaboratoryError for an unknown
-    or contradictory one."""
+    """Return the speed range and the disturbed values of a regime name. Raises LaboratoryError for
+    an unknown or contradictory one."""
     base, *names = (part.strip() for part in regime.replace(",", "+").split("+"))
     regimes, disturbances = settings["regimes"], settings["disturbances"]
     if base not in regimes:
@@ -127,12 +127,13 @@ def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, floa
     for name in names:
         if name not in disturbances:
             raise LaboratoryError(
-                f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}"
+                f"regime {regime!r}: unknown disturbance {name!r}; the disturbances are "
+                f"{', '.join(disturbances)}"
             )
         for key, value in disturbances[name].items():
             if key not in values:
                 raise LaboratoryError(
-                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are"
+                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys"
                 )
             if key in set_by:
                 raise LaboratoryError(
@@ -146,8 +147,8 @@ def disturb(settings: Mapping[str, Any], regime: str) -> tuple[tuple[float, floa
 def read_truth(
     cell: Mapping[str, Any], regime: str = "A", laboratory: Path = LABORATORY_FILE
 ) -> Truth:
-    """The truth of a regime: nominal `cell` (services/cell.toml), this installation's errors, the
-    regime's disturbances."""
+    """Return the truth of a regime: nominal `cell` (services/cell.toml), this installation's
+    errors, the regime's disturbances."""
     settings = read_toml(laboratory)
     try:
         speed, values = disturb(settings, regime)
@@ -176,7 +177,7 @@ def read_truth(
 
 
 def rotation_from_vector(vector: Vector) -> Vector:
-    """(3, 3) rotation about `vector` (3,) by its length in rad (Rodrigues' formula)."""
+    """Return the rotation (3, 3) about `vector` (3,) by its length in rad (Rodrigues' formula)."""
     angle = float(np.linalg.norm(vector))
     if angle == 0.0:
         return np.eye(3)

@@ -1,9 +1,10 @@
-"""The ball's world: table, flight, cup and floor, each stepped no finer than is exact there.
+"""The ball's world: table, flight, cup and floor, each computed with the coarsest step that is
+exact there.
 
-On the flat table and in free flight the ball follows closed forms (sim/catching/ball.py), one evaluation a
-tick. Only where it may touch the cup, an edge or anything else from above does the contact space
-(sim/catching/contact.py) take over at 1 kHz; a ball that lies still in a standing cup costs nothing. The
-light barrier and the closest approach to the cup are watched here.
+On the flat table and in free flight the ball follows closed forms (sim/catching/ball.py), one
+evaluation per tick. Only where it may touch the cup, an edge or anything else from above does the
+contact space (sim/catching/contact.py) take over at 1 kHz; a ball that lies still in a standing cup
+costs nothing. The light barrier and the closest approach to the cup are also computed here.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.ball import BallModel, BallState, TableMotion, fly
 from petrobot.sim.catching.contact import ContactSpace
-from petrobot.sim.catching.course import Barrier, Course, Outcome
+from petrobot.sim.catching.course import LightBarrier, ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.thrower import Throw
 from petrobot.sim.catching.truth import Truth
@@ -26,13 +27,13 @@ _HAND_SPEED = 3.0
 _AHEAD = 0.005
 """s, a little more than a tick: surfaces that can meet within it are near."""
 _GAIN = 1.0
-"""m/s, more than a falling ball gains until it must be looked at again."""
+"""m/s, more than a falling ball gains until it must be checked again."""
 _SETTLED = 0.05
-"""s that a ball must lie still in a cup that hardly moves before it is left alone."""
+"""s for which a ball must lie still in an almost standing cup before it counts as at rest."""
 _CREEP = 0.005
-"""m/s (and tenths of rad/s) up to which a cup hardly moves: an arm that settles."""
+"""m/s (and tenths of rad/s) up to which a cup almost stands: an arm that settles."""
 _STIRRED, _TILTED = 1e-4, 2e-4
-"""m and rad by which a cup has moved on before its ball is no longer taken to lie still in it."""
+"""m and rad by which a cup must have moved before its ball no longer counts as at rest in it."""
 _FLAT_SPEED = 0.02
 """m/s of vertical speed below which a ball on the table has stopped bouncing."""
 
@@ -51,12 +52,12 @@ class Where(StrEnum):
     """Lying still in the cup."""
 
 
-class World:
-    """One ball at most, where it is and what became of it. Times `now` are simulated seconds.
+class BallWorld:
+    """One ball at most: where it is and what happened to it. Times `now` are simulated seconds.
 
-    Each tick: `begin`; while `fine` holds, `fine_step` once for each 1 ms with the cup's pose at
-    the end of that millisecond; then `end`. `begin` and `end` ask for the cup's pose only when the
-    ball may be near it: a pose costs more than they do. The same object means the same pose.
+    Each tick: `begin`; while `fine` holds, `fine_step` once per 1 ms with the cup's pose at the end
+    of that millisecond; then `end`. `begin` and `end` ask for the cup's pose only when the ball may
+    be near it: a pose costs more than they do. The same object means the same pose.
     """
 
     def __init__(self, cell: Mapping[str, Any], truth: Truth) -> None:
@@ -66,10 +67,10 @@ class World:
         self._settings = settings
         self._cup_wall = float(cell["cup"]["wall"])
         self._space = ContactSpace(self.model, truth.table, truth.cup, self._cup_wall, settings)
-        self._barrier = Barrier(float(settings["cup"]["barrier_delay"]))
+        self._barrier = LightBarrier(float(settings["cup"]["barrier_delay"]))
         self.where = Where.ABSENT
         self.ball: BallState | None = None
-        self.course: Course | None = None
+        self.course: ThrowCourse | None = None
         self._cup: Frame3 | None = None
         self._look_at = -math.inf
         self._rest: tuple[Frame3, tuple[float, float, float]] | None = None
@@ -83,7 +84,7 @@ class World:
         one."""
         self._still_since: float | None = None
 
-    # What the laboratory asks
+    # Queries of the laboratory
 
     @property
     def barrier(self) -> bool:
@@ -100,21 +101,21 @@ class World:
         """Length of a fine step (s)."""
         return self._space.dt
 
-    def release(self, now: float, throw: Throw) -> Course:
-        """A ball enters the world. Raises RuntimeError while another one is there."""
+    def release(self, now: float, throw: Throw) -> ThrowCourse:
+        """Put a ball into the world. Raises RuntimeError while another one is there."""
         if self.ball is not None:
             raise RuntimeError("a ball is in play: one at a time")
         self.ball = throw.start
-        self.course = Course(throw, now)
+        self.course = ThrowCourse(throw, now)
         self._height = self._aside = math.inf
         self._last = (throw.start.position[0], now)
         self._roll(now, throw.start)
         return self.course
 
     def take_away(self, now: float) -> None:
-        """Somebody takes the ball out of play."""
-        if self.course is not None and self.course.outcome is Outcome.ROLLING:
-            self.course.outcome = Outcome.MISSED
+        """Take the ball out of play."""
+        if self.course is not None and self.course.outcome is ThrowOutcome.ROLLING:
+            self.course.outcome = ThrowOutcome.MISSED
         if self.course is not None:
             self.course.ended_at = now - self.course.released_at
         self.where, self.ball, self.course = Where.ABSENT, None, None
@@ -123,7 +124,7 @@ class World:
     # One tick
 
     def begin(self, now: float, cup: CupPose) -> None:
-        """Start of a tick at `now`; `cup` gives the cup's frame (origin: mouth centre, z out of the
+        """Start a tick at `now`; `cup` returns the cup's frame (origin: mouth centre, z out of the
         mouth)."""
         ball = self.ball
         if ball is None:
@@ -141,8 +142,8 @@ class World:
             self._look(now, ball, cup())
 
     def _look(self, now: float, ball: BallState, cup: Frame3) -> None:
-        """Into the contact space if ball and cup may touch within the tick; else note when that
-        must be asked again."""
+        """Enter the contact space if ball and cup may touch within the tick; else note when to
+        check again."""
         self._cup = cup
         spare = self._gap(ball, cup) - self._way_within_tick(ball)
         if spare <= 0.0:
@@ -151,7 +152,7 @@ class World:
             self._look_at = now + spare / (_norm(ball.velocity) + _GAIN + _HAND_SPEED)
 
     def _ride(self, cup: Frame3) -> None:
-        """A ball at rest goes along with its cup until that really moves."""
+        """Carry a ball at rest with its cup until the cup really moves."""
         if self._rest is None or self.ball is None or cup is self._cup:
             return
         (before, local), last = self._rest, self.ball.position
@@ -163,7 +164,7 @@ class World:
             self._touch(BallState(position, (x, y, z), (0.0, 0.0, 0.0)))
 
     def fine_step(self, now: float, cup: Frame3) -> None:
-        """A fine step that ends at `now` with the cup at `cup`."""
+        """Run a fine step that ends at `now` with the cup at `cup`."""
         before = self._cup or cup
         self._cup = cup
         if self.where is not Where.CONTACT:
@@ -174,11 +175,11 @@ class World:
         self._end_of_course(now, self.ball)
 
     def idle(self, now: float) -> None:
-        """A tick up to `now` without a ball; the cup need not be known."""
+        """Run a tick up to `now` without a ball; the cup need not be known."""
         self._barrier.see(now, False)
 
     def end(self, now: float, cup: CupPose) -> None:
-        """End of a tick at `now`: what follows closed forms goes on to here."""
+        """End a tick at `now`: evaluate the closed forms at this time."""
         course = self.course
         if self.ball is None or course is None:
             self.idle(now)
@@ -192,7 +193,7 @@ class World:
         elif self.where is not Where.CONTACT:
             if now >= self._look_at or course.exit_state is not None:
                 self._watch(now, self.ball, cup())
-            else:  # too far from the cup to matter
+            else:  # Too far from the cup to matter.
                 self._barrier.see(now, False)
                 self._height = math.inf
         self._end_of_course(now, self.ball)
@@ -220,8 +221,8 @@ class World:
         self.where = Where.CONTACT
 
     def _leave_contact(self, now: float, ball: BallState) -> None:
-        """The cup is far: on to the closed forms if the ball rolls flat on the table or flies clear
-        of it."""
+        """Return to the closed forms, with the cup far away, if the ball rolls flat on the table or
+        flies clear of it."""
         height = ball.position[2] - self._truth.table.top - self.model.radius
         if self._over_table(ball) and abs(height) < 1e-3 and abs(ball.velocity[2]) < _FLAT_SPEED:
             x, y, _ = ball.position
@@ -236,8 +237,8 @@ class World:
             self._soar(now, ball)
 
     def _go_on_table(self, now: float) -> None:
-        """Roll on; where the centre crosses an edge it flies from there, or tips over it when it is
-        too slow to."""
+        """Roll on. Where the centre crosses an edge, the ball flies from there, or tips over the
+        edge when it is too slow to fly."""
         motion = self._motion
         if motion is None:
             return
@@ -258,7 +259,7 @@ class World:
             self._touch(self.ball)
 
     def _settle(self, now: float, ball: BallState, before: Frame3, cup: Frame3) -> None:
-        """A ball that lies still in a cup that hardly moves is left alone."""
+        """Put a ball at rest that lies still in an almost standing cup."""
         still = _norm(ball.velocity) < self._settings["ball"]["rest_speed"] and self._inside(
             ball, cup
         )
@@ -277,10 +278,10 @@ class World:
             self._rest = cup, cup.local(ball.position)
             self.ball = BallState(ball.position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
-    # What is seen
+    # Observations
 
     def _watch(self, now: float, ball: BallState, cup: Frame3) -> None:
-        """Light barrier, crossing of the mouth's plane and closest approach."""
+        """Update light barrier, crossing of the mouth's plane and closest approach."""
         course = self.course
         if course is None:
             return
@@ -288,20 +289,20 @@ class World:
         interrupted = -self._truth.cup.depth < height < 0.0 and aside < self._truth.cup.radius
         self._barrier.see(now, interrupted)
         self._note_exit(now, ball, course)
-        if course.outcome is Outcome.ROLLING:
+        if course.outcome is ThrowOutcome.ROLLING:
             course.approach = min(course.approach, math.hypot(height, aside))
             if math.inf > self._height > 0.0 >= height and course.exit_state is not None:
                 share = self._height / (self._height - height)
                 course.crossing = min(course.crossing, self._aside + share * (aside - self._aside))
             if self._barrier.output:
-                course.outcome = Outcome.CAUGHT
+                course.outcome = ThrowOutcome.CAUGHT
                 course.caught_at = now - course.released_at
-        elif course.outcome is Outcome.CAUGHT and not self._barrier.output and cup.z[2] > 0.5:
-            course.outcome = Outcome.DROPPED
+        elif course.outcome is ThrowOutcome.CAUGHT and not self._barrier.output and cup.z[2] > 0.5:
+            course.outcome = ThrowOutcome.DROPPED
         self._height, self._aside = height, aside
 
-    def _note_exit(self, now: float, ball: BallState, course: Course) -> None:
-        """The ball went over the near edge while the contact space moved it, cup at hand."""
+    def _note_exit(self, now: float, ball: BallState, course: ThrowCourse) -> None:
+        """Note that the ball went over the near edge while the contact space moved it."""
         x, edge = ball.position[0], self._truth.table.near_edge
         if course.exit_state is None and x < edge:
             (before, at), (vx, _, _) = self._last, ball.velocity
@@ -311,7 +312,8 @@ class World:
         self._last = (x, now)
 
     def _end_of_course(self, now: float, ball: BallState) -> None:
-        """The floor ends it; so does lying still outside the cup, and time."""
+        """End the throw when the ball reaches the floor, lies still outside the cup, or takes too
+        long."""
         course, rules = self.course, self._settings["ball"]
         if course is None:
             return
@@ -338,7 +340,7 @@ class World:
         return -self._truth.cup.depth < height < 0.0 and aside < self._truth.cup.radius
 
     def _gap(self, ball: BallState, cup: Frame3) -> float:
-        """Distance between the ball and the cup, a solid cylinder here (m)."""
+        """Return the distance between the ball and the cup, here a solid cylinder (m)."""
         height, aside = _seen_from(cup, ball)
         half, wall = self._truth.cup.depth / 2.0, self._cup_wall
         beyond = max(abs(height + half) - half - wall, 0.0)
@@ -355,8 +357,8 @@ class World:
         return table.near_edge < x < table.far_edge and abs(y) < table.half_width
 
     def _near_table(self, ball: BallState) -> bool:
-        """Whether the ball may touch the table within a tick. One beside it that moves away fast
-        enough cannot."""
+        """Return whether the ball may touch the table within a tick. A ball beside it that moves
+        away fast enough cannot."""
         table, r = self._truth.table, self.model.radius
         x, y, z = ball.position
         vx, vy, _ = ball.velocity
@@ -371,20 +373,21 @@ class World:
         return gap < r + self._way_within_tick(ball)
 
     def close(self) -> None:
-        """End the physics client."""
+        """Disconnect the physics client."""
         self._space.close()
 
 
 def _clears_edge(state: BallState, model: BallModel) -> bool:
-    """Whether a ball that crosses an edge at this speed flies off at once: v^2 >= g r, else it tips
-    over the edge."""
+    """Return whether a ball that crosses an edge at this speed flies off at once: v^2 >= g r, else
+    it tips over the edge (the edge can no longer push when the centripetal force m v^2 / r exceeds
+    the weight)."""
     vx, vy, _ = state.velocity
     return vx * vx + vy * vy >= model.gravity * model.radius
 
 
 def _seen_from(cup: Frame3, ball: BallState) -> tuple[float, float]:
-    """Height of the ball's centre over the mouth's plane and its distance from the cup's axis
-    (m)."""
+    """Return the height of the ball's centre above the mouth's plane and its distance from the
+    cup's axis (m)."""
     (px, py, pz), (ox, oy, oz), (zx, zy, zz) = ball.position, cup.origin, cup.z
     rx, ry, rz = px - ox, py - oy, pz - oz
     height = rx * zx + ry * zy + rz * zz

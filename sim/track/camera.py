@@ -3,7 +3,7 @@ with flashes and noise.
 
 Body frame: origin on the floor below the middle of the axle, x forward, y left, z up. Camera frame:
 x right, y down, z forward. All pixels look at the floor, so each image is a homography of the
-floor's pictures: a matrix for the whole image.
+floor's pictures: one matrix for the whole image.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from petrobot.sim.track.floor import COARSE, FINE, Floor, Picture, Window
+from petrobot.sim.track.floor import COARSE, FINE, Floor, FloorWindow, Picture
 
 Array = NDArray[np.float64]
 
 STILL: Final = 0.0005
-"""m by which the farthest floor in view moves during an exposure, below which one view of it is
-enough."""
+"""m by which the farthest floor in view must move during an exposure for two views of it to be
+needed."""
 _BLUR: Final = 0.5 / math.sqrt(3.0)
-"""Two views so much of the exposure before and after its middle spread a point as evenly as the
-whole exposure (equal variance)."""
+"""Two views this share of the exposure before and after its middle spread a point like the whole
+exposure: a uniform distribution over the exposure T has the variance T^2 / 12, two points at +-d
+have d^2."""
 _NOISE_SIZE: Final = 320
 _NOISE_ZERO: Final = 128.0
-"""Grey level of the noise field that stands for none."""
+"""Grey level of the noise field that stands for no noise."""
 _SAMPLING: Final = 3.0
-"""Cells of the fine picture that a pixel may cover along the view before the coarse one is looked
-at."""
+"""Cells of the fine picture that a pixel may cover along the view before the coarse picture is
+used."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where the camera is on the rover (m, rad) and how it sees (px): pitch down, yaw to the left,
+    """Where the camera is on the rover (m, rad) and its lens (px): pitch down, yaw to the left,
     roll to the right."""
 
     forward: float
@@ -61,7 +62,7 @@ class Mount:
         return rolled
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels (..., 2) of body-frame points on the floor (..., 2)."""
+        """Return pixels (..., 2) of body-frame points on the floor (..., 2)."""
         floor = np.asarray(points, float)
         at = np.stack(
             [floor[..., 0] - self.forward, floor[..., 1], np.full(floor.shape[:-1], -self.height)],
@@ -71,8 +72,8 @@ class Mount:
         return np.asarray(self.focal * seen[..., :2] / seen[..., 2:] + self.principal)
 
     def to_floor(self) -> Array:
-        """(3, 3) homography from pixels (u, v, 1) to the body frame's floor. Raises ValueError for
-        a pixel above the horizon."""
+        """Return the homography (3, 3) from pixels (u, v, 1) to the floor in the body frame. Raises
+        ValueError for a pixel above the horizon."""
         u0, v0 = self.principal
         rays = self.rotation.T @ np.array(
             [[1.0, 0.0, -u0], [0.0, 1.0, -v0], [0.0, 0.0, self.focal]]
@@ -88,7 +89,7 @@ class Mount:
 
 
 class Motion(NamedTuple):
-    """The rover's pose (m, rad) and how it moves (m/s along its heading, rad/s)."""
+    """The rover's pose (m, rad) and motion (m/s along its heading, rad/s)."""
 
     x: float
     y: float
@@ -97,7 +98,7 @@ class Motion(NamedTuple):
     turn: float
 
 
-class FloorCamera:
+class RoverCamera:
     """Takes images of a `Floor`; noise from `rng`."""
 
     def __init__(
@@ -122,17 +123,17 @@ class FloorCamera:
         field = np.random.default_rng(_NOISE_SIZE).standard_normal((_NOISE_SIZE, _NOISE_SIZE))
         self._noise = np.asarray(np.clip(np.rint(_NOISE_ZERO + noise * field), 0, 255), np.uint8)
         self._parts = [
-            _Part(self._to_floor, 0, self._split, Window(COARSE, self._farthest(0.0))),
+            _Part(self._to_floor, 0, self._split, FloorWindow(COARSE, self._farthest(0.0))),
             _Part(
                 self._to_floor,
                 self._split,
                 mount.rows,
-                Window(FINE, self._farthest(float(self._split))),
+                FloorWindow(FINE, self._farthest(float(self._split))),
             ),
         ]
 
     def _farthest(self, row: float) -> float:
-        """How far from the body's origin the ends of a row look (m)."""
+        """Return how far from the body's origin the ends of a row look (m)."""
         return max(float(np.hypot(*self._ground(u, row))) for u in (0.0, float(self.mount.width)))
 
     def _ground(self, u: float, v: float) -> Array:
@@ -140,8 +141,8 @@ class FloorCamera:
         return np.array([x / w, y / w])
 
     def _split_row(self) -> int:
-        """First row whose pixels cover less than `_SAMPLING` cells of the fine picture along the
-        view."""
+        """Return the first row whose pixels cover less than `_SAMPLING` cells of the fine picture
+        along the view."""
         u = self.mount.width / 2
         for row in range(self.mount.rows):
             if np.linalg.norm(self._ground(u, row) - self._ground(u, row + 1)) < _SAMPLING * FINE:
@@ -157,8 +158,8 @@ class FloorCamera:
         veil: float = 0.0,
         grain: float = 1.0,
     ) -> Picture:
-        """One image (rows, width). `light`: factor, `veil`: grey levels of stray light, `grain`:
-        factor on the noise."""
+        """Return one image (rows, width). `light`: factor, `veil`: grey levels of stray light,
+        `grain`: factor on the noise."""
         black, share = self._black, (self._white - self._black) / 255.0
         if self.exposure * (abs(motion.speed) + abs(motion.turn) * self._reach) < STILL:
             still = self._view(floor, motion, 0.0)
@@ -177,7 +178,7 @@ class FloorCamera:
         )
 
     def _view(self, floor: Floor, motion: Motion, later: float) -> Picture:
-        """The paint that each pixel sees, `later` seconds than `motion`."""
+        """Return the paint that each pixel sees, `later` seconds after `motion`."""
         heading = motion.heading + later * motion.turn
         way = later * motion.speed
         c, s = math.cos(heading), math.sin(heading)
@@ -201,10 +202,10 @@ class FloorCamera:
 
 
 class _Part:
-    """Some rows of the image: their homography to the body frame's floor, and the window of the
-    picture that they look at."""
+    """Some rows of the image: their homography to the floor in the body frame, and the window of
+    the picture that they look at."""
 
-    def __init__(self, to_floor: Array, top: int, bottom: int, window: Window) -> None:
+    def __init__(self, to_floor: Array, top: int, bottom: int, window: FloorWindow) -> None:
         self.top, self.bottom, self.window = top, bottom, window
         self.to_floor: Array = to_floor @ np.array(
             [[1.0, 0.0, 0.0], [0.0, 1.0, float(top)], [0.0, 0.0, 1.0]]

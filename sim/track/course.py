@@ -1,8 +1,8 @@
 """The chessboard track: elements from square to square, centre line by arc length, nearest point,
 colour of the floor.
 
-Squares of 2 m, black and white in turn; a track of 50 mm in the opposite colour of each square;
-every element crosses one square from the middle of an edge to the middle of another: a straight of
+Squares of 2 m, black and white in turn; a track of 50 mm in the opposite colour of each square.
+Every element crosses one square from the middle of an edge to the middle of another: a straight of
 2 m or a quarter circle of 1 m radius (section 6 and figure 2 of the paper).
 """
 
@@ -17,17 +17,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from petrobot.sim.track.elements import BAR_MARGIN, SQUARE, Element, Kind, Pose, Square
+from petrobot.sim.track.elements import BAR_MARGIN, SQUARE, Element, ElementKind, FloorPose, Square
 
 BOARD: Final = 8
 """Squares along each side of the board."""
 _CLOSE: Final = 0.3
-"""m off a square's own element up to which no other element can be nearer: others keep 1 m off, or
-join it at its ends."""
+"""m off a square's own element up to which no other element can be nearer: others are at least 1 m
+away, or join it at its ends."""
 
 
 class TrackError(ValueError):
-    """A track that cannot be; the text says why and what to ask for instead."""
+    """An impossible track; the message says why and what to ask for instead."""
 
 
 class Near(NamedTuple):
@@ -56,16 +56,16 @@ def _on_board(square: Square) -> bool:
 
 
 def white(square: Square) -> bool:
-    """Whether a square is white."""
+    """Return whether a square is white."""
     return (square[0] + square[1]) % 2 == 0
 
 
 class Track:
-    """A valid track. Its board reaches from (0, 0) to (16, 16) m; the chessboard goes on around it,
-    without a track."""
+    """A valid track. Its board reaches from (0, 0) to (16, 16) m; the chessboard continues around
+    it, without a track."""
 
     def __init__(self, elements: Sequence[Element]) -> None:
-        """Raises TrackError for elements that make no track."""
+        """Raises TrackError for elements that do not form a valid track."""
         self.elements = tuple(elements)
         self.length = self.elements[-1].end - BAR_MARGIN if elements else 0.0
         """Arc length of the crossbar's far side (m)."""
@@ -74,8 +74,8 @@ class Track:
 
     @classmethod
     def of(cls, square: Square, heading: int, kinds: str, unpainted: Sequence[int] = ()) -> Track:
-        """The track that begins in `square` with `heading` (quarter turns from x) and has these
-        elements ("S", "L", "R").
+        """Return the track that begins in `square` with `heading` (quarter turns from x) and has
+        these elements ("S", "L", "R").
 
         `unpainted` are the indices of the elements that interruptions replace. Raises TrackError.
         """
@@ -83,7 +83,7 @@ class Track:
         start = 0.0
         for number, letter in enumerate(kinds):
             try:
-                kind = Kind(letter)
+                kind = ElementKind(letter)
             except ValueError as fault:
                 raise TrackError(
                     f"element {letter!r}: there are S (straight), L (left) and R (right)"
@@ -102,9 +102,12 @@ class Track:
         kinds: str = "mixed",
         arcs: float = 0.5,
     ) -> Track:
-        """A random track: so many elements, of which interruptions replace straights, arcs or
-        either (`kinds`: "straight", "arcs", "mixed"); `arcs` is the share of arcs where there is a
-        choice. Raises TrackError for what cannot be."""
+        """Return a random track with so many elements, of which interruptions replace straights,
+        arcs or either (`kinds`: "straight", "arcs", "mixed").
+
+        `arcs` is the share of arcs where there is a choice. Raises TrackError for an impossible
+        request.
+        """
         _check_wish(elements, interruptions, kinds, arcs)
         rng = np.random.default_rng((seed, _DRAWS))
         for _ in range(_ATTEMPTS):
@@ -121,13 +124,13 @@ class Track:
 
     @classmethod
     def contest(cls) -> Track:
-        """The fixed competition-like track: 24 elements, of which two arcs and a straight are
-        interrupted."""
+        """Return the fixed competition-like track: 24 elements, of which two arcs and a straight
+        are interrupted."""
         return cls.of(*CONTEST)
 
     @classmethod
     def read(cls, plain: Mapping[str, Any]) -> Track:
-        """The track that `plain` gave. Raises TrackError, KeyError."""
+        """Return the track that `plain` described. Raises TrackError, KeyError."""
         i, j = plain["square"]
         return cls.of(
             (int(i), int(j)),
@@ -137,7 +140,7 @@ class Track:
         )
 
     def plain(self) -> dict[str, Any]:
-        """Plain data from which `read` makes the track again."""
+        """Return plain data from which `read` makes the track again."""
         first = self.elements[0]
         return {
             "square": list(first.square),
@@ -181,12 +184,12 @@ class Track:
         )
 
     @property
-    def start(self) -> Pose:
+    def start(self) -> FloorPose:
         """Entrance of the first element."""
         return self.elements[0].at(0.0)
 
     @property
-    def end(self) -> Pose:
+    def end(self) -> FloorPose:
         """The T: the far side of its crossbar."""
         return self.at(self.length)
 
@@ -195,18 +198,20 @@ class Track:
         return [element.start for element in self.elements]
 
     def element_at(self, s: float) -> int:
-        """Index of the element at arc length s (m); the first or the last one outside the track."""
+        """Return the index of the element at arc length s (m); the first or the last one outside
+        the track."""
         number = int(np.searchsorted(self._starts, s, side="right")) - 1
         return min(max(number, 0), len(self.elements) - 1)
 
-    def at(self, s: float) -> Pose:
-        """Pose of the centre line at arc length s (m); outside the track it goes on straight."""
+    def at(self, s: float) -> FloorPose:
+        """Return the pose of the centre line at arc length s (m); outside the track it continues
+        straight."""
         element = self.elements[self.element_at(s)]
         return element.at(s - element.start)
 
     def nearest(self, x: float, y: float) -> Near:
-        """The point of the centre line nearest to (x, y), painted or not; gaps count as if they
-        were painted."""
+        """Return the point of the centre line nearest to (x, y); gaps count as if they were
+        painted."""
         square = math.floor(x / SQUARE), math.floor(y / SQUARE)
         own = self._of_square.get(square)
         if own is not None:
@@ -226,7 +231,7 @@ class Track:
     # Floor
 
     def floor(self, x: ArrayLike, y: ArrayLike) -> NDArray[np.uint8]:
-        """Colour of the floor at points (...,), m: 0 black, 1 white."""
+        """Return the colour of the floor at points (...,), m: 0 black, 1 white."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         i, j = np.floor(x / SQUARE).astype(int), np.floor(y / SQUARE).astype(int)
         marked = np.zeros(x.shape, bool)
@@ -239,16 +244,16 @@ class Track:
         return np.asarray(((i + j) % 2 == 0) ^ marked, np.uint8)
 
 
-# Drawing a track at random
+# Random tracks: a depth-first walk over the board.
 
 _DRAWS: Final = 0x747261
-"""Keeps the draws of tracks apart from other draws of the same seed."""
+"""Keeps the draws of tracks separate from other draws of the same seed."""
 _ATTEMPTS: Final = 400
 _PAINTED_BETWEEN: Final = 2
 _PAINTED_AT_ENDS: Final = 2
 _BACKTRACKS: Final = 400
 LEAST, MOST = 5, 40
-"""How many elements a random track may have."""
+"""Fewest and most elements of a random track."""
 CONTEST: Final = ((7, 3), 2, "SSLRRSSRSLLRLSSSLSSRLSSS", (7, 12, 21))
 """First square, heading, elements and interruptions of the competition-like track."""
 KINDS: Final[Mapping[str, str]] = {"straight": "S", "arcs": "LR", "mixed": "SLR"}
@@ -266,26 +271,32 @@ def _check_wish(elements: int, interruptions: int, kinds: str, arcs: float) -> N
         raise TrackError(f"a share of arcs of {arcs}: ask for 0 to 1")
 
 
-def _orders(rng: np.random.Generator, arcs: float) -> list[Kind]:
-    """The three kinds in the order in which they are tried."""
-    turns = [Kind.LEFT, Kind.RIGHT] if rng.random() < 0.5 else [Kind.RIGHT, Kind.LEFT]
-    return [*turns, Kind.STRAIGHT] if rng.random() < arcs else [Kind.STRAIGHT, *turns]
+def _orders(rng: np.random.Generator, arcs: float) -> list[ElementKind]:
+    """Return the three kinds in the order in which they are tried."""
+    turns = (
+        [ElementKind.LEFT, ElementKind.RIGHT]
+        if rng.random() < 0.5
+        else [ElementKind.RIGHT, ElementKind.LEFT]
+    )
+    return [*turns, ElementKind.STRAIGHT] if rng.random() < arcs else [ElementKind.STRAIGHT, *turns]
 
 
 def _walk(
     rng: np.random.Generator, square: Square, heading: int, elements: int, arcs: float
 ) -> str | None:
-    """A way of so many elements over the board that uses no square twice and has a free square
-    after its end; depth first."""
-    first = Element(Kind.STRAIGHT, square, heading, 0.0)
+    """Return a path of so many elements over the board that uses no square twice and has a free
+    square after its end; depth first. None if there is none, or the search takes too long."""
+    first = Element(ElementKind.STRAIGHT, square, heading, 0.0)
     way, used = [first], {square}
-    tries: list[Iterator[Kind]] = [iter(())]
+    tries: list[Iterator[ElementKind]] = [iter(())]
     for _ in range(_BACKTRACKS):
         if len(way) == elements:
             return "".join(element.kind for element in way)
         last = way[-1]
         if len(tries) == len(way):
-            tries.append(iter(_orders(rng, arcs) if len(way) < elements - 1 else [Kind.STRAIGHT]))
+            tries.append(
+                iter(_orders(rng, arcs) if len(way) < elements - 1 else [ElementKind.STRAIGHT])
+            )
         added = _step(last, tries[-1], used)
         if added is not None:
             way.append(added)
@@ -298,9 +309,9 @@ def _walk(
     return None
 
 
-def _step(last: Element, kinds: Iterator[Kind], used: set[Square]) -> Element | None:
-    """The next element after `last` of the first kind that leads on to a free square; None when no
-    kind is left."""
+def _step(last: Element, kinds: Iterator[ElementKind], used: set[Square]) -> Element | None:
+    """Return the next element after `last`, of the first kind that leads to a free square; None
+    when no kind is left."""
     square, heading = last.next_square, last.next_heading
     if not _on_board(square) or square in used:
         return None
@@ -314,8 +325,8 @@ def _step(last: Element, kinds: Iterator[Kind], used: set[Square]) -> Element | 
 def _interrupt(
     rng: np.random.Generator, letters: str, interruptions: int, kinds: str
 ) -> tuple[int, ...] | None:
-    """Indices of elements to replace, far enough from each other and from both ends; None when
-    there are too few."""
+    """Return the indices of elements to replace, far enough from each other and from both ends;
+    None when there are too few."""
     chosen: list[int] = []
     inner = range(_PAINTED_AT_ENDS, len(letters) - _PAINTED_AT_ENDS)
     for number in rng.permutation([n for n in inner if letters[n] in KINDS[kinds]]).tolist():

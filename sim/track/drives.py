@@ -20,12 +20,12 @@ from petrobot.services.comm.canopen.cia402 import (
 )
 from petrobot.sim.bus.canopen_node import CanopenNode
 from petrobot.sim.bus.power_drive import POWERED, PowerDrive
-from petrobot.sim.track.rover import SLOT, Rover
+from petrobot.sim.track.rover import SLOT, RoverBody
 from petrobot.sim.track.sensor import ReflectorSensor
 
 SYNC_PATIENCE: Final = 5
 """Periods of 1006h without SYNC after which an enabled drive stops by itself: 100 ms at 50 Hz, 5 cm
-of way at 0.5 m/s."""
+at 0.5 m/s."""
 _STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
     (int(each), 0)
     for each in (
@@ -39,24 +39,24 @@ _STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
     )
 )
 _LONGEST: Final = 0.1
-"""s between two set points beyond which the reference's slope is not made up for."""
+"""s between two set points above which the slope limit allows no larger step."""
 _AT_REST: Final = 0.05
-"""rad/s below which a wheel counts as having come to rest after a fault."""
+"""rad/s below which a wheel counts as being at rest after a fault."""
 _TURN: Final = 2.0 * math.pi
 _HALF, _WHOLE = 1 << 31, 1 << 32
 
 
 class WheelDrive(PowerDrive):
-    """One wheel's drive: set points of speed, limited in slope and by what the battery gives."""
+    """Drive of one wheel: speed set points, limited in slope and by the battery."""
 
     mode = Mode.CYCLIC_SYNCHRONOUS_VELOCITY
 
-    def __init__(self, side: int, rover: Rover) -> None:
+    def __init__(self, side: int, rover: RoverBody) -> None:
         """`side`: 0 left, 1 right; the node id is one more."""
         super().__init__(side + 1, "wheel_drive.eds", SYNC_PATIENCE)
         self.side = side
         self.limited = False
-        """Whether the last set point was more than the drive gives."""
+        """Whether the last set point was more than the drive can supply."""
         self._rover = rover
         self._wheel = rover.wheels[side]
         self._reference = 0.0
@@ -66,7 +66,7 @@ class WheelDrive(PowerDrive):
 
     # Hooks of the CANopen node.
     def before_sending(self) -> None:
-        """Bring status, position, speed, torque and what depends on the battery up to date."""
+        """Update status, position, speed, torque and what depends on the battery."""
         values, rover = self.values, self._rover
         values[_STATUSWORD] = self.statusword()
         position = round(self._count() * (_TURN * UNITS / rover.truth.encoder_counts))
@@ -80,13 +80,13 @@ class WheelDrive(PowerDrive):
         self.changed()
 
     def before_reading(self) -> None:
-        """Bring what only an SDO reads up to date as well."""
+        """Also update what only an SDO reads."""
         self.before_sending()
         self.values[Object.ERROR_CODE, 0] = self.fault
         self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
 
     def on_sync(self, now: float) -> None:
-        """Count the encoder, take the next set point."""
+        """Read the encoder and take the next set point."""
         since, self._synced = now - self._synced, now
         counted, self._counted = self._counted, self._count()
         if since > 0.0:
@@ -109,7 +109,7 @@ class WheelDrive(PowerDrive):
 
     # Hooks of the state machine.
     def begin(self, resumed: bool) -> None:
-        """Go on at the speed that the wheel has."""
+        """Continue at the speed that the wheel has."""
         self._reference = self._wheel.target = self._wheel.speed
         self._ramp = None
         self._wheel.braked = False
@@ -119,16 +119,16 @@ class WheelDrive(PowerDrive):
         self._ramp = deceleration
 
     def cut_power(self) -> None:
-        """The brake holds."""
+        """Let the brake hold."""
         self._reference = self._wheel.target = 0.0
         self._wheel.braked = True
 
     def flags(self) -> int:
-        """Whether set points are cut."""
+        """Return whether set points are cut."""
         return StatusBit.INTERNAL_LIMIT if self.limited else 0
 
     def step(self, now: float) -> None:
-        """Once a slot: ramp down, watch SYNC."""
+        """Ramp down and watch SYNC; called once per slot."""
         if self.state not in POWERED:
             return
         if self.state is State.OPERATION_ENABLED:
@@ -147,13 +147,13 @@ class WheelDrive(PowerDrive):
 
 
 class RoverBus:
-    """Everything on the rover's bus but the master: drives 1 (left) and 2 (right), sensor 3.
+    """Everything on the rover's bus except the master: drives 1 (left) and 2 (right), sensor 3.
 
-    In each tick: `receive` what came, then `step(now)`, then send what `drain` gives. Times are
+    In each tick: `receive` the frames, then `step(now)`, then send what `drain` returns. Times are
     seconds on the caller's clock.
     """
 
-    def __init__(self, rover: Rover, sensor: ReflectorSensor, now: float = 0.0) -> None:
+    def __init__(self, rover: RoverBody, sensor: ReflectorSensor, now: float = 0.0) -> None:
         self.rover = rover
         self.drives = (WheelDrive(0, rover), WheelDrive(1, rover))
         self.sensor = sensor
@@ -164,7 +164,7 @@ class RoverBus:
             node.boot(now)
 
     def receive(self, now: float, frame: Frame) -> None:
-        """A frame of the master's."""
+        """Process one frame of the master."""
         cob_id = frame.id
         target = self._own.get(cob_id & 0x7F)
         self.rover.move_to(now)
@@ -174,12 +174,12 @@ class RoverBus:
             for node in self._nodes:
                 node.sync(now)
         else:
-            self._due = -math.inf  # it may set any timer
+            self._due = -math.inf  # It may set any timer.
             for node in self._nodes:
                 node.receive(now, frame)
 
     def step(self, now: float) -> None:
-        """What rover and devices do on time."""
+        """Run what rover and devices do on time."""
         if now < self._due - 1e-9:
             return
         self.rover.move_to(now)
@@ -192,7 +192,7 @@ class RoverBus:
         self._due = min(self._watch_due, *[node.due() for node in self._nodes])
 
     def drain(self) -> list[Frame]:
-        """Frames to the master, oldest first."""
+        """Return the frames to the master, oldest first."""
         frames: list[Frame] = []
         for node in self._nodes:
             if node.outbox:
@@ -201,13 +201,13 @@ class RoverBus:
 
     def power(self, closed: bool) -> None:
         """Close or open the power chain (emergency stop). Open: the drives lose power and the
-        brakes fall in."""
+        brakes engage."""
         for drive in self.drives:
             drive.powered = closed
             if not closed:
                 drive.trip(Fault.UNDERVOLTAGE)
 
     def trip(self, side: int, fault: Fault = Fault.OVERCURRENT) -> str:
-        """Make a drive (0 left, 1 right) fail; gives the fault in words."""
+        """Make a drive (0 left, 1 right) fail; return the fault in words."""
         self.drives[side].trip(fault)
         return fault_text(fault)

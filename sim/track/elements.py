@@ -13,25 +13,25 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Square = tuple[int, int]
-"""Column and row: it reaches from 2 i to 2 i + 2 m in x and from 2 j to 2 j + 2 m in y."""
+"""Column and row: the square reaches from 2 i to 2 i + 2 m in x and from 2 j to 2 j + 2 m in y."""
 
 SQUARE: Final = 2.0
 """m, side of a square."""
 RADIUS: Final = 1.0
-"""m, of an arc's centre line."""
+"""m, radius of an arc's centre line."""
 HALF_WIDTH: Final = 0.025
 """m, half the track's width."""
 BAR_LENGTH, BAR_WIDTH = 0.50, 0.05
 """m, of the T's crossbar."""
 BAR_MARGIN: Final = 0.25
-"""m between the crossbar and the end of its square: paint of one colour all around it, or it would
-be no T."""
+"""m between the crossbar and the end of its square: without paint of one colour all around, it
+would not be a T."""
 _DIRECTIONS: Final = ((1, 0), (0, 1), (-1, 0), (0, -1))
 """Unit vectors of the headings 0, 90, 180, 270 degrees."""
 
 
-class Kind(StrEnum):
-    """What an element is, seen by who enters it."""
+class ElementKind(StrEnum):
+    """Kind of an element, in the direction of travel."""
 
     STRAIGHT = "S"
     LEFT = "L"
@@ -39,16 +39,16 @@ class Kind(StrEnum):
 
     @property
     def length(self) -> float:
-        """Of the centre line, m."""
-        return SQUARE if self is Kind.STRAIGHT else 0.5 * math.pi * RADIUS
+        """Length of the centre line, m."""
+        return SQUARE if self is ElementKind.STRAIGHT else 0.5 * math.pi * RADIUS
 
     @property
     def turn(self) -> int:
         """Quarter turns to the left from its entrance to its exit."""
-        return {Kind.STRAIGHT: 0, Kind.LEFT: 1, Kind.RIGHT: -1}[self]
+        return {ElementKind.STRAIGHT: 0, ElementKind.LEFT: 1, ElementKind.RIGHT: -1}[self]
 
 
-class Pose(NamedTuple):
+class FloorPose(NamedTuple):
     """A point of the floor (m) and a heading (rad, counter-clockwise from x)."""
 
     x: float
@@ -58,10 +58,10 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One element. `heading` counts quarter turns from x; `start` is its entrance's arc length
+    """One element. `heading` counts quarter turns from x; `start` is the arc length at its entrance
     (m)."""
 
-    kind: Kind
+    kind: ElementKind
     square: Square
     heading: int
     start: float
@@ -69,7 +69,7 @@ class Element:
 
     @property
     def end(self) -> float:
-        """Its exit's arc length (m)."""
+        """Arc length at its exit (m)."""
         return self.start + self.kind.length
 
     @property
@@ -80,9 +80,9 @@ class Element:
             self.square[1] + 0.5 * (1 - dy)
         ) * SQUARE
 
-    def at(self, way: float) -> Pose:
-        """The pose `way` metres after the entrance; before the entrance and after the exit the line
-        goes on straight."""
+    def at(self, way: float) -> FloorPose:
+        """Return the pose `way` metres after the entrance; the line continues straight before the
+        entrance and after the exit."""
         turn, inside = self.kind.turn, min(max(way, 0.0), self.kind.length)
         if turn:
             angle = inside / RADIUS
@@ -92,16 +92,16 @@ class Element:
         beyond = way - inside
         u, w = u + beyond * math.cos(angle), w + beyond * turn * math.sin(angle)
         (x, y), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
-        return Pose(
+        return FloorPose(
             x + u * dx - w * dy, y + u * dy + w * dx, self.heading * 0.5 * math.pi + turn * angle
         )
 
     def nearest(self, x: float, y: float) -> tuple[float, float, float]:
-        """Way after the entrance (m, within the element), offset to the left (m) and distance (m)
-        of a point."""
+        """Return for a point: distance after the entrance (m, within the element), offset to the
+        left (m) and distance (m)."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
-        if self.kind is Kind.STRAIGHT:
+        if self.kind is ElementKind.STRAIGHT:
             way = min(max(u, 0.0), SQUARE)
             return way, w, math.hypot(u - way, w)
         turn = self.kind.turn
@@ -112,19 +112,21 @@ class Element:
         return angle * RADIUS, turn * (RADIUS - math.hypot(u, RADIUS - turn * w)), aside
 
     def depth(self, x: Array, y: Array) -> Array:
-        """How far (m) points (...,) of its square lie within the track, were it painted; negative
-        outside."""
+        """Return how far (m) points (...,) of its square lie within the track if it is painted;
+        negative outside."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, (y - y0) * dx - (x - x0) * dy
         aside = (
-            w if self.kind is Kind.STRAIGHT else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
+            w
+            if self.kind is ElementKind.STRAIGHT
+            else np.hypot(u, RADIUS - self.kind.turn * w) - RADIUS
         )
         inside: Array = HALF_WIDTH - np.abs(aside)
         return inside
 
     def tee_depth(self, x: Array, y: Array) -> Array:
-        """The same where a straight element ends in a T: a crossbar before its exit, and nothing
-        beyond that."""
+        """Return the same where a straight element ends in a T: a crossbar before its exit, and
+        nothing beyond that."""
         (x0, y0), (dx, dy) = self.entrance, _DIRECTIONS[self.heading]
         u, w = (x - x0) * dx + (y - y0) * dy, np.abs((y - y0) * dx - (x - x0) * dy)
         before_end = SQUARE - BAR_MARGIN - u
@@ -135,7 +137,7 @@ class Element:
 
     @property
     def next_square(self) -> Square:
-        """The square that lies beyond its exit."""
+        """The square beyond its exit."""
         return beyond_edge(self.square, self.next_heading)
 
     @property
@@ -145,5 +147,6 @@ class Element:
 
 
 def beyond_edge(square: Square, heading: int) -> Square:
+    """Return the square next to `square` in direction `heading` (quarter turns)."""
     dx, dy = _DIRECTIONS[heading]
     return square[0] + dx, square[1] + dy

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.sim.track.camera import FloorCamera, Motion, Mount
+from petrobot.sim.track.camera import Motion, Mount, RoverCamera
 from petrobot.sim.track.course import BOARD, Track, TrackError
 from petrobot.sim.track.elements import SQUARE
 from petrobot.sim.track.floor import COARSE, ORIGIN, Floor
@@ -43,7 +43,7 @@ class FilmError(ValueError):
     """A film that cannot be made; the text says what to do."""
 
 
-class View:
+class FilmView:
     """The floor from above, cropped to the track's squares and one around them."""
 
     def __init__(self, track: Track) -> None:
@@ -90,7 +90,7 @@ def images(
     rows = np.array(score["path"], float).reshape(-1, 4)
     if len(rows) < 2:
         raise FilmError("the score holds no path: the run has not begun")
-    view = View(Track.read(score["track"]))
+    view = FilmView(Track.read(score["track"]))
     camera, rng = _camera(nominal["camera"]), np.random.default_rng(int(score["seed"]))
     trail = view.still
     before = view.pixel(*rows[0, 1:3])
@@ -118,7 +118,7 @@ def _inset(image: Picture, seen: Picture, text: str) -> None:
     )
 
 
-def _camera(nominal: Mapping[str, Any]) -> FloorCamera:
+def _camera(nominal: Mapping[str, Any]) -> RoverCamera:
     u, v = nominal["principal_px"]
     mount = Mount(
         nominal["forward"],
@@ -130,7 +130,7 @@ def _camera(nominal: Mapping[str, Any]) -> FloorCamera:
         (u, v),
         *_EYE,
     )
-    return FloorCamera(
+    return RoverCamera(
         mount, nominal["exposure"], (nominal["black"], nominal["white"]), nominal["noise"], 0.0
     )
 

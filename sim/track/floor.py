@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.sim.track.course import BOARD, Track, white
-from petrobot.sim.track.elements import SQUARE, Element, Kind, Square
+from petrobot.sim.track.elements import SQUARE, Element, ElementKind, Square
 
 Picture = NDArray[np.uint8]
 
 FINE: Final = 0.005
-"""m, side of a cell of the fine picture: a tenth of the track's width, its edges smoothed over a
+"""m, side of a cell of the fine picture: a tenth of the track's width; edges are smoothed over one
 cell."""
 COARSE: Final = 0.010
 """m, of the coarse picture, in which two by two cells are averaged."""
@@ -26,11 +26,11 @@ MARGIN: Final = 2
 """Squares around the board: what the camera sees of the hall while the rover is within 1 m of the
 board."""
 SLACK: Final = 0.4
-"""m that the rover may go before a window is copied anew."""
+"""m that the rover may move before a window is copied again."""
 _SIDE: Final = round(SQUARE / FINE)
 _RATIO: Final = round(COARSE / FINE)
 ORIGIN: Final = -MARGIN * SQUARE
-"""m, x and y of the pictures' first cells' outer corners."""
+"""m, x and y of the outer corners of the pictures' first cells."""
 
 
 class Floor:
@@ -45,7 +45,7 @@ class Floor:
         self._painted: list[Square] = []
 
     def paint(self, track: Track) -> None:
-        """Wipe the last track off and paint this one."""
+        """Remove the last track and paint this one."""
         self.version += 1
         for square in self._painted:
             self._fill(square, np.uint8(255 * white(square)))
@@ -63,13 +63,14 @@ class Floor:
             picture[bottom : bottom + side, left : left + side] = grey
 
 
-class Window:
-    """The part of a picture that a rover sees, copied whenever it has gone so far that it could see
-    beyond: small enough to stay in a processor's cache, where the whole floor (23 MB) does not."""
+class FloorWindow:
+    """The part of a picture that a rover sees, copied whenever the rover has moved so far that
+    it could see beyond it. It is small enough for a processor's cache; the whole floor (23 MB)
+    is not."""
 
     def __init__(self, cell: float, reach: float) -> None:
-        """`cell`: side of the picture's cells, `reach`: how far from its own place the rover sees
-        (m)."""
+        """`cell`: side of the picture's cells, `reach`: how far from its own position the rover
+        sees (m)."""
         self.cell = cell
         self.part = np.zeros((0, 0), np.uint8)
         self.x = self.y = math.nan
@@ -79,7 +80,7 @@ class Window:
         self._version = -1
 
     def look(self, picture: Picture, version: int, x: float, y: float) -> None:
-        """Have everything in the part that is in reach of (x, y), m."""
+        """Make the part contain everything within reach of (x, y), m."""
         near = abs(x - self._middle[0]) < SLACK and abs(y - self._middle[1]) < SLACK
         if near and version == self._version:
             return
@@ -111,8 +112,8 @@ def _chessboard(side: int) -> Picture:
 
 
 @lru_cache
-def _tile(kind: Kind, heading: int, tee: bool) -> Picture:
-    """A white track on a black square, which ends in a T or goes on."""
+def _tile(kind: ElementKind, heading: int, tee: bool) -> Picture:
+    """Return a white track on a black square, which ends in a T or continues."""
     element = Element(kind, (0, 0), heading, 0.0)
     middles = (np.arange(_SIDE) + 0.5) * FINE
     x, y = np.meshgrid(middles, middles)

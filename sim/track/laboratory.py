@@ -1,8 +1,8 @@
 """The laboratory of the mobile robot: floor, rover, drives, sensor and camera as one party, which
 answers as hardware would.
 
-The world moves on only when something is due: a slot of the rover, a frame, an image. A tick in
-between costs next to nothing.
+The world advances only when something is due: a slot of the rover, a frame, an image. A tick in
+between costs almost nothing.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.truth import LaboratoryError
-from petrobot.sim.faults import Fault, FaultKinds, FaultPlan
+from petrobot.sim.faults import FaultKinds, FaultPlan, InjectedFault
 from petrobot.sim.laboratory_party import FAULT, SCORE, LaboratoryParty, whole_number
-from petrobot.sim.track.camera import FloorCamera, Motion
+from petrobot.sim.track.camera import Motion, RoverCamera
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.drives import RoverBus
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.floor import Floor, Picture
-from petrobot.sim.track.referee import Referee
-from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.referee import TrackReferee
+from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import LightTruth, RoverTruth, TrackSite, TrackTruth, track_site_of
 
-# Faults that the rover's laboratory can be asked for.
+# Faults that the rover's laboratory can inject.
 
 ROVER_FAULTS: Final = FaultKinds(
     keys={
@@ -47,16 +47,17 @@ ROVER_FAULTS: Final = FaultKinds(
 )
 
 
-def read_rover_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> Fault:
-    """A fault as a caller asks for it. Raises ValueError that says what is wrong and what fits."""
+def read_rover_fault(now: float, kind: str, arguments: Mapping[str, Any]) -> InjectedFault:
+    """Return the fault that a caller asks for. Raises ValueError that says what is wrong and what
+    is expected."""
     return ROVER_FAULTS.read(now, kind, arguments)
 
 
-# Light over the floor: a slow drift, and flashes of spectators' cameras.
+# Light over the floor: a slow drift, and the flashes of spectators' cameras.
 
 
 class Light(NamedTuple):
-    """What falls on the floor: a factor on the nominal light, and stray light in the lens (grey
+    """Light on the floor: a factor on the nominal light, and stray light in the lens (grey
     levels)."""
 
     level: float
@@ -64,8 +65,8 @@ class Light(NamedTuple):
 
 
 class Hall:
-    """The hall's light from `began` (s) on; asked for moments that never go back. Flashes come at
-    random, with `rng`."""
+    """The hall's light from `began` (s) on, for moments in ascending order. Flashes come at random
+    (Poisson), drawn by `rng`."""
 
     def __init__(self, truth: LightTruth, rng: np.random.Generator, began: float) -> None:
         self._truth = truth
@@ -76,7 +77,7 @@ class Hall:
         self._next_flash(began)
 
     def at(self, now: float) -> Light:
-        """The light at a moment (s)."""
+        """Return the light at a moment (s)."""
         truth = self._truth
         angle = 2.0 * math.pi * (now - self._began) / truth.period + self._phase
         level = truth.level * (1.0 + truth.drift * math.sin(angle))
@@ -95,13 +96,13 @@ class Hall:
 
 
 REGIME: Final = "straight"
-"""The regime if none is asked for."""
+"""The default regime."""
 _SLIP, _LIGHT, _IMAGE, _ECHO, _FAULTS, _FALLEN = 0x736C, 0x6C69, 0x696D, 0x6563, 0x6661, 0x6672
-"""Keep draws of the same seed apart."""
+"""Keep draws of the same seed separate."""
 
 
 class TrackLaboratory(LaboratoryParty):
-    """The party of the simulated node `name`. `where` gives the party of an endpoint
+    """The party of the simulated node `name`. `where` returns the party of an endpoint
     (`Directory.party`)."""
 
     def __init__(
@@ -115,22 +116,22 @@ class TrackLaboratory(LaboratoryParty):
         boot: str = "laboratory",
         directory: str = "",
     ) -> None:
-        """Raises LaboratoryError for a regime that means nothing. `boot`, `directory`: as in
-        services.comm.callee."""
+        """Raises LaboratoryError for an unknown regime. `boot`, `directory`: as in
+        services.comm.calls.callee."""
         super().__init__(name, where, boot, directory)
-        cv2.setNumThreads(1)  # cores are shared with other nodes
+        cv2.setNumThreads(1)  # Other nodes share the cores.
         self._site = site
         self._floor = Floor()
-        self._cameras: dict[str, FloorCamera] = {}
+        self._cameras: dict[str, RoverCamera] = {}
         truth = site.truth(regime)
-        self.rover = Rover(truth.rover, np.random.default_rng((seed, _SLIP)))
+        self.rover = RoverBody(truth.rover, np.random.default_rng((seed, _SLIP)))
         self._echo_draws = np.random.default_rng((seed, _ECHO))
         self.bus = RoverBus(self.rover, ReflectorSensor(self._measure))
         self._prepare(seed, truth, truth.course.track(seed))
 
     def _prepare(self, seed: int, truth: TrackTruth, track: Track) -> None:
-        """A new experiment: rover at the start, score empty, everything drawn anew. Drives and
-        counters stay as they are."""
+        """Begin a new experiment: rover at the start, empty score, everything drawn again. Drives
+        and counters keep their state."""
         self.truth, self.track = truth, track
         self._floor.paint(track)
         self._camera = self._camera_of(truth)
@@ -150,15 +151,16 @@ class TrackLaboratory(LaboratoryParty):
         self.rover.move_to(self.now)
         draws = np.random.default_rng((seed, _SLIP))
         self.rover.place(truth.rover, _put_down(track.start, truth.rover, draws), draws)
-        self.referee = Referee(track, seed, truth.regime, self.now, hangs.tolist())
+        self.referee = TrackReferee(track, seed, truth.regime, self.now, hangs.tolist())
         self._watch_due = self.now
 
-    def _camera_of(self, truth: TrackTruth) -> FloorCamera:
-        """The camera as it is mounted; kept, since its noise field takes some milliseconds."""
+    def _camera_of(self, truth: TrackTruth) -> RoverCamera:
+        """Return the camera as it is mounted; cached, since its noise field takes some
+        milliseconds."""
         key = repr(truth.camera)
         if key not in self._cameras:
             nominal = self._site.nominal["camera"]
-            self._cameras[key] = FloorCamera(
+            self._cameras[key] = RoverCamera(
                 truth.camera,
                 float(nominal["exposure"]),
                 (float(nominal["black"]), float(nominal["white"])),
@@ -170,7 +172,7 @@ class TrackLaboratory(LaboratoryParty):
     # The world, as lock step and real time drive it
 
     def tick(self, now: float) -> None:
-        """Exposure of the world as it is at `now`, then on to `now` + TICK."""
+        """Expose the world as it is at `now`, then advance it to `now` + TICK."""
         if not self._faults.none:
             self._begin_faults(now)
         if self.exposures.due(now):
@@ -184,12 +186,12 @@ class TrackLaboratory(LaboratoryParty):
         self.now = now + TICK
 
     def take_on_bus(self, now: float, frames: Sequence[Frame]) -> None:
-        """Frames of the master's."""
+        """Process frames of the master."""
         for frame in self._faults.passed(frames):
             self.bus.receive(now, frame)
 
     def take_frames(self) -> Sequence[Frame]:
-        """Frames of drives and sensor since the last call."""
+        """Return the frames of drives and sensor since the last call."""
         return self._faults.passed(self.bus.drain())
 
     def _expose(self, now: float) -> None:
@@ -198,7 +200,7 @@ class TrackLaboratory(LaboratoryParty):
         self.exposures.put(now, now + self._site.settings["camera"]["readout"], self.picture(now))
 
     def picture(self, now: float) -> Picture:
-        """What the camera sees at a moment that the world has come to (s): (rows, width) grey
+        """Return what the camera sees at the present moment of the world (s): (rows, width) grey
         levels."""
         rover = self.rover
         rover.move_to(now)
@@ -222,18 +224,18 @@ class TrackLaboratory(LaboratoryParty):
             self.bus.power(powerless)
         self.bus.sensor.dead = self._faults.active("dead_sensor")
 
-    def _strike(self, fault: Fault) -> None:
+    def _strike(self, fault: InjectedFault) -> None:
         if fault.kind == "drive_fault":
             self.bus.trip(int(fault.value) - 1)
 
     def serve(self, service: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """Answer one of `services`. Raises ValueError (LaboratoryError, TrackError among them) for
-        arguments that cannot be.
+        bad arguments.
 
         laboratory_prepare(seed=0, regime="straight", elements=None, interruptions=None,
-        speed=None): a new experiment, gives nothing; `speed` (m/s) is refused if no wheel goes so
-        fast; other parameters of the task are not the laboratory's business; laboratory_score():
-        see sim.track_referee; laboratory_fault(kind, after=0, ...): see sim.track_faults.
+        speed=None): begin a new experiment, return nothing; a `speed` (m/s) that no wheel reaches
+        is refused; other parameters of the task do not concern the laboratory; laboratory_score():
+        see `TrackReferee.score`; laboratory_fault(kind, after=0, ...): see `ROVER_FAULTS`.
         """
         if service == SCORE:
             return self.referee.score(self.now)
@@ -251,18 +253,18 @@ class TrackLaboratory(LaboratoryParty):
         return {}
 
     def make_ready(self, arguments: Mapping[str, Any]) -> None:
-        """Have the camera of a regime ready. Raises LaboratoryError."""
+        """Make the camera of a regime. Raises LaboratoryError."""
         self._camera_of(self._site.truth(str(arguments.get("regime", REGIME))))
 
     def close(self) -> None:
-        """Nothing is held outside of memory."""
+        """Do nothing: all is in memory."""
 
 
-def _put_down(start: Pose, rover: RoverTruth, draws: np.random.Generator) -> Pose:
-    """Where a hand puts the rover that is to stand at `start`."""
+def _put_down(start: FloorPose, rover: RoverTruth, draws: np.random.Generator) -> FloorPose:
+    """Return where a hand puts the rover that is to stand at `start`."""
     dx, dy, turn = draws.standard_normal(3).tolist()
     aside, heading = rover.settings["placed"], rover.settings["placed_heading"]
-    return Pose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
+    return FloorPose(start.x + aside * dx, start.y + aside * dy, start.heading + heading * turn)
 
 
 def _check_speed(speed: object, rover: RoverTruth) -> None:
@@ -270,17 +272,18 @@ def _check_speed(speed: object, rover: RoverTruth) -> None:
     most = round(rover.top_speed * min(wheel.radius for wheel in rover.wheels), 1)
     if speed is not None and not (isinstance(speed, int | float) and 0.0 < speed <= most):
         raise LaboratoryError(
-            f"speed = {speed!r}: give one above 0 and up to {most} m/s, which is what the "
-            "wheels can do"
+            f"speed: expected a number above 0 and at most {most} m/s, the top speed of the "
+            f"wheels, got {speed!r}"
         )
 
 
 _WATCH: Final = 0.02
-"""s between two looks of the referee: 1 cm of way at 0.5 m/s."""
+"""s between two looks of the referee: 1 cm at 0.5 m/s."""
 
 
 def make_laboratory(directory: Directory, name: str) -> TrackLaboratory:
-    """The laboratory of the simulated node `name` of the location file. Raises LaboratoryError."""
+    """Return the laboratory of the simulated node `name` of the location file. Raises
+    LaboratoryError."""
     boot = f"{name} in lock step"
     return TrackLaboratory(
         name, track_site_of(directory), directory.party, boot=boot, directory=directory.hash

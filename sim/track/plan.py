@@ -16,7 +16,7 @@ from petrobot.sim.track.elements import (
     RADIUS,
     SQUARE,
     Element,
-    Kind,
+    ElementKind,
 )
 
 WIDTH_PX: Final = 720
@@ -117,9 +117,9 @@ def _paint(track: Track) -> list[str]:
             continue
         colour = _DARK if white(element.square) else _LIGHT
         last = number == len(track.elements) - 1
+        line = _line(element, track.length - element.start if last else element.kind.length)
         lines.append(
-            f'<path d="{_line(element, track.length - element.start if last else element.kind.length)}" fill="none" '
-            f'stroke="{colour}" stroke-width="{2 * HALF_WIDTH:g}"/>'
+            f'<path d="{line}" fill="none" stroke="{colour}" stroke-width="{2 * HALF_WIDTH:g}"/>'
         )
         if last:
             x, y, heading = track.at(track.length - 0.5 * BAR_WIDTH)
@@ -133,9 +133,9 @@ def _paint(track: Track) -> list[str]:
 
 def _line(element: Element, way: float) -> str:
     (x0, y0, _), (x1, y1, _) = element.at(0.0), element.at(way)
-    if element.kind is Kind.STRAIGHT:
+    if element.kind is ElementKind.STRAIGHT:
         return f"M{x0:.5g} {y0:.5g}L{x1:.5g} {y1:.5g}"
-    sweep = 1 if element.kind is Kind.LEFT else 0
+    sweep = 1 if element.kind is ElementKind.LEFT else 0
     return f"M{x0:.5g} {y0:.5g}A{RADIUS:g} {RADIUS:g} 0 0 {sweep} {x1:.5g} {y1:.5g}"
 
 

@@ -1,10 +1,10 @@
-"""Keeps the score of a run on the track: how far off the centre line, interruptions recovered,
+"""Keeps the score of a run on the track: distance from the centre line, interruptions recovered,
 where and when it stopped.
 
-The rules (docs/decisions/mobile-contract.md): what counts is the body's origin. It is *on* the
-track until it is more than `LEFT` off; over an interruption it is in a *gap* until it is within
-`REGAINED` of the centre line behind it; *lost* after it has left the track, until it is back on a
-painted element no farther back than it was; and at the *end* once it has come to the T.
+The rules (docs/decisions/mobile-contract.md) apply to the body's origin. It is *on* the track until
+it is more than `LEFT` off; over an interruption it is in a *gap* until it is within `REGAINED` of
+the centre line behind it; *lost* after it has left the track, until it is back on a painted element
+no farther back than it was; and at the *end* once it has reached the T.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from enum import StrEnum
 from typing import Any, Final
 
 from petrobot.sim.track.course import BOARD, Gap, Near, Track
-from petrobot.sim.track.elements import SQUARE, Pose
+from petrobot.sim.track.elements import SQUARE, FloorPose
 
 LEFT: Final = 0.30
 """m off the centre line at which the track counts as left."""
@@ -25,7 +25,7 @@ REGAINED: Final = 0.10
 IN_TIME: Final = 1.0
 """m behind an interruption within which the track must be regained."""
 BEFORE_END, BEYOND_END, ASIDE_END = 0.10, 0.30, 0.30
-"""m before and beyond the T's far side, and aside of it, where the rover must stop."""
+"""m before and beyond the T's far side, and to the side of it, where the rover must stop."""
 STANDING: Final = 0.01
 """m/s below which the rover counts as standing ..."""
 STANDING_FOR: Final = 0.5
@@ -33,16 +33,16 @@ STANDING_FOR: Final = 0.5
 DEPARTED: Final = 0.01
 """m from where it was put down at which the clock starts."""
 OFF_BOARD: Final = 1.0
-"""m beyond the board's edge at which somebody stops the rover."""
+"""m beyond the board's edge at which a person stops the rover."""
 ROW_PERIOD: Final = 0.2
 """s between two rows of the path."""
 _BEHIND, _AHEAD = 0.6, 1.2
-"""m along the track by which the nearest point may have moved since the last look: farther is
+"""m along the track by which the nearest point may have moved since the last look; more means
 another part of the track."""
 
 
-class Phase(StrEnum):
-    """Where a run stands."""
+class RunPhase(StrEnum):
+    """State of a run."""
 
     ON = "on"
     GAP = "gap"
@@ -52,8 +52,8 @@ class Phase(StrEnum):
 
 @dataclass(slots=True)
 class _Crossing:
-    """What became of one interruption. `aside` is the greatest distance from the line that would
-    have been there (m)."""
+    """What happened at one interruption. `aside` is the greatest distance from the line that is
+    missing there (m)."""
 
     gap: Gap
     kind: str
@@ -65,23 +65,23 @@ class _Crossing:
 
 
 @dataclass(slots=True)
-class Referee:
-    """Watches one run. `watch` it often; `score` gives plain data at any time."""
+class TrackReferee:
+    """Watches one run. Call `watch` often; `score` returns plain data at any time."""
 
     track: Track
     seed: int
     regime: str
     began: float
     reflectors: Sequence[bool] = ()
-    """Whether the reflector of each interruption hangs; all do if nothing is said."""
-    phase: Phase = Phase.ON
+    """Whether the reflector of each interruption is present; all are if this is empty."""
+    phase: RunPhase = RunPhase.ON
     s: float = 0.0
     """Arc length reached (m)."""
     penalties: list[dict[str, Any]] = field(default_factory=list)
     departed: float | None = None
     """When the rover first moved (s)."""
     stopped: float | None = None
-    """When it came to stand at the T (s)."""
+    """When it stopped at the T (s)."""
     finished: bool = False
     _path: list[tuple[float, float, float, float]] = field(default_factory=list)
     _way: float = 0.0
@@ -89,8 +89,8 @@ class Referee:
     _squares: float = 0.0
     _most: float = 0.0
     _removed: bool = False
-    _first: Pose | None = None
-    _last: Pose | None = None
+    _first: FloorPose | None = None
+    _last: FloorPose | None = None
     _still_since: float | None = None
     _crossings: list[_Crossing] = field(default_factory=list)
 
@@ -102,9 +102,9 @@ class Referee:
             for gap, kind, there in zip(self.track.gaps, kinds, hang, strict=True)
         ]
 
-    def watch(self, now: float, pose: Pose, speed: float) -> bool:
-        """The body is at `pose` and goes at `speed` (m/s) at a moment (s). Says whether the rover
-        has just left the board, where somebody presses its emergency stop."""
+    def watch(self, now: float, pose: FloorPose, speed: float) -> bool:
+        """Process the body's pose and speed (m/s) at a moment (s). Return whether the rover has
+        just left the board, where a person presses its emergency stop."""
         if not self._path or now - self.began >= self._path[-1][0] + ROW_PERIOD - 1e-9:
             self._path.append((now - self.began, *pose))
         if self.stopped is not None or self._removed:
@@ -118,29 +118,29 @@ class Referee:
                 return False
             self.departed = now
         self._way += step
-        if step > 0.0 and self.phase is not Phase.END:
+        if step > 0.0 and self.phase is not RunPhase.END:
             self._locate(now, pose, step)
-        if self.phase is Phase.END:
+        if self.phase is RunPhase.END:
             self._await_stop(now, pose, speed)
         if not all(-OFF_BOARD <= at <= BOARD * SQUARE + OFF_BOARD for at in (pose.x, pose.y)):
             self._removed = True
             self._penalize(now, "left_board", pose)
         return self._removed
 
-    def _locate(self, now: float, pose: Pose, step: float) -> None:
+    def _locate(self, now: float, pose: FloorPose, step: float) -> None:
         near = self.track.nearest(pose.x, pose.y)
-        if self.phase is Phase.ON:
+        if self.phase is RunPhase.ON:
             self._follow(now, pose, near, step)
-        elif self.phase is Phase.GAP:
+        elif self.phase is RunPhase.GAP:
             self._cross(now, pose, near)
         elif self._painted(near) and near.distance <= REGAINED and near.s >= self.s - _BEHIND:
             self._go_on(now, pose, near)
-        if self.phase is Phase.ON and self.s >= self.track.length - BEFORE_END:
-            self.phase, self.finished = Phase.END, True
+        if self.phase is RunPhase.ON and self.s >= self.track.length - BEFORE_END:
+            self.phase, self.finished = RunPhase.END, True
 
-    def _follow(self, now: float, pose: Pose, near: Near, step: float) -> None:
+    def _follow(self, now: float, pose: FloorPose, near: Near, step: float) -> None:
         if near.distance > LEFT or not -_BEHIND <= near.s - self.s <= _AHEAD:
-            self.phase = Phase.LOST
+            self.phase = RunPhase.LOST
             self._penalize(now, "track_left", pose)
             return
         self.s = max(self.s, near.s)
@@ -149,12 +149,12 @@ class Referee:
             self._squares += step * near.distance * near.distance
             self._most = max(self._most, near.distance)
             return
-        self.phase = Phase.GAP
+        self.phase = RunPhase.GAP
         for crossing in self._crossings:
             if crossing.gap.start <= near.s <= crossing.gap.end and crossing.entered is None:
                 crossing.entered = now
 
-    def _cross(self, now: float, pose: Pose, near: Near) -> None:
+    def _cross(self, now: float, pose: FloorPose, near: Near) -> None:
         open_gaps = [
             each for each in self._crossings if each.entered is not None and each.ended is None
         ]
@@ -163,8 +163,8 @@ class Referee:
         if self._painted(near) and near.distance <= REGAINED and near.s >= self.s:
             self._go_on(now, pose, near)
 
-    def _go_on(self, now: float, pose: Pose, near: Near) -> None:
-        """The track is regained: every interruption before it is recovered or missed."""
+    def _go_on(self, now: float, pose: FloorPose, near: Near) -> None:
+        """Continue on the regained track: every interruption before it is recovered or missed."""
         for crossing in self._crossings:
             if crossing.ended is None and crossing.gap.end <= near.s + 1e-9:
                 crossing.ended = now
@@ -173,12 +173,12 @@ class Referee:
                 )
                 if not crossing.recovered:
                     self._penalize(now, "interruption_missed", pose, crossing.gap.end)
-        self.phase, self.s = Phase.ON, max(self.s, near.s)
+        self.phase, self.s = RunPhase.ON, max(self.s, near.s)
 
     def _painted(self, near: Near) -> bool:
         return self.track.elements[near.element].painted
 
-    def _await_stop(self, now: float, pose: Pose, speed: float) -> None:
+    def _await_stop(self, now: float, pose: FloorPose, speed: float) -> None:
         end = self.track.end
         c, s = math.cos(end.heading), math.sin(end.heading)
         ahead = (pose.x - end.x) * c + (pose.y - end.y) * s
@@ -194,7 +194,7 @@ class Referee:
         if still and not beyond and ahead >= -BEFORE_END:
             self.stopped = self._still_since
 
-    def _penalize(self, now: float, kind: str, pose: Pose, s: float | None = None) -> None:
+    def _penalize(self, now: float, kind: str, pose: FloorPose, s: float | None = None) -> None:
         begun = self.began if self.departed is None else self.departed
         row = {"s": self.s if s is None else s, "x": pose.x, "y": pose.y, "after": now - begun}
         self.penalties.append(
@@ -204,8 +204,8 @@ class Referee:
     # The score
 
     def score(self, now: float) -> dict[str, Any]:
-        """How the run went, as plain data (docs/decisions/mobile-contract.md); the keys without a
-        unit are counts or flags."""
+        """Return the result of the run as plain data (docs/decisions/mobile-contract.md); keys
+        without a unit are counts or flags."""
         begun = now if self.departed is None else self.departed
         overrun = any(each["kind"] == "not_stopped" for each in self.penalties)
         stopped_at_t = self.stopped is not None and not overrun
@@ -238,7 +238,7 @@ class Referee:
         }
 
     def _all_penalties(self, now: float, stopped_at_t: bool, overrun: bool) -> list[dict[str, Any]]:
-        """Those given, and those that a run that is over now has earned besides."""
+        """Return the penalties so far, plus those that a run that ends now has earned."""
         given, last = list(self.penalties), self._last or self.track.start
         for crossing in self._crossings:
             if crossing.entered is not None and crossing.ended is None:

@@ -1,9 +1,9 @@
-"""The rover's body: wheels that lag, slip and skid, a battery that sags, and the way that comes of
-them.
+"""The rover's body: wheels that lag, slip and skid, a battery whose voltage drops, and the
+resulting motion.
 
-Differential drive. Between two moments at which anything changes the wheels' speeds have a closed
-form (first-order lag of a constant set point), and the body goes along a circular arc; so it is
-moved only when somebody looks or something changes.
+Differential drive. Between two moments at which anything changes, the wheels' speeds have a closed
+form (first-order lag of a constant set point), and the body moves along a circular arc. So it is
+moved only when its state is needed or something changes.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Final
 
 import numpy as np
 
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.truth import RoverTruth
 
 SLOT: Final = 0.02
-"""s between two draws of slip and two looks at the battery, whatever happens in between."""
+"""s between two draws of slip and two updates of the battery, whatever happens in between."""
 _DRAWN: Final = 256
 """Slips drawn at a time."""
 
 _CAUGHT_UP: Final = 1e-6
-"""rad/s off its set point at which a wheel has caught up."""
+"""rad/s from its set point at which a wheel has caught up."""
 _STUCK: Final = 0.01
 """rad/s below which a wheel that is to stand sticks by dry friction: 1 mm/s."""
 
@@ -34,19 +34,21 @@ class Wheel:
         self.radius = radius
         self.lag = lag
         self.target = 0.0
-        """rad/s, what its motor is told."""
+        """rad/s, set point of its motor."""
         self.speed = 0.0
         self.angle = 0.0
         """rad, turned since the beginning; the encoder counts this."""
         self.braked = True
 
     def turn(self, dt: float, brake_lag: float) -> float:
-        """Go on for `dt` seconds; gives the angle turned (rad)."""
+        """Turn for `dt` seconds; return the angle turned (rad)."""
         target, lag = (0.0, brake_lag) if self.braked else (self.target, self.lag)
         excess = self.speed - target
         if excess == 0.0:
             turned = target * dt
         else:
+            # First-order lag with time constant T: w(t) = c + (w0 - c) exp(-t / T), integrated over
+            # dt.
             rest = math.exp(-dt / lag)
             turned = target * dt + excess * lag * (1.0 - rest)
             self.speed = target + excess * rest
@@ -57,39 +59,39 @@ class Wheel:
         return turned
 
 
-class Rover:
-    """Wheels 0 (left) and 1 (right) and the body on them. `move_to` brings it up to a moment; times
-    are the caller's clock (s)."""
+class RoverBody:
+    """Wheels 0 (left) and 1 (right) and the body on them. `move_to` advances it to a moment; times
+    are on the caller's clock (s)."""
 
     def __init__(self, truth: RoverTruth, rng: np.random.Generator, now: float = 0.0) -> None:
         """`rng` draws the slip."""
         self.wheels = (Wheel(0.0, 1.0), Wheel(0.0, 1.0))
         self.now = now
-        self.place(truth, Pose(0.0, 0.0, 0.0), rng)
+        self.place(truth, FloorPose(0.0, 0.0, 0.0), rng)
 
-    def place(self, truth: RoverTruth, pose: Pose, rng: np.random.Generator) -> None:
-        """Put this rover somewhere, standing; its encoders go on from where they are."""
+    def place(self, truth: RoverTruth, pose: FloorPose, rng: np.random.Generator) -> None:
+        """Put this rover somewhere, standing; its encoders keep their counts."""
         self.truth = truth
         self.x, self.y, self.heading = pose
         self._rng = rng
         for wheel, true in zip(self.wheels, truth.wheels, strict=True):
             wheel.radius, wheel.lag, wheel.speed = true.radius, true.lag, 0.0
         self.speed = self.turn = 0.0
-        """m/s along the heading and rad/s of the body, on the average of the last motion."""
+        """m/s along the heading and rad/s of the body, averaged over the last motion."""
         self._slips = np.zeros((0, 2)).tolist()
         self._slip = [0.0, 0.0]
         self._slot = self._placed = self.now
         self._lasted: list[float] = [0.0, 0.0]
         self.torques = [0.0, 0.0]
-        """N m of the motors."""
+        """Torques of the motors (N m)."""
         self.voltage = truth.battery[0]
         self._keep = math.exp(-SLOT / truth.slip_time)
         self._fresh = truth.slip * math.sqrt(1.0 - self._keep * self._keep)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> FloorPose:
         """Where it is."""
-        return Pose(self.x, self.y, self.heading)
+        return FloorPose(self.x, self.y, self.heading)
 
     @property
     def standing(self) -> bool:
@@ -99,11 +101,11 @@ class Rover:
 
     @property
     def top_speed(self) -> float:
-        """rad/s that a wheel reaches on what the battery gives now."""
+        """rad/s that a wheel reaches with the present voltage."""
         return self.truth.top_speed * self.voltage / self.truth.nominal_voltage
 
     def move_to(self, now: float) -> None:
-        """Bring it up to `now`."""
+        """Advance the rover to `now`."""
         while self._slot + SLOT <= now + 1e-9:
             self._slot += SLOT
             self._move(self._slot)
@@ -130,13 +132,13 @@ class Rover:
         )
 
     def _drive(self, dt: float, way: float, turned: float) -> None:
-        """Along an arc; lateral acceleration takes some of the turn away and pushes the body
-        outwards."""
+        """Move along an arc; lateral acceleration reduces the turn and pushes the body outwards."""
         truth = self.truth
         lateral = way * turned / (dt * dt)
         turned /= 1.0 + truth.slip_turn * abs(lateral)
         aside = -truth.slip_aside * lateral * dt
         middle = self.heading + 0.5 * turned
+        # 2 R sin(turn / 2) to second order; the turn of one slot is small.
         chord = way * (1.0 - turned * turned / 24.0)
         c, s = math.cos(middle), math.sin(middle)
         self.x += chord * c - aside * s
@@ -145,10 +147,12 @@ class Rover:
         self.speed, self.turn = way / dt, turned / dt
 
     def _begin_slot(self) -> None:
-        """New slip, and what motors and battery do on the average of the slot that has ended."""
+        """Draw new slip; compute the averages of motors and battery over the finished slot."""
         if not self._slips:
             self._slips = self._rng.standard_normal((_DRAWN, 2)).tolist()
         fresh, keep, slip = self._slips.pop(), self._keep, self._slip
+        # First-order Gauss-Markov process: x' = k x + sigma sqrt(1 - k^2) n keeps the variance
+        # sigma^2.
         self._slip = [
             keep * slip[0] + self._fresh * fresh[0],
             keep * slip[1] + self._fresh * fresh[1],

@@ -10,13 +10,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from petrobot.sim.bus.canopen_node import CanopenNode
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.truth import SensorTruth
 
 SENSOR_NODE: Final = 3
 """Node id."""
 ECHOES: Final = 2
-"""How many echoes a TPDO carries."""
+"""Number of echoes in a TPDO."""
 _ECHO: Final = 0x2010
 _LEAST_RANGE: Final = 0.001
 _BEARING_UNIT, _RANGE_UNIT = 1e-4, 1e-3
@@ -31,12 +31,12 @@ class Echo(NamedTuple):
 
 def look(
     truth: SensorTruth,
-    pose: Pose,
+    pose: FloorPose,
     reflectors: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> list[Echo]:
-    """Echoes of one turn of the sensor on a rover at `pose`, nearest first; `reflectors` are points
-    (x, y) in m."""
+    """Return the echoes of one turn of the sensor on a rover at `pose`, nearest first; `reflectors`
+    are points (x, y) in m."""
     c, s = math.cos(pose.heading), math.sin(pose.heading)
     x, y = pose.x + truth.forward * c, pose.y + truth.forward * s
     echoes: list[Echo] = []
@@ -74,19 +74,19 @@ class ReflectorSensor(CanopenNode):
     """Measures and sends by its event timer (1800h:5, ms)."""
 
     def __init__(self, measure: Callable[[float], Sequence[Echo]]) -> None:
-        """`measure` gives the echoes at a moment (s), nearest first."""
+        """`measure` returns the echoes at a moment (s), nearest first."""
         super().__init__(SENSOR_NODE, "reflector_sensor.eds")
         self.dead = False
-        """Whether it says nothing any more."""
+        """Whether it has become silent."""
         self._measure = measure
         self._next = 0.0
 
     def due(self) -> float:
-        """When it measures or says something next."""
+        """Return when it measures or sends next."""
         return min(super().due(), self._next) if self.values[0x1800, 5] else super().due()
 
     def advance(self, now: float) -> None:
-        """Measure when the event timer says so."""
+        """Measure when the event timer is due."""
         super().advance(now)
         timer = self.values[0x1800, 5] * 1e-3
         if timer and now >= self._next - 1e-9:

@@ -1,4 +1,4 @@
-"""What the rover's cell really is: the nominal numbers, one rover's seeded errors, and a regime's
+"""What the rover's cell really is: the nominal numbers, one rover's random errors, and a regime's
 track and disturbances.
 
 Only the laboratory reads this. A regime name is a kind of track and any number of disturbances of
@@ -24,7 +24,7 @@ LABORATORY_FILE = Path(__file__).with_name("track.toml")
 
 @dataclass(frozen=True, slots=True)
 class WheelTruth:
-    """One wheel and its motor as they are."""
+    """The true values of one wheel and its motor."""
 
     radius: float
     lag: float
@@ -32,7 +32,7 @@ class WheelTruth:
 
 @dataclass(frozen=True, slots=True)
 class RoverTruth:
-    """The rover as it is; the numbers' meanings stand in sim/track/track.toml and rover.toml."""
+    """The true values of the rover; sim/track/track.toml and rover.toml explain the numbers."""
 
     wheels: tuple[WheelTruth, WheelTruth]
     """Left and right."""
@@ -47,18 +47,18 @@ class RoverTruth:
     slip_aside: float
     slip_turn: float
     battery: tuple[float, float, float]
-    """Voltage at the start (V), its fall (V/s), resistance (ohm)."""
+    """Voltage at the start (V), its drop (V/s), resistance (ohm)."""
     settings: Mapping[str, float]
     """How it is put down, friction, inertia, brakes, torque, electronics."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorTruth:
-    """The retroreflector sensor as it is (m, rad)."""
+    """The true values of the retroreflector sensor (m, rad)."""
 
     forward: float
     below: float
-    """Of the reflectors' centres."""
+    """m by which the sensor is below the reflectors' centres."""
     half_angle: float
     range: float
     fan: float
@@ -87,8 +87,8 @@ class LightTruth:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
-    """Which track a regime lays."""
+class TrackCourse:
+    """The kind of track that a regime uses."""
 
     kinds: str
     elements: int
@@ -97,8 +97,7 @@ class Course:
     def track(
         self, seed: int, elements: int | None = None, interruptions: int | None = None
     ) -> Track:
-        """The track of a seed; numbers given go before the regime's. Raises
-        sim.track.TrackError."""
+        """Return the track of a seed; given numbers replace the regime's. Raises `TrackError`."""
         if self.kinds == "contest":
             return Track.contest()
         return Track.by_seed(
@@ -114,7 +113,7 @@ class TrackTruth:
     """The simulated truth of one regime."""
 
     regime: str
-    course: Course
+    course: TrackCourse
     rover: RoverTruth
     camera: Mount
     sensor: SensorTruth
@@ -125,21 +124,21 @@ class TrackTruth:
 
 @dataclass(frozen=True, slots=True)
 class TrackSite:
-    """The cell's two files."""
+    """The two files of the cell."""
 
     nominal: Mapping[str, Any]
     settings: Mapping[str, Any]
     source: str = "rover.toml"
 
     def truth(self, regime: str) -> TrackTruth:
-        """The truth of a regime. Raises LaboratoryError."""
+        """Return the truth of a regime. Raises LaboratoryError."""
         base, values = _disturbed(self.settings, regime)
         errors, nominal = self.settings["installation"], self.nominal
         rng = np.random.default_rng(errors["seed"])
         try:
             return TrackTruth(
                 regime,
-                Course(str(base["kinds"]), int(base["elements"]), int(base["interruptions"])),
+                TrackCourse(str(base["kinds"]), int(base["elements"]), int(base["interruptions"])),
                 _rover(nominal, self.settings["rover"], errors, values, rng),
                 _camera(nominal["camera"], errors, values, rng),
                 _sensor(nominal, self.settings["sensor"], errors, values, rng),
@@ -154,13 +153,13 @@ class TrackSite:
 
 
 def read_track_site(rover: Path, laboratory: Path = LABORATORY_FILE) -> TrackSite:
-    """The site of a rover file. Raises LaboratoryError."""
+    """Return the site of a rover file. Raises LaboratoryError."""
     return TrackSite(read_toml(rover), read_toml(laboratory), str(rover))
 
 
 def track_site_of(directory: Directory) -> TrackSite:
-    """The site that the location file names: `[parameters] rover`, and `laboratory` if it is not
-    the shipped one."""
+    """Return the site that the location file names: `[parameters] rover`, and `laboratory` if it is
+    not the shipped one."""
     if "rover" not in directory.parameters:
         raise LaboratoryError(
             f'{directory.source}: [parameters] rover is missing; write rover = "rover.toml"'
@@ -186,12 +185,13 @@ def _disturbed(
     for name in names:
         if name not in disturbances:
             raise LaboratoryError(
-                f"regime {regime!r}: no disturbance {name!r}; there are {', '.join(disturbances)}"
+                f"regime {regime!r}: unknown disturbance {name!r}; the disturbances are "
+                f"{', '.join(disturbances)}"
             )
         for key, value in disturbances[name].items():
             if key not in values:
                 raise LaboratoryError(
-                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys there are"
+                    f"[disturbances.{name}] {key}: unknown key; [nominal] lists the keys"
                 )
             if key in set_by:
                 raise LaboratoryError(

@@ -16,24 +16,24 @@ TURN = {"S": 0, "L": 1, "R": -1}
 
 
 @dataclass(frozen=True)
-class Pose:
+class DrawnPose:
     """A place on the floor (m) and a heading (rad)."""
 
     x: float
     y: float
     heading: float
 
-    def moved(self, forward: float, left: float = 0.0, turn: float = 0.0) -> Pose:
+    def moved(self, forward: float, left: float = 0.0, turn: float = 0.0) -> DrawnPose:
         """The pose that lies there as seen from this one."""
         cos, sin = math.cos(self.heading), math.sin(self.heading)
-        return Pose(
+        return DrawnPose(
             self.x + forward * cos - left * sin,
             self.y + forward * sin + left * cos,
             self.heading + turn,
         )
 
 
-class Floor:
+class DrawnFloor:
     """Elements ("S", "L", "R"; lower case: unpainted) from (0, 0) along x; squares of 2 m with
     their first edge there.
 
@@ -46,7 +46,7 @@ class Floor:
     ) -> None:
         self.inverted, self.bar, self.width = inverted, bar, width
         self.elements = []
-        pose = Pose(0.0, 0.0, 0.0)
+        pose = DrawnPose(0.0, 0.0, 0.0)
         for letter in elements:
             turn = TURN[letter.upper()]
             self.elements.append((letter, pose))
@@ -56,7 +56,7 @@ class Floor:
         self.end = pose
         self.t = pose.moved(-0.25)
 
-    def at(self, s: float, aside: float = 0.0, turn: float = 0.0) -> Pose:
+    def at(self, s: float, aside: float = 0.0, turn: float = 0.0) -> DrawnPose:
         """The pose `s` metres along the centre line, `aside` m to its left, turned by `turn`
         rad."""
         for letter, pose in self.elements:
@@ -92,7 +92,7 @@ class Floor:
         return result
 
 
-def _body(pose: Pose, x: Vector, y: Vector) -> tuple[Vector, Vector]:
+def _body(pose: DrawnPose, x: Vector, y: Vector) -> tuple[Vector, Vector]:
     dx, dy = x - pose.x, y - pose.y
     cos, sin = math.cos(pose.heading), math.sin(pose.heading)
     return dx * cos + dy * sin, dy * cos - dx * sin
@@ -110,7 +110,9 @@ class Photographer:
         v = (np.arange(self.view.height)[:, None] + fine).ravel()
         self._x, self._y = self.view.points(u[None, :], v[:, None])
 
-    def __call__(self, floor: Floor, pose: Pose, random: np.random.Generator) -> NDArray[np.uint8]:
+    def __call__(
+        self, floor: DrawnFloor, pose: DrawnPose, random: np.random.Generator
+    ) -> NDArray[np.uint8]:
         """Grey levels (height, width) from a pose of the rover."""
         cos, sin = math.cos(pose.heading), math.sin(pose.heading)
         x = pose.x + self._x * cos - self._y * sin

@@ -27,7 +27,7 @@ RUN = re.compile(r"^\d+ (ok |BAD) +([\d.]+) s,.* rms ([\d.]+) max ([\d.]+) mm")
 
 
 @dataclass(frozen=True)
-class Row:
+class FigureRow:
     """One run of a campaign: its regime, the recovery that was chosen first, and how long it took
     (s)."""
 
@@ -74,11 +74,11 @@ def draw_learning(options: argparse.Namespace) -> None:
     options.out.write_text(_svg(len(regimes), panels), encoding="utf-8")
 
 
-def read(folder: Path) -> list[Row]:
+def read(folder: Path) -> list[FigureRow]:
     """The rows of a campaign's table."""
     with (folder / "table.csv").open(encoding="utf-8", newline="") as file:
         return [
-            Row(
+            FigureRow(
                 line["regime"],
                 line[f"chosen.{TASK}"],
                 float(line["mission_s"]),
@@ -98,7 +98,9 @@ def mean_of(seconds: Sequence[float]) -> tuple[float, float]:
     return mean, float(stats.t.ppf(0.975, count - 1)) * deviation / math.sqrt(count)
 
 
-def _tell(regime: str, mine: Sequence[Row], others: Mapping[str, Sequence[Row]]) -> None:
+def _tell(
+    regime: str, mine: Sequence[FigureRow], others: Mapping[str, Sequence[FigureRow]]
+) -> None:
     for action, rows in others.items():
         mean, half = mean_of([row.seconds for row in rows])
         print(
@@ -121,7 +123,7 @@ def _tell(regime: str, mine: Sequence[Row], others: Mapping[str, Sequence[Row]])
 
 
 def _learning_panel(
-    number: int, regime: str, mine: Sequence[Row], others: Mapping[str, Sequence[Row]]
+    number: int, regime: str, mine: Sequence[FigureRow], others: Mapping[str, Sequence[FigureRow]]
 ) -> str:
     most = 1.1 * max(row.seconds for row in (*mine, *(r for rows in others.values() for r in rows)))
     panel = _Panel(

@@ -21,15 +21,15 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task.file import load
 from petrobot.services.comm.location_file import load as load_directory
 from petrobot.services.mobile.detection import (
-    Detector,
     TemplateBank,
+    TrackDetector,
     consensus,
     detect_edges,
     detect_ridge,
 )
 from petrobot.services.mobile.floor import ScanGrid
 from petrobot.services.mobile.sight import Sight
-from tests.mobile.conftest import Floor, Photographer, Pose
+from tests.mobile.conftest import DrawnFloor, DrawnPose, Photographer
 
 ROOT = Path(__file__).parents[2]
 TASK = ROOT / "coordinator" / "tasks" / "follow_track.toml"
@@ -79,7 +79,7 @@ def measure_detectors(options: argparse.Namespace) -> None:
             print(f"{name:12}{light:12}{right:16.3f}{1e3 * off:11.1f}{1e3 * seconds:8.2f}")
 
 
-def _detectors() -> dict[str, Detector]:
+def _detectors() -> dict[str, TrackDetector]:
     random = np.random.default_rng(3)
     return {
         "edges": detect_edges,
@@ -90,7 +90,7 @@ def _detectors() -> dict[str, Detector]:
 
 
 def _judge(
-    detector: Detector, photographer: Photographer, grid: ScanGrid
+    detector: TrackDetector, photographer: Photographer, grid: ScanGrid
 ) -> tuple[float, float, float]:
     """Share of images with a right line, median distance of its points (m), and CPU time of an
     image (s)."""
@@ -108,10 +108,10 @@ def _judge(
     return right / len(cases), float(np.median(off)) if off else math.nan, cpu / len(cases)
 
 
-def _cases() -> Iterator[tuple[Floor, Pose, float, int]]:
+def _cases() -> Iterator[tuple[DrawnFloor, DrawnPose, float, int]]:
     random = np.random.default_rng(11)
     for seed in range(240):
-        floor = Floor(("SSS", "SLS", "SRS", "SLLS", "SRLS", "SSLS")[seed % 6])
+        floor = DrawnFloor(("SSS", "SLS", "SRS", "SLLS", "SRLS", "SSLS")[seed % 6])
         s = float(random.uniform(0.1, 2.9))
         yield (
             floor,
@@ -121,7 +121,7 @@ def _cases() -> Iterator[tuple[Floor, Pose, float, int]]:
         )
 
 
-def _off(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.float64]:
+def _off(sight: Sight, floor: DrawnFloor, pose: DrawnPose, s: float) -> NDArray[np.float64]:
     line = [floor.at(s + 0.3 + 0.005 * i) for i in range(260)]
     near = sight.x <= sight.x[0] + 0.5
     cos, sin = math.cos(pose.heading), math.sin(pose.heading)

@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from petrobot.services.mobile.detection import (
-    Detector,
     TemplateBank,
+    TrackDetector,
     consensus,
     detect_edges,
     detect_ridge,
 )
 from petrobot.services.mobile.floor import ScanGrid
 from petrobot.services.mobile.sight import Sight
-from tests.mobile.conftest import Floor, Photographer, Pose
+from tests.mobile.conftest import DrawnFloor, DrawnPose, Photographer
 
 PHOTOGRAPHER = Photographer()
 GRID = ScanGrid.of(PHOTOGRAPHER.view, 1.2)
 WIDTH = 0.05
-DETECTORS: dict[str, Callable[[], Detector]] = {
+DETECTORS: dict[str, Callable[[], TrackDetector]] = {
     "edges": lambda: detect_edges,
     "ridge": lambda: detect_ridge,
     "consensus": lambda: consensus(lambda: np.random.default_rng(7)),
@@ -36,14 +36,18 @@ EVERY = pytest.mark.parametrize("name", DETECTORS)
 
 
 def look(
-    name: str, floor: Floor, pose: Pose, seed: int = 1, photographer: Photographer = PHOTOGRAPHER
+    name: str,
+    floor: DrawnFloor,
+    pose: DrawnPose,
+    seed: int = 1,
+    photographer: Photographer = PHOTOGRAPHER,
 ) -> Sight:
     """What a detector sees of a floor from a pose."""
     image = photographer(floor, pose, np.random.default_rng(seed))
     return DETECTORS[name]()(GRID, GRID.sample(image), WIDTH, None)
 
 
-def off_line(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.float64]:
+def off_line(sight: Sight, floor: DrawnFloor, pose: DrawnPose, s: float) -> NDArray[np.float64]:
     """Distances (m) of the nearest half metre of a sight from the centre line around s + 0.3 to s +
     1.6 m."""
     line = [floor.at(s + 0.3 + 0.005 * i) for i in range(260)]
@@ -69,7 +73,7 @@ def off_line(sight: Sight, floor: Floor, pose: Pose, s: float) -> NDArray[np.flo
 def test_offset_and_heading_of_a_straight_line_are_recovered(
     name: str, aside: float, turn: float, s: float, seed: int
 ) -> None:
-    floor = Floor("SSS")
+    floor = DrawnFloor("SSS")
     sight = look(name, floor, floor.at(s, aside, turn), seed)
     line = sight.describe()
     assert line.heading == pytest.approx(-turn, abs=0.06)
@@ -81,7 +85,7 @@ def test_offset_and_heading_of_a_straight_line_are_recovered(
 @EVERY
 @pytest.mark.parametrize(("elements", "bend"), [("SLL", 1.0), ("SRR", -1.0)])
 def test_curvature_of_an_arc_is_recovered(name: str, elements: str, bend: float) -> None:
-    floor = Floor(elements)
+    floor = DrawnFloor(elements)
     found = [look(name, floor, floor.at(2.05 + 0.1 * i), seed=i) for i in range(6)]
     assert np.mean([sight.describe().curvature for sight in found]) == pytest.approx(bend, abs=0.25)
     for i, sight in enumerate(found):
@@ -97,9 +101,9 @@ def test_swapping_black_and_white_changes_nothing(
 ) -> None:
     """Without noise the negative of a floor gives the same line."""
     quiet = Photographer(noise=0.0)
-    pose = Floor("SLS").at(s, aside, turn)
+    pose = DrawnFloor("SLS").at(s, aside, turn)
     one, other = (
-        look(name, Floor("SLS", inverted=inverted), pose, photographer=quiet)
+        look(name, DrawnFloor("SLS", inverted=inverted), pose, photographer=quiet)
         for inverted in (False, True)
     )
     assume(name != "template" or (one.seen and other.seen))  # its lattice misses one image in sixty
@@ -115,7 +119,7 @@ def test_swapping_black_and_white_changes_nothing(
 def test_the_line_goes_on_where_its_colour_is_inverted(name: str, back: float) -> None:
     """The edge of a square lies across the view: the same line is seen before and behind it, and
     has not ended."""
-    floor = Floor("SSS")
+    floor = DrawnFloor("SSS")
     pose = floor.at(2.0 - back, 0.02, 0.06)
     sight = look(name, floor, pose)
     assert sight.x[0] < 0.5 and sight.x[-1] > 1.05 and not sight.broke_off
@@ -125,7 +129,7 @@ def test_the_line_goes_on_where_its_colour_is_inverted(name: str, back: float) -
 
 @EVERY
 def test_an_empty_square_shows_no_line(name: str) -> None:
-    floor = Floor("Sss")
+    floor = DrawnFloor("Sss")
     for i in range(6):
         assert not look(name, floor, floor.at(2.1 + 0.1 * i, 0.03 * i, 0.05 * i), seed=i).seen
 
@@ -133,14 +137,14 @@ def test_an_empty_square_shows_no_line(name: str) -> None:
 @EVERY
 def test_the_edge_of_a_square_alone_is_no_line(name: str) -> None:
     """Beside the track, along the border between black and white."""
-    floor = Floor("sss")
-    assert not look(name, floor, Pose(0.3, 1.0, 0.0)).seen
+    floor = DrawnFloor("sss")
+    assert not look(name, floor, DrawnPose(0.3, 1.0, 0.0)).seen
 
 
 @EVERY
 def test_the_line_before_decides_which_of_two_is_followed(name: str) -> None:
     """Where one goes on from what was seen before and another lies aside, the first is taken."""
-    floor = Floor("SSS")
+    floor = DrawnFloor("SSS")
     pose = floor.at(0.5, 0.0, 0.0)
     image = PHOTOGRAPHER(floor, pose, np.random.default_rng(3))
     distances = PHOTOGRAPHER.view.distances()
@@ -163,7 +167,7 @@ def test_the_line_before_decides_which_of_two_is_followed(name: str) -> None:
 def test_noise_is_stood(name: str, noise: float) -> None:
     """Three to seven times the nominal noise: nine of ten images still show the line."""
     loud = Photographer(noise=noise)
-    floor = Floor("SSS")
+    floor = DrawnFloor("SSS")
     good = 0
     for i in range(20):
         pose = floor.at(0.1 + 0.06 * i)
@@ -178,6 +182,6 @@ def test_noise_is_stood(name: str, noise: float) -> None:
 def test_dim_light_is_stood(name: str) -> None:
     """Two fifths of the contrast."""
     dim = Photographer(black=20.0, white=85.0)
-    floor = Floor("SLS")
+    floor = DrawnFloor("SLS")
     for i in range(6):
         assert look(name, floor, floor.at(0.3 + 0.2 * i), i, dim).seen

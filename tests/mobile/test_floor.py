@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from petrobot.services.mobile.floor import FloorView, ScanGrid
 from petrobot.services.mobile.model import nominal_rover
-from tests.mobile.conftest import Floor, Photographer
+from tests.mobile.conftest import DrawnFloor, Photographer
 
 VIEW = FloorView(nominal_rover().camera)
 
@@ -42,7 +42,7 @@ def test_scan_rows_are_about_as_far_apart_as_asked_and_reach_as_far() -> None:
 
 def test_both_ways_of_sampling_agree_where_the_image_shows_the_floor() -> None:
     image = Photographer(noise=0.0)(
-        Floor("SLS"), Floor("SLS").at(1.0, 0.05, 0.1), np.random.default_rng(0)
+        DrawnFloor("SLS"), DrawnFloor("SLS").at(1.0, 0.05, 0.1), np.random.default_rng(0)
     )
     grid = ScanGrid.of(VIEW, 1.2)
     rows = grid.sample(image)

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from petrobot.services.mobile.following import LAWS, TIGHTEST, SpeedProfile
 from petrobot.services.mobile.odometry import Pose
 from petrobot.services.mobile.track_map import Fit
-from tests.mobile.conftest import Floor
+from tests.mobile.conftest import DrawnFloor
 
 PERIOD, LAG = 0.02, 0.06
 EVERY = pytest.mark.parametrize("law", LAWS)
 
 
-def looking(floor: Floor, pose: Pose, s: float) -> dict[float, Fit]:
+def looking(floor: DrawnFloor, pose: Pose, s: float) -> dict[float, Fit]:
     """The line near `s` in the body frame, by distance ahead."""
     way = np.arange(max(0.0, s - 0.3), s + 0.9, 0.02)
     seen = [pose.body(at.x, at.y) for at in (floor.at(float(w)) for w in way)]
@@ -33,7 +33,7 @@ def looking(floor: Floor, pose: Pose, s: float) -> dict[float, Fit]:
     return fits
 
 
-def drive(law: str, floor: Floor, begin: Pose, speed: float, seconds: float) -> list[float]:
+def drive(law: str, floor: DrawnFloor, begin: Pose, speed: float, seconds: float) -> list[float]:
     """Distances (m) from the centre line, each cycle: wheels of first order, one cycle of delay,
     the speed profile's speed."""
     profile, pose, turning, pending = SpeedProfile(), begin, 0.0, 0.0
@@ -69,7 +69,7 @@ def drive(law: str, floor: Floor, begin: Pose, speed: float, seconds: float) -> 
 def test_a_rover_beside_a_straight_comes_onto_it_and_stays(
     law: str, aside: float, askew: float
 ) -> None:
-    errors = drive(law, Floor("SSS"), Pose(0.4, aside, askew), 0.5, 4.5)
+    errors = drive(law, DrawnFloor("SSS"), Pose(0.4, aside, askew), 0.5, 4.5)
     assert max(errors) < abs(aside) + 0.12
     assert max(errors[-25:]) < 0.012
 
@@ -77,12 +77,12 @@ def test_a_rover_beside_a_straight_comes_onto_it_and_stays(
 @pytest.mark.parametrize(("law", "bound"), [("feed_forward", 0.012), ("pursuit", 0.045)])
 @pytest.mark.parametrize("elements", ["SLS", "SRS"])
 def test_an_arc_is_followed(law: str, bound: float, elements: str) -> None:
-    errors = drive(law, Floor(elements), Pose(0.4, 0.0, 0.0), 0.5, 8.0)
+    errors = drive(law, DrawnFloor(elements), Pose(0.4, 0.0, 0.0), 0.5, 8.0)
     assert max(errors) < bound
 
 
 def test_the_feed_forward_stays_stable_at_twice_the_speed() -> None:
-    errors = drive("feed_forward", Floor("SSS"), Pose(0.4, 0.1, 0.0), 1.0, 3.5)
+    errors = drive("feed_forward", DrawnFloor("SSS"), Pose(0.4, 0.1, 0.0), 1.0, 3.5)
     assert max(errors[-25:]) < 0.01
 
 

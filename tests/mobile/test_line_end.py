@@ -11,15 +11,15 @@ from petrobot.services.mobile.detection import detect_edges
 from petrobot.services.mobile.model import nominal_rover
 from petrobot.services.mobile.sight import TrackEnd
 from petrobot.services.mobile.watching import FloorWatch, LineWatcher
-from tests.mobile.conftest import Floor, Photographer, Pose
+from tests.mobile.conftest import DrawnFloor, DrawnPose, Photographer
 
 WATCH = FloorWatch.of(nominal_rover())
 PHOTOGRAPHER = Photographer()
 
 
 def drive(
-    floor: Floor, first: float, last: float, step: float = 0.02, seed: int = 5
-) -> list[tuple[Pose, TrackEnd, tuple[float, float]]]:
+    floor: DrawnFloor, first: float, last: float, step: float = 0.02, seed: int = 5
+) -> list[tuple[DrawnPose, TrackEnd, tuple[float, float]]]:
     """Images every `step` m along the line, with a little weaving: poses, and the end that a
     watcher believes in."""
     random = np.random.default_rng(seed)
@@ -47,7 +47,7 @@ def drive(
 def test_the_end_is_recognised_and_placed(
     elements: str, bar: bool, length: float, kind: TrackEnd, inverted: bool
 ) -> None:
-    floor = Floor(elements, bar=bar, inverted=inverted)
+    floor = DrawnFloor(elements, bar=bar, inverted=inverted)
     seen = drive(floor, length - 1.3, length - 0.4)
     assert len(seen) >= 5 and {k for _, k, _ in seen} == {kind}
     there = floor.at(length)
@@ -59,11 +59,11 @@ def test_the_end_is_recognised_and_placed(
 @pytest.mark.parametrize("elements", ["SSS", "SLRS", "SRLLS"])
 def test_a_track_that_goes_on_has_no_end(elements: str) -> None:
     length = sum(2.0 if e == "S" else math.pi / 2 for e in elements)
-    assert drive(Floor(elements), 0.3, length - 1.6, 0.06) == []
+    assert drive(DrawnFloor(elements), 0.3, length - 1.6, 0.06) == []
 
 
 def test_one_image_is_not_believed() -> None:
-    floor = Floor("SSs")
+    floor = DrawnFloor("SSs")
     watcher, random = LineWatcher(WATCH, detect_edges), np.random.default_rng(0)
     sights = [watcher.look(PHOTOGRAPHER(floor, floor.at(3.2 + 0.02 * i), random)) for i in range(4)]
     assert sights[0].broke_off and [sight.end is None for sight in sights[:3]] == [
@@ -74,7 +74,7 @@ def test_one_image_is_not_believed() -> None:
 
 
 def test_a_line_that_vanishes_is_looked_for_anew_after_three_images() -> None:
-    floor, random = Floor("SSS"), np.random.default_rng(0)
+    floor, random = DrawnFloor("SSS"), np.random.default_rng(0)
     watcher = LineWatcher(WATCH, detect_edges)
     blank = np.full((120, 160), 90, dtype=np.uint8)
     assert watcher.look(PHOTOGRAPHER(floor, floor.at(0.2), random)).seen

@@ -6,7 +6,7 @@ from importlib.resources import files
 
 import pytest
 
-from petrobot.services.mobile.model import ModelError, nominal_rover, read_rover
+from petrobot.services.mobile.model import RoverFileError, nominal_rover, read_rover
 
 TEXT = files("petrobot.services.mobile").joinpath("rover.toml").read_text(encoding="utf-8")
 
@@ -24,11 +24,11 @@ def test_the_shipped_file_is_read() -> None:
         ("focal_px = 140.0", 'focal_px = "wide"', "[camera] focal_px"),
         ("principal_px = [79.5, 59.5]", "principal_px = [79.5]", "[camera] principal_px"),
         ("[track]", "[trak]", "[track]"),
-        ("[track]", "[track", "no TOML"),
+        ("[track]", "[track", "not valid TOML"),
     ],
 )
 def test_a_bad_one_is_refused_with_file_and_key(old: str, new: str, named: str) -> None:
     assert old in TEXT
-    with pytest.raises(ModelError) as refused:
+    with pytest.raises(RoverFileError) as refused:
         read_rover(TEXT.replace(old, new, 1), "mine.toml")
     assert "mine.toml" in str(refused.value) and named in str(refused.value)

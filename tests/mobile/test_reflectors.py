@@ -63,7 +63,7 @@ def test_two_reflectors_are_two() -> None:
 
 def test_frames_of_the_sensor() -> None:
     assert parse_echoes(struct.pack("<hHhH", -1234, 2500, 0, 0)) == [(-0.1234, 2.5)]
-    with pytest.raises(ValueError, match="must have 8"):
+    with pytest.raises(ValueError, match="expected 8 bytes"):
         parse_echoes(b"\0\0")
 
 

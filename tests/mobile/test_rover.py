@@ -15,10 +15,10 @@ from petrobot.services.mobile.odometry import Pose as Odo
 from petrobot.services.mobile.odometry import turned
 from petrobot.services.mobile.paths import arc
 from petrobot.services.rehearsal import Rehearsal, rehearse
-from tests.mobile.conftest import Floor, Pose
+from tests.mobile.conftest import DrawnFloor, DrawnPose
 from tests.mobile.yard import Yard
 
-START = Pose(0.0, 0.0, 0.0)
+START = DrawnPose(0.0, 0.0, 0.0)
 
 
 def play(
@@ -72,7 +72,7 @@ def enabled(yard: Yard) -> Yard:
 
 def gap_yard(kind: str, *, reflector: bool = True) -> tuple[Yard, Any]:
     """A rover that has followed the track to an interruption; with what following gave."""
-    floor = Floor("S" + kind + "SS")
+    floor = DrawnFloor("S" + kind + "SS")
     resumes = floor.at(2.0 + (2.0 if kind == "s" else math.pi / 2))
     yard = enabled(Yard(floor, START, reflectors=[(resumes.x, resumes.y)] if reflector else ()))
     followed = play(yard, driving.follow_feed_forward, speed=0.5).result
@@ -81,7 +81,7 @@ def gap_yard(kind: str, *, reflector: bool = True) -> tuple[Yard, Any]:
 
 
 def test_the_drives_are_enabled_and_nothing_moves() -> None:
-    yard = enabled(Yard(Floor("SS"), START))
+    yard = enabled(Yard(DrawnFloor("SS"), START))
     yard.run(0.5)
     assert yard.rover.stopped() and math.hypot(yard.body.x, yard.body.y) < 0.001
 
@@ -92,9 +92,9 @@ def test_the_drives_are_enabled_and_nothing_moves() -> None:
 def test_following_comes_to_the_end_and_stays_on_the_line(
     action: Callable[..., Any], bound: float
 ) -> None:
-    yard = enabled(Yard(Floor("SLRs"), START))
+    yard = enabled(Yard(DrawnFloor("SLRs"), START))
     result = play(yard, action, speed=0.5).result
-    end = Floor("SLR").end
+    end = DrawnFloor("SLR").end
     assert result.status == "success" and result.values["at_t"] is False
     assert max(yard.errors) < bound
     ahead, aside = yard.beyond(end)
@@ -104,7 +104,7 @@ def test_following_comes_to_the_end_and_stays_on_the_line(
 
 
 def test_the_t_is_told_from_an_interruption_and_stopped_at() -> None:
-    floor = Floor("SS", bar=True)
+    floor = DrawnFloor("SS", bar=True)
     yard = enabled(Yard(floor, START))
     followed = play(yard, driving.follow_feed_forward).result
     assert followed.status == "success" and followed.values["at_t"] is True
@@ -204,14 +204,14 @@ def test_a_line_seen_in_passing_is_not_regained_by_turning_away_from_it() -> Non
 
 
 def test_a_search_where_nothing_is_gives_up() -> None:
-    yard = enabled(Yard(Floor("Sss"), START))
+    yard = enabled(Yard(DrawnFloor("Sss"), START))
     followed = play(yard, driving.follow_feed_forward).result
     result = play(yard, driving.search_pattern, line_end=followed.values["line_end"]).result
     assert (result.status, result.cause) == ("failure", "no_track")
 
 
 def test_a_stream_that_ceases_stops_the_rover() -> None:
-    yard = enabled(Yard(Floor("SSS"), START))
+    yard = enabled(Yard(DrawnFloor("SSS"), START))
 
     def cut(now: float) -> None:
         yard.camera = now < 2.0
@@ -222,13 +222,13 @@ def test_a_stream_that_ceases_stops_the_rover() -> None:
 
 
 def test_no_line_at_all_is_an_error() -> None:
-    yard = enabled(Yard(Floor("sss"), START))
+    yard = enabled(Yard(DrawnFloor("sss"), START))
     result = play(yard, driving.follow_feed_forward, patience=1.0).result
     assert (result.status, result.cause) == ("error", "no_line")
 
 
 def test_a_drive_fault_ends_the_run_and_a_reset_mends_it() -> None:
-    yard = enabled(Yard(Floor("SSS"), START))
+    yard = enabled(Yard(DrawnFloor("SSS"), START))
 
     def trip(now: float) -> None:
         if abs(now - 1.5) < 0.001:
@@ -249,7 +249,7 @@ def test_a_drive_fault_ends_the_run_and_a_reset_mends_it() -> None:
 
 
 def test_a_cut_bus_is_an_error_and_comes_back() -> None:
-    yard = enabled(Yard(Floor("SSS"), START))
+    yard = enabled(Yard(DrawnFloor("SSS"), START))
     yard.bus.cut = True
     yard.run(0.2)
     state = yard.rover.state()
@@ -260,7 +260,7 @@ def test_a_cut_bus_is_an_error_and_comes_back() -> None:
 
 
 def test_a_cancelled_follower_comes_to_rest() -> None:
-    yard = enabled(Yard(Floor("SSS"), START))
+    yard = enabled(Yard(DrawnFloor("SSS"), START))
     played = play(yard, driving.follow_feed_forward, cancel_after=2.0)
     assert played.result.cause == "cancelled"
     yard.run(1.2)
@@ -268,7 +268,7 @@ def test_a_cancelled_follower_comes_to_rest() -> None:
 
 
 def test_a_silent_action_does_not_drive_on() -> None:
-    yard = enabled(Yard(Floor("SSSSS"), START))
+    yard = enabled(Yard(DrawnFloor("SSSSS"), START))
     yard.rover.command(yard.ports.now, {"do": "follow", "speed": 0.5})
     yard.run(2.5)
     state = yard.rover.state()
@@ -276,7 +276,7 @@ def test_a_silent_action_does_not_drive_on() -> None:
 
 
 def test_a_pause_holds_and_goes_on() -> None:
-    yard = enabled(Yard(Floor("SSSSS"), START))
+    yard = enabled(Yard(DrawnFloor("SSSSS"), START))
     yard.rover.command(yard.ports.now, {"do": "follow", "speed": 0.5})
     yard.run(0.3)
     assert yard.rover.hold(yard.ports.now) == "held"
@@ -300,12 +300,12 @@ def test_a_pause_holds_and_goes_on() -> None:
     ],
 )
 def test_bad_commands_are_refused(body: dict[str, Any]) -> None:
-    yard = enabled(Yard(Floor("SS"), START))
+    yard = enabled(Yard(DrawnFloor("SS"), START))
     with pytest.raises(ValueError, match=r".+"):
         yard.rover.command(yard.ports.now, body)
 
 
 def test_nothing_is_obeyed_before_the_drives_are_enabled() -> None:
-    yard = Yard(Floor("SS"), START)
+    yard = Yard(DrawnFloor("SS"), START)
     with pytest.raises(ValueError, match="not enabled"):
         yard.rover.command(0.0, {"do": "follow", "speed": 0.5})

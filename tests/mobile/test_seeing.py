@@ -11,16 +11,16 @@ import pytest
 from petrobot.services.comm.streams.camera import MemoryImages
 from petrobot.services.comm.streams.image import Image
 from petrobot.services.mobile import seeing
-from petrobot.services.mobile.camera import CameraError, FloorCamera
+from petrobot.services.mobile.camera import FloorCamera, FloorCameraError
 from petrobot.services.mobile.sight import TrackAhead, TrackEnd
 from petrobot.services.rehearsal import Rehearsal, rehearse
-from tests.mobile.conftest import Floor, Photographer
+from tests.mobile.conftest import DrawnFloor, Photographer
 
 PHOTOGRAPHER = Photographer()
 PERIOD = 0.04
 
 
-class Ports:
+class CameraPorts:
     """What the camera's driver may reach."""
 
     def __init__(self) -> None:
@@ -36,14 +36,19 @@ class Ports:
         raise FileNotFoundError(path)
 
 
-class Drive:
+class CarriedCamera:
     """A camera that is carried along a floor at `speed` m/s from `s` on; `dark` is when it stops
     sending images (s)."""
 
     def __init__(
-        self, floor: Floor, s: float, speed: float = 0.5, dark: float = 1e9, small: bool = False
+        self,
+        floor: DrawnFloor,
+        s: float,
+        speed: float = 0.5,
+        dark: float = 1e9,
+        small: bool = False,
     ) -> None:
-        self.ports = Ports()
+        self.ports = CameraPorts()
         self.camera = FloorCamera({}, self.ports)  # type: ignore[arg-type]
         self._floor, self._s, self._speed, self._dark, self._small = floor, s, speed, dark, small
         self._due, self._sequence = 0.0, 0
@@ -72,7 +77,7 @@ class Drive:
 
 @pytest.mark.parametrize("name", ["edges", "ridge", "consensus", "template"])
 def test_a_track_is_found_in_three_images(name: str) -> None:
-    played = Drive(Floor("SSS"), 0.3, 0.1).play(getattr(seeing, f"find_{name}"))
+    played = CarriedCamera(DrawnFloor("SSS"), 0.3, 0.1).play(getattr(seeing, f"find_{name}"))
     assert played.result.status == "success" and played.result.values["images"] == 3
     assert (
         abs(played.result.values["offset"]) < 0.02 and abs(played.result.values["heading"]) < 0.06
@@ -83,57 +88,57 @@ def test_a_track_is_found_in_three_images(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["edges", "ridge", "consensus", "template"])
 def test_a_track_is_watched_to_its_interruption(name: str) -> None:
-    played = Drive(Floor("SSs"), 2.9).play(getattr(seeing, f"watch_{name}"))
+    played = CarriedCamera(DrawnFloor("SSs"), 2.9).play(getattr(seeing, f"watch_{name}"))
     assert played.result.status == "success" and played.result.values["at_t"] is False
     ends = [TrackAhead.parse(values).end for _, _, values in played.published]
     assert {end.kind for end in ends if end is not None} == {TrackEnd.INTERRUPTION}
 
 
 def test_a_track_is_watched_to_its_t() -> None:
-    played = Drive(Floor("SS", bar=True), 2.7).play(seeing.watch_edges)
+    played = CarriedCamera(DrawnFloor("SS", bar=True), 2.7).play(seeing.watch_edges)
     assert played.result.status == "success" and played.result.values["at_t"] is True
     assert played.result.values["share"] > 0.9
 
 
 def test_nothing_to_find_is_an_error_but_the_stream_tells_that_images_come() -> None:
-    played = Drive(Floor("sss"), 0.3, 0.1).play(seeing.find_edges, timeout=1.0)
+    played = CarriedCamera(DrawnFloor("sss"), 0.3, 0.1).play(seeing.find_edges, timeout=1.0)
     assert (played.result.status, played.result.cause) == ("error", "no_line")
     assert len(played.published) > 20 and all(values[1] == 0.0 for _, _, values in played.published)
 
 
 def test_a_line_that_vanishes_without_an_end_is_lost() -> None:
-    drive = Drive(Floor("SSs"), 3.3, 1.0)
-    drive._floor = Floor("S")  # nothing is painted beyond 2 m, and no end was ever in view
+    drive = CarriedCamera(DrawnFloor("SSs"), 3.3, 1.0)
+    drive._floor = DrawnFloor("S")  # nothing is painted beyond 2 m, and no end was ever in view
     played = drive.play(seeing.watch_edges)
     assert (played.result.status, played.result.cause) == ("error", "no_line")
 
 
 def test_a_camera_that_goes_dark_is_an_error_and_is_started_anew() -> None:
-    drive = Drive(Floor("SSS"), 0.3, 0.1, dark=0.5)
+    drive = CarriedCamera(DrawnFloor("SSS"), 0.3, 0.1, dark=0.5)
     played = drive.play(seeing.watch_edges)
     assert (played.result.status, played.result.cause) == ("error", "no_image")
     assert drive.camera.rate == 0.0
 
 
 def test_images_of_another_size_are_refused() -> None:
-    played = Drive(Floor("SSS"), 0.3, small=True).play(seeing.find_edges)
+    played = CarriedCamera(DrawnFloor("SSS"), 0.3, small=True).play(seeing.find_edges)
     assert (played.result.status, played.result.cause) == ("error", "bad_image")
     assert "160x120" in played.result.text
 
 
 def test_a_cancelled_watch_withdraws_its_set_points() -> None:
-    played = Drive(Floor("SSSS"), 0.3, 0.1).play(seeing.watch_edges, cancel_after=0.5)
+    played = CarriedCamera(DrawnFloor("SSSS"), 0.3, 0.1).play(seeing.watch_edges, cancel_after=0.5)
     assert played.result.cause == "cancelled"
     assert max(time for time, _, _ in played.published) <= 0.51
 
 
 def test_the_driver_refuses_a_rate_that_cannot_be() -> None:
-    with pytest.raises(CameraError, match="rate"):
-        FloorCamera({"rate": 0.0}, Ports())  # type: ignore[arg-type]
+    with pytest.raises(FloorCameraError, match="rate"):
+        FloorCamera({"rate": 0.0}, CameraPorts())  # type: ignore[arg-type]
 
 
 def test_the_driver_is_a_device_without_commands() -> None:
-    camera = FloorCamera({}, Ports())  # type: ignore[arg-type]
+    camera = FloorCamera({}, CameraPorts())  # type: ignore[arg-type]
     camera.start()
     assert camera.state()["rate"] == 25.0 and not camera.stopped() and camera.hold(0.0) == "held"
     camera.stop(0.0)

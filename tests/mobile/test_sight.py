@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from petrobot.services.mobile.sight import (
     STREAMED,
     UNSEEN,
-    End,
+    LineEnd,
     Sight,
     TrackAhead,
     TrackEnd,
@@ -43,7 +43,7 @@ def test_a_parabola_comes_back(offset: float, slope: float, bend: float) -> None
 def test_a_set_point_comes_back_older_by_what_it_was_held(
     age: float, confidence: float, kind: TrackEnd, points: list[tuple[float, float]], held: float
 ) -> None:
-    end = None if kind is TrackEnd.NONE else End(kind, 0.7, -0.1)
+    end = None if kind is TrackEnd.NONE else LineEnd(kind, 0.7, -0.1)
     back = TrackAhead.parse(TrackAhead(age, confidence, end, tuple(points)).values(), held)
     assert (back.confidence, back.end, back.points) == (confidence, end, tuple(points))
     assert back.age == pytest.approx(age + held)

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from petrobot.services.mobile.odometry import Pose
 from petrobot.services.mobile.paths import arc
-from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.mobile.sight import LineEnd, TrackAhead, TrackEnd
 from petrobot.services.mobile.track_map import TrackMap
 
 FAR = 12
 
 
 def sight(
-    pose: Pose, line: Pose, bend: float = 0.0, end: End | None = None, noise: float = 0.0
+    pose: Pose, line: Pose, bend: float = 0.0, end: LineEnd | None = None, noise: float = 0.0
 ) -> TrackAhead:
     """What a camera at `pose` tells of a line (a circle of that curvature through `line`), from
     0.43 m ahead on."""
@@ -89,7 +89,7 @@ def test_the_end_is_the_mean_of_its_sights_and_bounds_what_is_ahead() -> None:
     track = TrackMap()
     for i in range(4):
         pose = Pose(0.03 * i, 0, 0)
-        end = End(TrackEnd.T, 0.9 - pose.x + 0.01 * (-1) ** i, 0.0)
+        end = LineEnd(TrackEnd.T, 0.9 - pose.x + 0.01 * (-1) ** i, 0.0)
         track.take(pose, sight(pose, Pose(0, 0, 0), end=end))
     assert track.end is not None
     kind, x, y = track.end

@@ -12,18 +12,18 @@ from petrobot.services.comm.canopen.cia301 import EMCY_BASE, HEARTBEAT_BASE, TPD
 from petrobot.services.comm.canopen.cia402 import Command, Fault, State
 from petrobot.services.comm.canopen.master import Phase, Power
 from petrobot.services.mobile.wheel_drives import SILENT_CYCLES, WheelMaster
-from tests.mobile.conftest import Floor, Pose
+from tests.mobile.conftest import DrawnFloor, DrawnPose
 from tests.mobile.yard import Yard
 
 CYCLE = 0.02
 LEFT, RIGHT, SENSOR = 1, 2, 3
 
 
-class Bench:
+class WheelBench:
     """A master on a rover's bus; `passes` says which of the nodes' frames come through."""
 
     def __init__(self, quick_stop: float = 30.0) -> None:
-        self.yard = Yard(Floor("SS"), Pose(0.0, 0.0, 0.0))
+        self.yard = Yard(DrawnFloor("SS"), DrawnPose(0.0, 0.0, 0.0))
         self.master = WheelMaster(LEFT, RIGHT, SENSOR, CYCLE, quick_stop)
         self.passes: Callable[[Frame], bool] = lambda frame: True
         self.now = 0.0
@@ -41,7 +41,7 @@ class Bench:
                 if self.passes(frame):
                     self.master.receive(self.now, frame)
 
-    def enabled(self) -> Bench:
+    def enabled(self) -> WheelBench:
         """Configured and enabled."""
         self.run(1.0)
         self.master.reset(self.now)
@@ -56,7 +56,7 @@ def without(node: int, *bases: int) -> Callable[[Frame], bool]:
 
 
 def test_a_sensor_that_never_answers_keeps_nobody_from_driving() -> None:
-    bench = Bench()
+    bench = WheelBench()
     bench.passes = lambda frame: frame.id & 0x7F != SENSOR
     bench.enabled()
     assert not bench.master.sensor_alive
@@ -66,7 +66,7 @@ def test_a_sensor_that_never_answers_keeps_nobody_from_driving() -> None:
 
 
 def test_a_drive_that_never_answers_is_named_and_tried_again() -> None:
-    bench = Bench()
+    bench = WheelBench()
     bench.passes = lambda frame: frame.id & 0x7F != RIGHT
     bench.run(2.5)
     assert bench.master.phase is Phase.CONFIGURING
@@ -85,7 +85,7 @@ def test_a_drive_that_never_answers_is_named_and_tried_again() -> None:
     ],
 )
 def test_silence_of_one_drive_stops_both(base: int, text: str) -> None:
-    bench = Bench().enabled()
+    bench = WheelBench().enabled()
     bench.run(0.5, 3.0)
     bench.passes = without(RIGHT, base)
     bench.run(SILENT_CYCLES * CYCLE + 0.3, 3.0)
@@ -99,7 +99,7 @@ def test_silence_of_one_drive_stops_both(base: int, text: str) -> None:
 
 
 def test_an_emergency_is_told_with_its_wheel_and_its_code() -> None:
-    bench = Bench().enabled()
+    bench = WheelBench().enabled()
     bench.master.receive(bench.now, emergency(LEFT, Fault.OVERCURRENT, 0x03))
     (trouble,) = bench.master.troubles
     assert (trouble.cause, trouble.axis, trouble.code) == ("drive_fault", 0, Fault.OVERCURRENT)
@@ -110,7 +110,7 @@ def test_an_emergency_is_told_with_its_wheel_and_its_code() -> None:
 
 
 def test_a_restarted_sensor_is_no_trouble_and_a_restarted_drive_is() -> None:
-    bench = Bench().enabled()
+    bench = WheelBench().enabled()
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + SENSOR, b"\0"))
     told = [trouble.text for trouble in bench.master.troubles]
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + LEFT, b"\0"))

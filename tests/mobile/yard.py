@@ -13,20 +13,20 @@ import numpy as np
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.mobile.rover import Rover
-from petrobot.services.mobile.sight import End, TrackAhead, TrackEnd
+from petrobot.services.mobile.sight import LineEnd, TrackAhead, TrackEnd
 from petrobot.services.worker.setpoints import SetpointReceiver
 from petrobot.sim.track.drives import RoverBus
-from petrobot.sim.track.rover import Rover as Body
+from petrobot.sim.track.rover import RoverBody as Body
 from petrobot.sim.track.sensor import Echo, ReflectorSensor, look
 from petrobot.sim.track.truth import read_track_site
-from tests.mobile.conftest import Floor, Pose
+from tests.mobile.conftest import DrawnFloor, DrawnPose
 
 ROVER_FILE = Path(__file__).parents[2] / "services" / "mobile" / "rover.toml"
 IMAGE = 0.04
 CYCLE = 0.02
 
 
-class Bus:
+class YardBus:
     """The driver's port."""
 
     def __init__(self, bus: RoverBus) -> None:
@@ -48,15 +48,15 @@ class Bus:
         """Leave."""
 
 
-class Ports:
+class YardPorts:
     """What the driver may reach."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: YardBus) -> None:
         self.now = 0.0
         self._bus = bus
         self.receiver = SetpointReceiver(IMAGE, lambda: self.now)
 
-    def can(self) -> Bus:
+    def can(self) -> YardBus:
         """The bus."""
         return self._bus
 
@@ -83,8 +83,8 @@ class Yard:
 
     def __init__(
         self,
-        floor: Floor,
-        begin: Pose,
+        floor: DrawnFloor,
+        begin: DrawnPose,
         *,
         reflectors: Sequence[tuple[float, float]] = (),
         seed: int = 1,
@@ -95,9 +95,9 @@ class Yard:
         self.body = Body(truth.rover, random)
         self.body.place(truth.rover, (begin.x, begin.y, begin.heading), random)  # type: ignore[arg-type]
         self._sensor = truth.sensor
-        self.bus = Bus(RoverBus(self.body, ReflectorSensor(self._echoes)))
+        self.bus = YardBus(RoverBus(self.body, ReflectorSensor(self._echoes)))
         self._random = np.random.default_rng(seed + 1)
-        self.ports = Ports(self.bus)
+        self.ports = YardPorts(self.bus)
         self.rover = Rover({}, self.ports)
         self.camera = True
         self.errors: list[float] = []
@@ -127,11 +127,11 @@ class Yard:
                 self.rover.step(now)
 
     @property
-    def pose(self) -> Pose:
+    def pose(self) -> DrawnPose:
         """Where the rover truly is."""
-        return Pose(self.body.x, self.body.y, self.body.heading)
+        return DrawnPose(self.body.x, self.body.y, self.body.heading)
 
-    def beyond(self, place: Pose) -> tuple[float, float]:
+    def beyond(self, place: DrawnPose) -> tuple[float, float]:
         """How far the rover is ahead and to the left of a pose (m)."""
         cos, sin = math.cos(place.heading), math.sin(place.heading)
         dx, dy = self.body.x - place.x, self.body.y - place.y
@@ -144,14 +144,14 @@ class Yard:
         """What an ideal camera tells: painted points in its view, the nearest connected row of
         them, and where that ends."""
         rows: list[tuple[float, float]] = []
-        end: End | None = None
+        end: LineEnd | None = None
         for place, painted in zip(self._line, self._painted, strict=True):
             dx, dy = place.x - self.body.x, place.y - self.body.y
             cos, sin = math.cos(self.body.heading), math.sin(self.body.heading)
             x, y = dx * cos + dy * sin, dy * cos - dx * sin
             inside = 0.43 < x < 1.5 and abs(y) < 0.3 + 0.2 * x
             if rows and not painted and inside and end is None and x - rows[-1][0] < 0.05:
-                end = End(TrackEnd.INTERRUPTION, x, y)
+                end = LineEnd(TrackEnd.INTERRUPTION, x, y)
             if (
                 inside
                 and painted
@@ -160,17 +160,17 @@ class Yard:
             ):
                 rows.append((x, y))
             if self.floor.bar and inside and place is self._line[-1] and rows:
-                end = End(TrackEnd.T, x, y)
+                end = LineEnd(TrackEnd.T, x, y)
         points = tuple(rows[:: max(1, len(rows) // 11)][:12]) if len(rows) > 8 else ()
         return TrackAhead(0.0, 1.0 if points else 0.0, end if points else None, points)
 
 
-def _length(floor: Floor) -> float:
+def _length(floor: DrawnFloor) -> float:
     total = sum(2.0 if letter.upper() == "S" else math.pi / 2 for letter, _ in floor.elements)
     return total - 0.25 if floor.bar else total
 
 
-def _painted(floor: Floor, s: float) -> bool:
+def _painted(floor: DrawnFloor, s: float) -> bool:
     for letter, _ in floor.elements:
         s -= 2.0 if letter.upper() == "S" else math.pi / 2
         if s < 0.0:

@@ -274,7 +274,7 @@ class FakeRemote:
         self.state, self._published = self._rig.arm.state(), self._rig.now
 
 
-class Play:
+class ArmPlay:
     """Runs an action on a rig; also the action's context."""
 
     def __init__(self, rig: Rig) -> None:
@@ -295,7 +295,7 @@ class Play:
     def play(
         self,
         action: Coroutine[Any, Any, Result],
-        each: Callable[[Play], None] | None = None,
+        each: Callable[[ArmPlay], None] | None = None,
         cancel: Callable[[], bool] | None = None,
         most: float = 20.0,
     ) -> Result | None:
@@ -323,12 +323,12 @@ class Play:
 
 
 @pytest.fixture
-def play(rig: Rig) -> Play:
+def play(rig: Rig) -> ArmPlay:
     """Runs actions on an enabled arm at home."""
-    return Play(rig)
+    return ArmPlay(rig)
 
 
 @pytest.fixture
-def make_play() -> type[Play]:
+def make_play() -> type[ArmPlay]:
     """For rigs that are not the usual one."""
-    return Play
+    return ArmPlay

@@ -12,13 +12,13 @@ from petrobot.services.action import Status
 from petrobot.services.comm.canopen.cia402 import Fault
 from petrobot.services.motion import actions
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 FALL = math.sqrt(2 * 0.055 / 9.81)
 
 
-class Ball:
+class PredictedBall:
     """A ball that leaves the edge `leaves` seconds from the start, as vision would predict it 50
     times a second from `seen` on.
 
@@ -60,7 +60,7 @@ class Ball:
 
 @pytest.mark.parametrize("action", [actions.intercept_tilted, actions.intercept_upright])
 def test_intercept_is_in_place_before_the_ball(play: Any, action: Callable[..., Any]) -> None:
-    result = play.play(action(play), Ball())
+    result = play.play(action(play), PredictedBall())
     assert result.status is Status.SUCCESS
     assert result.values["slack"] > 0.2
     assert result.values["point"][1] == pytest.approx(0.15, abs=0.002)
@@ -69,13 +69,13 @@ def test_intercept_is_in_place_before_the_ball(play: Any, action: Callable[..., 
 
 
 def test_intercept_waits_for_a_good_prediction(play: Any) -> None:
-    result = play.play(actions.intercept_tilted(play), Ball(sigma=0.03))
+    result = play.play(actions.intercept_tilted(play), PredictedBall(sigma=0.03))
     assert result.status is Status.SUCCESS
     assert result.values["slack"] < 0.1
 
 
 def test_intercept_that_comes_late_is_a_failure_and_goes_on(play: Any) -> None:
-    result = play.play(actions.intercept_tilted(play), Ball(leaves=0.3, y=0.3, seen=0.25))
+    result = play.play(actions.intercept_tilted(play), PredictedBall(leaves=0.3, y=0.3, seen=0.25))
     assert (result.status, result.cause) == (Status.FAILURE, "late")
     assert play.device.state["mode"] == "follow"
 
@@ -89,7 +89,7 @@ def test_intercept_without_a_ball_says_so(play: Any) -> None:
 
 def test_intercept_when_vision_dies_says_so_and_the_arm_holds(play: Any) -> None:
     begun = play.now
-    result = play.play(actions.intercept_tilted(play), Ball(leaves=1.5, y=0.3, until=0.3))
+    result = play.play(actions.intercept_tilted(play), PredictedBall(leaves=1.5, y=0.3, until=0.3))
     assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
     assert play.now - begun < 0.3 + 0.06 + 0.05
     play.rig.run(0.3)
@@ -98,12 +98,12 @@ def test_intercept_when_vision_dies_says_so_and_the_arm_holds(play: Any) -> None
 
 
 def test_intercept_of_a_ball_out_of_reach(play: Any) -> None:
-    result = play.play(actions.intercept_tilted(play), Ball(y=1.4))
+    result = play.play(actions.intercept_tilted(play), PredictedBall(y=1.4))
     assert (result.status, result.cause) == (Status.ERROR, "unreachable")
 
 
 def test_intercept_with_a_faulty_drive(play: Any) -> None:
-    ball = Ball()
+    ball = PredictedBall()
 
     def world(play: Any) -> None:
         ball(play)
@@ -118,14 +118,14 @@ def test_intercept_with_a_faulty_drive(play: Any) -> None:
 @pytest.mark.parametrize("action", [actions.intercept_tilted, actions.follow_and_wait])
 def test_a_cancelled_run_leaves_the_arm_holding(play: Any, action: Callable[..., Any]) -> None:
     begun = play.now
-    assert play.play(action(play), Ball(), cancel=lambda: play.now - begun > 0.4) is None
+    assert play.play(action(play), PredictedBall(), cancel=lambda: play.now - begun > 0.4) is None
     play.rig.run(0.3)
     assert play.rig.arm.state()["mode"] == "hold"
     assert play.rig.arm.stopped()
 
 
 def test_the_two_actions_of_a_catch_hand_over(play: Any) -> None:
-    ball = Ball()
+    ball = PredictedBall()
     assert play.play(actions.intercept_tilted(play), ball).status is Status.SUCCESS
     result = play.play(actions.follow_and_wait(play), ball)
     assert result.status is Status.SUCCESS
@@ -141,7 +141,7 @@ def test_the_two_actions_of_a_catch_hand_over(play: Any) -> None:
 
 
 def test_a_ball_that_does_not_come_is_missed(play: Any) -> None:
-    ball = Ball(caught=False)
+    ball = PredictedBall(caught=False)
     play.play(actions.intercept_tilted(play), ball)
     result = play.play(actions.follow_and_wait(play, margin=0.4), ball)
     assert (result.status, result.cause) == (Status.FAILURE, "missed")
@@ -150,7 +150,7 @@ def test_a_ball_that_does_not_come_is_missed(play: Any) -> None:
 
 
 def test_waiting_while_vision_dies_is_an_error(play: Any) -> None:
-    ball = Ball(leaves=2.0, until=0.9)
+    ball = PredictedBall(leaves=2.0, until=0.9)
     assert play.play(actions.intercept_tilted(play), ball).status is Status.SUCCESS
     result = play.play(actions.follow_and_wait(play), ball)
     assert (result.status, result.cause) == (Status.ERROR, "no_setpoint")
@@ -220,7 +220,7 @@ def test_an_arm_that_cannot_get_home_past_the_table_says_so_and_does_not_touch_i
         start=[math.radians(angle) for angle in (0.0, 90.0, -90.0, 0.0, 0.0, 0.0)]
     ).enable()
     arm = nominal_arm()
-    bare = Guard(Puma.of(arm), arm, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
+    bare = CollisionGuard(Puma.of(arm), arm, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
     play = make_play(rig)
     result = play.play(actions.reset_and_home(play, timeout=5.0, speed=0.7))
     assert (result.status, result.cause) == (Status.ERROR, "arm_timeout")

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.canopen.cia402 import Fault
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import nominal_arm, nominal_cell
 
 ARM = nominal_arm()
 PUMA = Puma.of(ARM)
-TOUCH = Guard(PUMA, ARM, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
+TOUCH = CollisionGuard(PUMA, ARM, nominal_cell(), cup_margin=0.0, arm_margin=0.0)
 """Says what is really touched, without margins."""
 CYCLE = 0.004
 AWAY = [math.radians(angle) for angle in (-60.0, 63.0, -205.0, 40.0, 70.0, 90.0)]
@@ -101,12 +101,12 @@ def test_speed_is_a_share(rig: Any) -> None:
         ({}, "unknown command None"),
         ({"do": "dance"}, "unknown command 'dance': know move, follow"),
         ({"do": "move", "pose": "moon"}, "unknown pose 'moon': know home, empty, ready"),
-        ({"do": "move", "pose": [0.0] * 5}, "a pose is a name or 6 angles"),
-        ({"do": "move", "pose": [0.0] * 5 + [math.nan]}, "a pose is a name or 6 angles"),
+        ({"do": "move", "pose": [0.0] * 5}, "expected a name or 6 finite angles"),
+        ({"do": "move", "pose": [0.0] * 5 + [math.nan]}, "expected a name or 6 finite angles"),
         ({"do": "move", "pose": [9.0] + [0.0] * 5}, "joint 1 beyond its limit"),
         ({"do": "move", "pose": [0.33, 0.52, -3.3, 0.12, 0.85, 0.06]}, "cup at the table"),
-        ({"do": "move", "pose": "home", "speed": 0.0}, "must be at least 0.001"),
-        ({"do": "move", "pose": "home", "speed": True}, "must be at least 0.001"),
+        ({"do": "move", "pose": "home", "speed": 0.0}, "expected a number from 0.001 to 1"),
+        ({"do": "move", "pose": "home", "speed": True}, "expected a number from 0.001 to 1"),
         ({"do": "follow", "strategy": "net"}, "unknown strategy 'net': know tilted, upright"),
     ],
 )
@@ -123,10 +123,10 @@ def test_bad_commands_are_refused_and_change_nothing(
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        ({"speed": 0.0}, "speed = 0.0"),
-        ({"speed": "fast"}, "must be of type float"),
+        ({"speed": 0.0}, "speed: expected a number above 0"),
+        ({"speed": "fast"}, "speed: expected a float, got 'fast'"),
         ({"stream_period": -1.0}, "stream_period"),
-        ({"enable": 1}, "must be of type bool"),
+        ({"enable": 1}, "enable: expected a bool, got 1"),
         ({"sped": 0.5}, "unknown key 'sped'; did you mean 'speed'"),
     ],
 )

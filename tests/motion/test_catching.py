@@ -23,7 +23,7 @@ STEP = 5e-4
 Vector = np.ndarray[Any, np.dtype[np.float64]]
 
 
-class Trial(NamedTuple):
+class CatchTrial(NamedTuple):
     """A ball as it leaves the edge: at y (m), with speed and heading (m/s, rad), so many seconds
     after its release."""
 
@@ -39,7 +39,7 @@ class Trial(NamedTuple):
         )
 
 
-def throw(rng: np.random.Generator, low: float, high: float) -> Trial:
+def throw(rng: np.random.Generator, low: float, high: float) -> CatchTrial:
     """A nominal throw: released 0.1 m from the far edge with 70 to 100 % of the spin of rolling,
     unknown rolling resistance."""
     length = 1.5
@@ -48,13 +48,15 @@ def throw(rng: np.random.Generator, low: float, high: float) -> Trial:
     drag = 0.006 * rng.uniform(0.7, 1.3) * 9.81
     leaving = math.sqrt(rolling**2 - 2 * drag * length)
     heading = math.atan2(target - release, length)
-    return Trial(target, leaving, heading, 2 * length / math.cos(heading) / (rolling + leaving))
+    return CatchTrial(
+        target, leaving, heading, 2 * length / math.cos(heading) / (rolling + leaving)
+    )
 
 
 class BallInCup:
     """A ball in flight and in a cup that is held still."""
 
-    def __init__(self, start: Trial, mouth: Vector, axis: Vector) -> None:
+    def __init__(self, start: CatchTrial, mouth: Vector, axis: Vector) -> None:
         self.p = np.array([CELL.near_edge, start.y, CELL.table_top + BALL])
         self.v = start.velocity
         self.w = np.cross([0.0, 0.0, 1.0], self.v) / BALL
@@ -108,7 +110,7 @@ class BallInCup:
 
 
 def _catch(
-    rig: Any, ball: Trial, strategy: str, rng: np.random.Generator, noise: float, blind: float
+    rig: Any, ball: CatchTrial, strategy: str, rng: np.random.Generator, noise: float, blind: float
 ) -> bool:
     """One throw: vision sees it after `blind` s, with errors of `noise` (m at the edge for each
     second that is left)."""
@@ -165,7 +167,7 @@ def test_upright_is_good_at_slow_balls(rig: Any) -> None:
 
 
 def test_a_cup_that_is_not_there_catches_nothing() -> None:
-    ball = Trial(0.1, 1.5, 0.0, 1.0)
+    ball = CatchTrial(0.1, 1.5, 0.0, 1.0)
     assert not BallInCup(ball, np.array([0.5, -0.1, 0.55]), np.array([0.0, 0.0, 1.0])).caught()
 
 
@@ -192,13 +194,13 @@ def test_the_home_pose_is_near_every_ball() -> None:
     tenth of a second at the least."""
     from petrobot.services.motion.interception import STRATEGIES, Interceptor, Prediction
     from petrobot.services.motion.kinematics import Puma, branch_of
-    from petrobot.services.motion.limits import Guard
+    from petrobot.services.motion.limits import CollisionGuard
 
     arm = nominal_arm()
     puma = Puma.of(arm)
     home = arm.poses["home"]
     interceptor = Interceptor(
-        puma, CELL, Guard(puma, arm, CELL), home, branch_of(puma, np.array(home))
+        puma, CELL, CollisionGuard(puma, arm, CELL), home, branch_of(puma, np.array(home))
     )
     rng = np.random.default_rng(7)
     for low, high in REGIMES.values():

@@ -31,7 +31,7 @@ from petrobot.services.comm.canopen.cia402 import (
     state_of,
     to_units,
 )
-from petrobot.services.motion.drive_link import DriveLink, DriveSettings
+from petrobot.services.motion.drive_master import DriveSettings, JointDriveLink
 from petrobot.sim.catching.drives import DriveBus, ratings
 from tests.waiting import Limit
 
@@ -39,7 +39,7 @@ TPDO, RPDO = canopen.pdo_struct(SENT), canopen.pdo_struct(RECEIVED)
 CYCLE = 0.004
 
 
-class Bench:
+class ArmDriveBench:
     """Six drives on a bench; the test is the master of the first one."""
 
     def __init__(self, plant: Any, table: Any) -> None:
@@ -81,7 +81,7 @@ class Bench:
         return int.from_bytes(answer.data[4:], "little")
 
     def configure(self) -> None:
-        link = DriveLink(1, DriveSettings(-2.7, 2.7, 13.0))
+        link = JointDriveLink(1, DriveSettings(-2.7, 2.7, 13.0))
         for transfer in link.transfers(CYCLE):
             self.sdo(transfer)
         self.send(canopen.nmt(NmtCommand.START))
@@ -118,20 +118,20 @@ class Bench:
 
 
 @pytest.fixture
-def bench(make_plant: Callable[[], Any], table: Any) -> Bench:
-    return Bench(make_plant(), table)
+def bench(make_plant: Callable[[], Any], table: Any) -> ArmDriveBench:
+    return ArmDriveBench(make_plant(), table)
 
 
-def test_boot_up_of_every_node(bench: Bench) -> None:
+def test_boot_up_of_every_node(bench: ArmDriveBench) -> None:
     assert {frame.id for frame in bench.frames if frame.data == b"\x00"} == set(range(0x701, 0x708))
 
 
-def test_no_process_data_before_the_node_is_started(bench: Bench) -> None:
+def test_no_process_data_before_the_node_is_started(bench: ArmDriveBench) -> None:
     bench.cycle(Command.SHUTDOWN.word, 3)
     assert not [frame for frame in bench.frames if frame.id == 0x181]
 
 
-def test_the_way_to_operation_state_by_state(bench: Bench) -> None:
+def test_the_way_to_operation_state_by_state(bench: ArmDriveBench) -> None:
     bench.configure()
     seen = []
     for command in (
@@ -155,7 +155,7 @@ def test_the_way_to_operation_state_by_state(bench: Bench) -> None:
     assert bench.plant.braked[0]
 
 
-def test_a_set_point_is_followed_and_held_against_gravity(bench: Bench) -> None:
+def test_a_set_point_is_followed_and_held_against_gravity(bench: ArmDriveBench) -> None:
     bench.enable()
     start = bench.target
     for cycle in range(1, 201):
@@ -185,7 +185,7 @@ def test_a_set_point_is_followed_and_held_against_gravity(bench: Bench) -> None:
         (Frame(0x601, bytes.fromhex("60 40 60 00 00 00 00 00")), Abort.COMMAND),
     ],
 )
-def test_abort_codes(bench: Bench, frame: Frame, code: Abort) -> None:
+def test_abort_codes(bench: ArmDriveBench, frame: Frame, code: Abort) -> None:
     assert bench.refused(frame) == code
 
 
@@ -198,32 +198,32 @@ def test_abort_codes(bench: Bench, frame: Frame, code: Abort) -> None:
         (0x5FFF0010, Abort.NO_OBJECT),
     ],
 )
-def test_what_cannot_be_mapped_is_refused(bench: Bench, entry: int, code: Abort) -> None:
+def test_what_cannot_be_mapped_is_refused(bench: ArmDriveBench, entry: int, code: Abort) -> None:
     bench.sdo(Transfer(0x1600, 0, Type.UNSIGNED8, 0))
     assert (
         bench.refused(canopen.sdo_write_request(1, 0x1600, 1, entry.to_bytes(4, "little"))) == code
     )
 
 
-def test_a_mapping_beyond_eight_bytes_is_refused(bench: Bench) -> None:
+def test_a_mapping_beyond_eight_bytes_is_refused(bench: ArmDriveBench) -> None:
     bench.sdo(Transfer(0x1A00, 0, Type.UNSIGNED8, 0))
     for sub in (1, 2, 3):
         bench.sdo(Transfer(0x1A00, sub, Type.UNSIGNED32, 0x60640020))
     assert bench.refused(canopen.sdo_write_request(1, 0x1A00, 0, b"\x03")) == Abort.PDO_LENGTH
 
 
-def test_a_pdo_that_is_on_keeps_its_mapping(bench: Bench) -> None:
+def test_a_pdo_that_is_on_keeps_its_mapping(bench: ArmDriveBench) -> None:
     bench.configure()
     assert bench.refused(canopen.sdo_write_request(1, 0x1A00, 0, b"\x00")) == Abort.STATE
 
 
-def test_mode_and_limits_cannot_change_while_the_motor_has_torque(bench: Bench) -> None:
+def test_mode_and_limits_cannot_change_while_the_motor_has_torque(bench: ArmDriveBench) -> None:
     bench.enable()
     for index, sub, data in ((0x6060, 0, b"\x00"), (0x607D, 2, bytes(4)), (0x60C2, 1, b"\x08")):
         assert bench.refused(canopen.sdo_write_request(1, index, sub, data)) == Abort.STATE
 
 
-def test_software_limits_cut_the_target(bench: Bench) -> None:
+def test_software_limits_cut_the_target(bench: ArmDriveBench) -> None:
     bench.enable()
     start = bench.target
     limit = Limit("the target", steps=1000)
@@ -235,7 +235,7 @@ def test_software_limits_cut_the_target(bench: Bench) -> None:
     assert bench.status()[1] == pytest.approx(2.7, abs=1e-3)
 
 
-def test_quick_stop_ramps_down_and_holds_and_can_be_left(bench: Bench) -> None:
+def test_quick_stop_ramps_down_and_holds_and_can_be_left(bench: ArmDriveBench) -> None:
     bench.enable()
     for _ in range(100):
         bench.target += 0.004
@@ -254,7 +254,7 @@ def test_quick_stop_ramps_down_and_holds_and_can_be_left(bench: Bench) -> None:
     assert bench.state() is State.OPERATION_ENABLED
 
 
-def test_without_sync_the_drive_stops_by_itself(bench: Bench) -> None:
+def test_without_sync_the_drive_stops_by_itself(bench: ArmDriveBench) -> None:
     bench.enable()
     for _ in range(100):
         bench.target += 0.004
@@ -271,7 +271,7 @@ def test_without_sync_the_drive_stops_by_itself(bench: Bench) -> None:
     assert bench.plant.qd[0] == 0.0
 
 
-def test_without_the_masters_heartbeat_the_drive_stops_by_itself(bench: Bench) -> None:
+def test_without_the_masters_heartbeat_the_drive_stops_by_itself(bench: ArmDriveBench) -> None:
     bench.enable()
     bench.beats = False
     silent = bench.now
@@ -282,7 +282,9 @@ def test_without_the_masters_heartbeat_the_drive_stops_by_itself(bench: Bench) -
     assert 0.2 - 2 * CYCLE <= bench.now - silent <= 0.2 + 2 * CYCLE
 
 
-def test_a_blocked_joint_trips_the_following_error_and_a_reset_clears_it(bench: Bench) -> None:
+def test_a_blocked_joint_trips_the_following_error_and_a_reset_clears_it(
+    bench: ArmDriveBench,
+) -> None:
     bench.enable()
     bench.plant.braked[0] = True
     for _ in range(60):
@@ -298,7 +300,7 @@ def test_a_blocked_joint_trips_the_following_error_and_a_reset_clears_it(bench: 
     assert bench.emergencies() == [Fault.FOLLOWING_ERROR, Fault.NONE]
 
 
-def test_a_fault_is_reset_on_the_rising_edge_only(bench: Bench) -> None:
+def test_a_fault_is_reset_on_the_rising_edge_only(bench: ArmDriveBench) -> None:
     bench.configure()
     bench.cycle(Command.FAULT_RESET.word)
     bench.bus.trip(0, Fault.OVERCURRENT)
@@ -309,7 +311,7 @@ def test_a_fault_is_reset_on_the_rising_edge_only(bench: Bench) -> None:
     assert bench.state() is State.SWITCH_ON_DISABLED
 
 
-def test_open_power_chain_drops_the_brakes_and_forbids_reset(bench: Bench) -> None:
+def test_open_power_chain_drops_the_brakes_and_forbids_reset(bench: ArmDriveBench) -> None:
     bench.enable()
     bench.bus.power(False)
     assert bench.plant.braked[0]
@@ -327,7 +329,7 @@ def test_open_power_chain_drops_the_brakes_and_forbids_reset(bench: Bench) -> No
     assert bench.state() is State.SWITCH_ON_DISABLED
 
 
-def test_leaving_operational_while_enabled_stops_the_motion(bench: Bench) -> None:
+def test_leaving_operational_while_enabled_stops_the_motion(bench: ArmDriveBench) -> None:
     bench.enable()
     bench.send(canopen.nmt(NmtCommand.ENTER_PREOPERATIONAL, 1))
     assert bench.bus.drives[0].state is State.QUICK_STOP_ACTIVE
@@ -340,7 +342,7 @@ def test_leaving_operational_while_enabled_stops_the_motion(bench: Bench) -> Non
     )
 
 
-def test_reset_gives_a_boot_up_and_the_defaults_again(bench: Bench) -> None:
+def test_reset_gives_a_boot_up_and_the_defaults_again(bench: ArmDriveBench) -> None:
     bench.enable()
     bench.frames.clear()
     bench.send(canopen.nmt(NmtCommand.RESET_NODE, 1))
@@ -350,7 +352,7 @@ def test_reset_gives_a_boot_up_and_the_defaults_again(bench: Bench) -> None:
     assert bench.sdo(Transfer(0x1017, 0, Type.UNSIGNED16)) == 0
 
 
-def test_slow_drives_say_so_and_cut_what_is_too_fast(bench: Bench) -> None:
+def test_slow_drives_say_so_and_cut_what_is_too_fast(bench: ArmDriveBench) -> None:
     bench.enable()
     rated = bench.sdo(Transfer(Object.MAX_SPEED, 0, Type.UNSIGNED32))
     bench.bus.slow_down(0.5)
@@ -364,7 +366,7 @@ def test_slow_drives_say_so_and_cut_what_is_too_fast(bench: Bench) -> None:
     assert bench.plant.factor == 0.5
 
 
-def test_inputs_are_sent_on_change_and_by_the_timer(bench: Bench) -> None:
+def test_inputs_are_sent_on_change_and_by_the_timer(bench: ArmDriveBench) -> None:
     cob_id = 0x187
     bench.sdo(Transfer(0x1800, 5, Type.UNSIGNED16, 100), node=7)
     bench.sdo(Transfer(0x1800, 1, Type.UNSIGNED32, cob_id), node=7)
@@ -382,7 +384,7 @@ def test_inputs_are_sent_on_change_and_by_the_timer(bench: Bench) -> None:
     assert bench.frames[-1] == Frame(cob_id, b"\x00") or Frame(cob_id, b"\x00") in bench.frames
 
 
-def test_short_process_data_is_reported_and_not_obeyed(bench: Bench) -> None:
+def test_short_process_data_is_reported_and_not_obeyed(bench: ArmDriveBench) -> None:
     bench.enable()
     bench.send(Frame(0x201, b"\x00\x00"))
     bench.send(canopen.SYNC)

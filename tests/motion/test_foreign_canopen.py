@@ -24,8 +24,8 @@ from petrobot.services.comm.canopen.cia402 import (
     from_units,
 )
 from petrobot.services.comm.canopen.hub import Hub
-from petrobot.services.motion.drive_link import DriveSettings
-from petrobot.services.motion.drive_master import DriveMaster, Phase
+from petrobot.services.comm.canopen.master import Phase
+from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.sim.catching.drives import DriveBus, ratings
 
 canopen: Any = importlib.import_module("canopen")  # it has no annotations worth the name

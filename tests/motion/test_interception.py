@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.motion.interception import STRATEGIES, Interceptor, Plan, Prediction
+from petrobot.services.motion.interception import STRATEGIES, CatchPlan, Interceptor, Prediction
 from petrobot.services.motion.kinematics import Puma, branch_of
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import nominal_arm, nominal_cell
 from petrobot.services.motion.trajectory import reach_time
 
 ARM, CELL = nominal_arm(), nominal_cell()
 PUMA = Puma.of(ARM)
-GUARD = Guard(PUMA, ARM, CELL)
+GUARD = CollisionGuard(PUMA, ARM, CELL)
 HOME = ARM.poses["home"]
 INTERCEPTOR = Interceptor(PUMA, CELL, GUARD, HOME, branch_of(PUMA, np.array(HOME)))
 STILL = (0.0,) * 6
@@ -37,8 +37,8 @@ def _exit(
 
 
 def _plan(
-    prediction: Prediction, strategy: str = "tilted", before: Plan | None = None
-) -> Plan | None:
+    prediction: Prediction, strategy: str = "tilted", before: CatchPlan | None = None
+) -> CatchPlan | None:
     return INTERCEPTOR.plan(
         STRATEGIES[strategy], prediction, HOME, STILL, SPEED, ACCELERATION, before
     )
@@ -100,7 +100,7 @@ def test_small_changes_of_the_prediction_move_the_pose_a_little(
     assert _alone(first.candidate, changed) is None or _alone(second.candidate, prediction) is None
 
 
-def _alone(candidate: int, prediction: Prediction) -> Plan | None:
+def _alone(candidate: int, prediction: Prediction) -> CatchPlan | None:
     """The plan if there were no other candidate."""
     strategy = STRATEGIES["tilted"]
     depth, hand = divmod(candidate, len(strategy.hands))
@@ -163,11 +163,11 @@ def test_a_set_point_gets_older_while_it_lies() -> None:
     ],
 )
 def test_what_is_no_catch_point_is_refused(values: list[float]) -> None:
-    with pytest.raises(ValueError, match="a catch point has"):
+    with pytest.raises(ValueError, match="catch point: expected"):
         Prediction.parse(values)
 
 
 def test_a_cup_along_the_flange_is_refused() -> None:
     cup = replace(CELL.cup, axis=(0.0, 0.0, 1.0))
-    with pytest.raises(ValueError, match="axis must not lie along"):
+    with pytest.raises(ValueError, match="expected an axis across"):
         Interceptor(PUMA, replace(CELL, cup=cup), GUARD, HOME, branch_of(PUMA, np.array(HOME)))

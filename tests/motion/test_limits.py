@@ -8,16 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.services.host.numba_kernels import COMPILED, plain
-from petrobot.services.motion.clearance import Point, clear, clear_step
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.limits import LOOKS, NEAR, Guard
+from petrobot.services.motion.limits import LOOKS, NEAR, CollisionGuard, Point, clear, clear_step
 from petrobot.services.motion.model import nominal_arm, nominal_cell
 from petrobot.services.motion.steering import CLOSER, Steering
 from petrobot.services.motion.trajectory import Six, Trajectory, six
 
 ARM, CELL = nominal_arm(), nominal_cell()
 PUMA = Puma.of(ARM)
-GUARD = Guard(PUMA, ARM, CELL)
+GUARD = CollisionGuard(PUMA, ARM, CELL)
 HOME = np.array(ARM.poses["home"])
 ANGLES = st.tuples(
     *(
@@ -134,13 +133,13 @@ def test_an_arm_switched_on_in_a_forbidden_pose_may_leave_it_creeping() -> None:
 
 
 def test_a_closer_guard_lets_pass_what_a_wider_one_refuses() -> None:
-    wide = Guard(PUMA, ARM, CELL, cup_margin=0.10, arm_margin=0.10)
+    wide = CollisionGuard(PUMA, ARM, CELL, cup_margin=0.10, arm_margin=0.10)
     assert GUARD.violation(HOME.tolist()) == ""
     assert wide.violation(HOME.tolist()) == "cup at the table"
     assert wide.closer(0.05).violation(HOME.tolist()) == ""
 
 
-class Thorough(Guard):
+class Thorough(CollisionGuard):
     """Looks at everything, however far the arm is from it."""
 
     def _arm_far(self, elbow: Point, wrist: Point) -> bool:
@@ -155,7 +154,7 @@ class Thorough(Guard):
 def test_an_arm_that_is_far_from_everything_touches_nothing(angles: tuple[float, ...]) -> None:
     """The short cuts for an arm that is far away never hide a touch."""
     for margins in ((0.0, 0.0), (0.005, 0.01), (0.05, 0.05)):
-        assert Guard(PUMA, ARM, CELL, *margins).violation(angles) == Thorough(
+        assert CollisionGuard(PUMA, ARM, CELL, *margins).violation(angles) == Thorough(
             PUMA, ARM, CELL, *margins
         ).violation(angles)
 
@@ -165,7 +164,7 @@ def test_an_arm_that_is_far_from_everything_touches_nothing(angles: tuple[float,
 def test_a_rest_pose_found_clear_is_not_taken_for_another_arms(
     offset: tuple[float, ...], cycles: int
 ) -> None:
-    guard = Guard(PUMA, ARM, CELL)
+    guard = CollisionGuard(PUMA, ARM, CELL)
     moving, stuck = (
         Trajectory(HOME.tolist(), 0.004, ARM.speed.tolist(), ARM.acceleration.tolist())
         for _ in range(2)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from petrobot.services.motion.kinematics import Puma
-from petrobot.services.motion.limits import Guard
+from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import (
-    ModelError,
+    ArmFileError,
     nominal_arm,
     nominal_cell,
     read_arm,
@@ -35,20 +35,24 @@ def test_the_nominal_arm_is_the_published_one() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("limits = [-160.0, 160.0]", "limits = [-160.0]", "joint 1: limits must be 2 numbers"),
-        ("torque = 186.4", 'torque = "much"', "joint 2: torque must be a finite number"),
-        ("wrist = 0.055", "", "body: wrist must be a finite number"),
-        ("home = [18.7", "home = [180.0", "home lies outside the joint limits"),
+        (
+            "limits = [-160.0, 160.0]",
+            "limits = [-160.0]",
+            "joint 1: limits: expected a list of 2 numbers",
+        ),
+        ("torque = 186.4", 'torque = "much"', "joint 2: torque: expected a finite number"),
+        ("wrist = 0.055", "", "body: wrist: expected a finite number"),
+        ("home = [18.7", "home = [180.0", "poses.home: lies outside the joint limits"),
         (
             "[[link]]\nmass = 17.4",
             "[[spare]]\nmass = 17.4",
-            "needs 6 [[joint]] and [[link]], has 6 and 5",
+            "expected 6 tables [[joint]] and [[link]] each, got 6 and 5",
         ),
     ],
 )
 def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
     assert old in ARM
-    with pytest.raises(ModelError, match=r"puma560\.toml") as caught:
+    with pytest.raises(ArmFileError, match=r"puma560\.toml") as caught:
         read_arm(ARM.replace(old, new, 1))
     assert says in str(caught.value)
 
@@ -56,14 +60,14 @@ def test_a_bad_arm_is_refused_by_name(old: str, new: str, says: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("[cup]", "[mug]", r"lacks \[cup\]"),
+        ("[cup]", "[mug]", r"table \[cup\] is missing"),
         ("axis = [-1.0, 0.0, 0.0]", "axis = [-1.0, 0.5, 0.0]", "unit vector"),
-        ("near_edge = 0.62", "near_edge = true", "near_edge must be a finite number"),
+        ("near_edge = 0.62", "near_edge = true", "near_edge: expected a finite number"),
     ],
 )
 def test_a_bad_cell_is_refused_by_name(old: str, new: str, says: str) -> None:
     assert old in CELL
-    with pytest.raises(ModelError, match=says):
+    with pytest.raises(ArmFileError, match=says):
         read_cell(CELL.replace(old, new, 1))
 
 
@@ -94,7 +98,7 @@ def test_the_accelerations_can_be_had_for_the_torques() -> None:
 
 def test_named_poses_are_clear_and_the_cup_is_at_the_edge() -> None:
     arm, cell = nominal_arm(), nominal_cell()
-    guard = Guard(Puma.of(arm), arm, cell)
+    guard = CollisionGuard(Puma.of(arm), arm, cell)
     for name, pose in arm.poses.items():
         assert guard.violation(pose) == "", name
     home, empty = guard.place(arm.poses["home"]), guard.place(arm.poses["empty"])

@@ -17,8 +17,8 @@ import pytest
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import NmtCommand, Type, map_pdo, nmt, sdo_write_request
 from petrobot.services.comm.canopen.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
-from petrobot.sim.catching.laboratory import Laboratory
-from petrobot.sim.catching.puma_model import ArmModel
+from petrobot.sim.catching.laboratory import CatchingLaboratory
+from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.site import Site, read_site
 from tests.sim.laboratory_bench import LaboratoryBench
 
@@ -34,7 +34,7 @@ def site() -> Site:
 
 
 @pytest.fixture(scope="session")
-def arm(site: Site) -> ArmModel:
+def arm(site: Site) -> PumaModel:
     """The shipped arm."""
     return site.arm
 
@@ -43,7 +43,7 @@ class Master:
     """Sets six drives up over SDO, enables them, and leads them along straight joint paths at most
     of the joint limits."""
 
-    def __init__(self, model: ArmModel, pose: Sequence[float], share: float = 0.9) -> None:
+    def __init__(self, model: PumaModel, pose: Sequence[float], share: float = 0.9) -> None:
         self._speed, self._acceleration = share * model.speed, share * model.acceleration
         self.target = np.array(pose, dtype=float)
         self.position = np.array(pose, dtype=float)
@@ -143,11 +143,13 @@ class Master:
         return now >= self._ends
 
 
-class Bench(LaboratoryBench):
+class CatchingBench(LaboratoryBench):
     """The catching cell's laboratory and its master."""
 
     def __init__(self, site: Site, **options: Any) -> None:
-        self.lab = Laboratory("laboratory", site, lambda name: PARTIES.get(name, name), **options)
+        self.lab = CatchingLaboratory(
+            "laboratory", site, lambda name: PARTIES.get(name, name), **options
+        )
         self.home: list[float] = site.arm.poses["home"].tolist()
         self.master = Master(site.arm, self.home)
         super().__init__(self.lab, self.master, "arm")
@@ -179,12 +181,12 @@ class Bench(LaboratoryBench):
 
 
 @pytest.fixture
-def bench(site: Site) -> Iterator[Callable[..., Bench]]:
+def bench(site: Site) -> Iterator[Callable[..., CatchingBench]]:
     """Makes benches; options as for Laboratory."""
-    made: list[Bench] = []
+    made: list[CatchingBench] = []
 
-    def make(**options: Any) -> Bench:
-        made.append(Bench(site, **options))
+    def make(**options: Any) -> CatchingBench:
+        made.append(CatchingBench(site, **options))
         return made[-1]
 
     yield make
@@ -200,7 +202,7 @@ def cell_master(site: Site) -> Callable[[], Master]:
 
 def run_digests(seed: int, regime: str, prepared_before: bool = False) -> list[str]:
     """Digests of the score, of all images and of the arm's end position after a throw."""
-    made = Bench(
+    made = CatchingBench(
         read_site(CELL_FILE),
         seed=77 if prepared_before else seed,
         regime="A" if prepared_before else regime,

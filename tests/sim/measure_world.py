@@ -31,7 +31,7 @@ def reference() -> float:
     return best
 
 
-class Meter:
+class WorldMeter:
     """Adds up the CPU time that methods take, with what they call."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ def measure(regime: str, rate: float, parts: bool) -> None:
 
     from petrobot.sim.catching.site import read_site
 
-    bench, meter = Bench(read_site(CELL_FILE), seed=1, regime=regime), Meter()
+    bench, meter = Bench(read_site(CELL_FILE), seed=1, regime=regime), WorldMeter()
     lab = bench.lab
     bench.enable()
     bench.want_images(rate)

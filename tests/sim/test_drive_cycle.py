@@ -14,7 +14,7 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import NmtCommand, NmtState, SdoClient, Transfer, Type
 from petrobot.services.comm.canopen.cia402 import RECEIVED, SENT, Command, Fault, Object, to_units
 from petrobot.sim.catching import drives
-from petrobot.sim.catching.drives import Drive, DriveBus
+from petrobot.sim.catching.drives import DriveBus, ServoDrive
 from petrobot.sim.catching.servo import DriveRating
 from tests.waiting import Limit
 
@@ -49,7 +49,7 @@ class Joints:
                 self.q[joint] += dt * self.qd[joint]
 
 
-class StepByStep(Drive):
+class StepByStep(ServoDrive):
     """A drive that never takes the quick way."""
 
     def after_configuring(self) -> None:
@@ -57,10 +57,10 @@ class StepByStep(Drive):
         self._usual = False
 
 
-class Bench:
+class CycleBench:
     """A bus of one kind of drives, and what they have sent."""
 
-    def __init__(self, kind: type[Drive], monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, kind: type[ServoDrive], monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
             patch.setattr(drives, "Drive", kind)
             self.bus = DriveBus(Joints(), [DriveRating(40.0, 2.0, 1.0)] * 6)
@@ -143,7 +143,7 @@ happenings = st.tuples(
 @given(course=st.lists(happenings, min_size=1, max_size=40))
 def test_the_quick_way_sends_what_the_steps_send(course: list[tuple[str, int, bool]]) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        benches = [Bench(kind, monkeypatch) for kind in (Drive, StepByStep)]
+        benches = [CycleBench(kind, monkeypatch) for kind in (ServoDrive, StepByStep)]
     quick = 0
     for bench in benches:
         for word in WORDS * 2:
@@ -164,7 +164,7 @@ def test_the_quick_way_sends_what_the_steps_send(course: list[tuple[str, int, bo
 def test_a_bench_of_aims_goes_the_quick_way() -> None:
     """Else the comparison above would compare the same with the same."""
     with pytest.MonkeyPatch.context() as monkeypatch:
-        bench = Bench(Drive, monkeypatch)
+        bench = CycleBench(ServoDrive, monkeypatch)
     for word in WORDS + [WORDS[-1]] * 5:
         bench.happen("aim", 11)
         bench.cycle(word, None, False)

@@ -30,7 +30,7 @@ from petrobot.sim.catching.arm_motion import (
     stepped,
     stepped_packed,
 )
-from petrobot.sim.catching.puma_model import ArmModel
+from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.site import Triple, carried, numbers_of
 
 ZERO: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -201,7 +201,7 @@ TRIPLE = st.tuples(*[st.floats(-1.0, 1.0, allow_subnormal=False)] * 3)
     origin=TRIPLE,
 )
 def test_what_the_flange_carries_is_where_the_arms_frames_put_it_to_the_bit(
-    arm: ArmModel, q: Six, zero: Six, axes: tuple[Triple, Triple, Triple], origin: Triple
+    arm: PumaModel, q: Six, zero: Six, axes: tuple[Triple, Triple, Triple], origin: Triple
 ) -> None:
     numbers = numbers_of(arm, zero, axes, origin)
     flange = arm.flange_frame([angle + off for angle, off in zip(q, zero, strict=True)])

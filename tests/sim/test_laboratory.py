@@ -16,7 +16,7 @@ import pytest
 from petrobot.services.comm.lockstep.channels import images_wanted
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Executed
-from petrobot.sim.catching.course import Outcome
+from petrobot.sim.catching.course import ThrowOutcome
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.thrower import draw_throw
 from petrobot.sim.exposures import Exposures
@@ -213,14 +213,14 @@ def test_arm_power_falls_and_comes_back(bench: Benches) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ({"kind": "fire"}, "no fault is called 'fire'"),
+        ({"kind": "fire"}, "unknown fault 'fire'"),
         ({"kind": "drive_fault"}, "joint is missing"),
         ({"kind": "drive_fault", "joint": 7}, "from 1 to 6"),
         ({"kind": "drive_fault", "joint": 1.5}, "whole number"),
         ({"kind": "slow_arm", "factor": 0.0}, "from 0.05 to 1"),
-        ({"kind": "dead_camera", "joint": 1}, "takes no 'joint'"),
-        ({"kind": "drop_images", "share": "half"}, "share is 'half'"),
-        ({}, "no fault is called ''"),
+        ({"kind": "dead_camera", "joint": 1}, "unknown key 'joint'"),
+        ({"kind": "drop_images", "share": "half"}, "from 0 to 1, got 'half'"),
+        ({}, "unknown fault ''"),
     ],
 )
 def test_a_fault_that_cannot_be_is_refused(
@@ -275,9 +275,9 @@ def test_a_throw_takes_the_status_of_its_cycle(bench: Benches) -> None:
     ("arguments", "says"),
     [
         ({"regime": "Z"}, "must begin with"),
-        ({"seed": -1}, "seed is -1"),
-        ({"seed": "one"}, "seed is 'one'"),
-        ({"throws": 1.5}, "throws is 1.5"),
+        ({"seed": -1}, "of 0 or more, got -1"),
+        ({"seed": "one"}, "of 0 or more, got 'one'"),
+        ({"throws": 1.5}, "or none, got 1.5"),
     ],
 )
 def test_a_preparation_that_cannot_be_is_refused(
@@ -306,4 +306,4 @@ def test_the_same_seed_gives_the_same_bits_here_and_in_a_fresh_process(digests: 
 
 
 def test_outcomes_are_plain_words() -> None:
-    assert {str(outcome) for outcome in Outcome} == {"rolling", "caught", "missed", "dropped"}
+    assert {str(outcome) for outcome in ThrowOutcome} == {"rolling", "caught", "missed", "dropped"}

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.catching.oracle import Oracle, Verdict
+from petrobot.sim.catching.oracle import Oracle, OracleVerdict
 from petrobot.sim.catching.site import CupMount, Site
 from petrobot.sim.catching.thrower import draw_throw
 from petrobot.sim.catching.truth import Truth
@@ -17,7 +17,7 @@ from petrobot.sim.catching.truth import Truth
 THROWS = 60
 
 
-def verdicts(site: Site, regime: str, throws: int = THROWS) -> list[Verdict]:
+def verdicts(site: Site, regime: str, throws: int = THROWS) -> list[OracleVerdict]:
     truth = site.truth(regime)
     oracle, home = Oracle(site.arm, truth, site.cell), site.arm.poses["home"].tolist()
     return [oracle.judge(draw_throw(1, n, site.cell, truth), home) for n in range(1, throws + 1)]

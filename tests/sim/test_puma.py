@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.sim.catching.puma import ArmPlant, RigidBody, urdf
-from petrobot.sim.catching.puma_model import ArmModel, Link
+from petrobot.sim.catching.puma_model import PrincipalInertia, PumaModel
 from petrobot.sim.catching.servo import JointServo
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.truth import Vector
@@ -24,16 +24,16 @@ ANGLES = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6)
 
 
 @pytest.fixture(scope="module")
-def body(arm: ArmModel) -> RigidBody:
+def body(arm: PumaModel) -> RigidBody:
     return RigidBody(arm, GRAVITY)
 
 
-def angles(arm: ArmModel, shares: list[float]) -> list[float]:
+def angles(arm: PumaModel, shares: list[float]) -> list[float]:
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
     return (middle + half * np.array(shares)).tolist()  # type: ignore[no-any-return]
 
 
-def potential_energy(arm: ArmModel, q: Sequence[float]) -> float:
+def potential_energy(arm: PumaModel, q: Sequence[float]) -> float:
     """From masses and heights alone (J)."""
     frames = arm.frames(q)
     return sum(
@@ -42,7 +42,7 @@ def potential_energy(arm: ArmModel, q: Sequence[float]) -> float:
     )
 
 
-def without_friction(arm: ArmModel) -> ArmModel:
+def without_friction(arm: PumaModel) -> PumaModel:
     return replace(arm, viscous=np.zeros(6), coulomb=np.zeros(6))
 
 
@@ -62,7 +62,7 @@ def test_gravity_is_the_published_one(
     assert body.bias(q, [0.0] * 6) == pytest.approx(torques, abs=1e-4)
 
 
-def test_mass_matrix_is_the_published_one(arm: ArmModel, body: RigidBody) -> None:
+def test_mass_matrix_is_the_published_one(arm: PumaModel, body: RigidBody) -> None:
     published = [
         [3.6594, -0.4044, 0.1006, -0.0025, 0.0, 0.0],
         [-0.4044, 4.4137, 0.3509, 0.0, 0.0024, 0.0],
@@ -78,14 +78,14 @@ def test_mass_matrix_is_the_published_one(arm: ArmModel, body: RigidBody) -> Non
     assert mass[1:, 1:] == pytest.approx(np.array(published)[1:, 1:], abs=1e-3)
 
 
-def test_zero_pose_is_the_published_one(arm: ArmModel) -> None:
+def test_zero_pose_is_the_published_one(arm: PumaModel) -> None:
     assert arm.flange_frame(QZ).origin == pytest.approx((0.4521, -0.15005, 0.4318 + 0.67183))
 
 
 @settings(max_examples=60, deadline=None)
 @given(shares=ANGLES)
 def test_forward_kinematics_agrees_with_bullet(
-    arm: ArmModel, body: RigidBody, shares: list[float]
+    arm: PumaModel, body: RigidBody, shares: list[float]
 ) -> None:
     q = angles(arm, shares)
     flange = arm.flange_frame(q)
@@ -99,7 +99,7 @@ def test_forward_kinematics_agrees_with_bullet(
 @settings(max_examples=40, deadline=None)
 @given(shares=ANGLES)
 def test_gravity_is_the_gradient_of_the_potential_energy(
-    arm: ArmModel, body: RigidBody, shares: list[float]
+    arm: PumaModel, body: RigidBody, shares: list[float]
 ) -> None:
     q, step = angles(arm, shares), 1e-5
     gradient = []
@@ -114,18 +114,18 @@ def test_gravity_is_the_gradient_of_the_potential_energy(
 @settings(max_examples=40, deadline=None)
 @given(shares=ANGLES)
 def test_mass_matrix_is_symmetric_and_positive(
-    arm: ArmModel, body: RigidBody, shares: list[float]
+    arm: PumaModel, body: RigidBody, shares: list[float]
 ) -> None:
     mass = body.mass_matrix(angles(arm, shares))
     assert mass == pytest.approx(mass.T, abs=1e-12)
     assert np.linalg.eigvalsh(mass + np.diag(arm.rotor)).min() > 0.1
 
 
-def test_every_published_tensor_reaches_bullet(arm: ArmModel, body: RigidBody) -> None:
+def test_every_published_tensor_reaches_bullet(arm: PumaModel, body: RigidBody) -> None:
     """Bullet silently zeroes an impossible tensor: moments of inertia about each joint must
     count."""
     links = tuple(
-        Link(n.mass, n.centre, (2 * n.inertia[0], 2 * n.inertia[1], 2 * n.inertia[2]))
+        PrincipalInertia(n.mass, n.centre, (2 * n.inertia[0], 2 * n.inertia[1], 2 * n.inertia[2]))
         for n in arm.links
     )
     difference = RigidBody(replace(arm, links=links), GRAVITY).mass_matrix(QN) - body.mass_matrix(
@@ -137,19 +137,19 @@ def test_every_published_tensor_reaches_bullet(arm: ArmModel, body: RigidBody) -
     )
 
 
-def test_urdf_names_all_six_joints(arm: ArmModel) -> None:
+def test_urdf_names_all_six_joints(arm: PumaModel) -> None:
     text = urdf(arm)
     assert [text.count(f'name="joint{n}"') for n in range(1, 7)] == [1] * 6
 
 
-def released(arm: ArmModel, q: list[float], joints: range = range(6)) -> ArmPlant:
+def released(arm: PumaModel, q: list[float], joints: range = range(6)) -> ArmPlant:
     plant = ArmPlant(arm, GRAVITY, q)
     for joint in joints:
         plant.release(joint)
     return plant
 
 
-def test_energy_is_kept_without_friction(arm: ArmModel) -> None:
+def test_energy_is_kept_without_friction(arm: PumaModel) -> None:
     free = without_friction(arm)
     body, start = RigidBody(free, GRAVITY), [0.3, 0.9, -1.6, 0.4, 0.8, 0.0]
     plant = released(free, start)
@@ -167,7 +167,7 @@ def test_energy_is_kept_without_friction(arm: ArmModel) -> None:
     assert energy() == pytest.approx(before, abs=0.01 * drop)
 
 
-def test_brakes_hold_and_stop_the_arm(arm: ArmModel) -> None:
+def test_brakes_hold_and_stop_the_arm(arm: PumaModel) -> None:
     home = arm.poses["home"].tolist()
     plant = ArmPlant(arm, GRAVITY, home)
     for _ in range(200):
@@ -187,7 +187,7 @@ def test_brakes_hold_and_stop_the_arm(arm: ArmModel) -> None:
 @pytest.mark.parametrize(
     ("torque", "moves"), [(20.0, False), (-20.0, False), (32.0, True), (-32.0, True)]
 )
-def test_dry_friction_holds_up_to_its_limit(arm: ArmModel, torque: float, moves: bool) -> None:
+def test_dry_friction_holds_up_to_its_limit(arm: PumaModel, torque: float, moves: bool) -> None:
     """Joint 1 feels no gravity; its dry friction is 62.6 x 0.415 = 26 N m."""
     plant = released(arm, arm.poses["home"].tolist(), range(1))
     for _ in range(100):
@@ -197,7 +197,7 @@ def test_dry_friction_holds_up_to_its_limit(arm: ArmModel, torque: float, moves:
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5, 0.3])
-def test_speed_has_a_limit(arm: ArmModel, factor: float) -> None:
+def test_speed_has_a_limit(arm: PumaModel, factor: float) -> None:
     plant = released(arm, arm.poses["home"].tolist(), range(1))
     plant.slow_down(factor)
     fastest = 0.0
@@ -207,7 +207,7 @@ def test_speed_has_a_limit(arm: ArmModel, factor: float) -> None:
     assert 0.9 * factor < fastest / arm.speed[0] < 1.15 * factor
 
 
-def test_torque_has_a_limit(arm: ArmModel) -> None:
+def test_torque_has_a_limit(arm: PumaModel) -> None:
     home = arm.poses["home"].tolist()
     at_limit, beyond = released(arm, home, range(1)), released(arm, home, range(1))
     for _ in range(30):
@@ -216,7 +216,7 @@ def test_torque_has_a_limit(arm: ArmModel) -> None:
     assert at_limit.q == beyond.q
 
 
-def test_hard_stops_end_the_motion(arm: ArmModel) -> None:
+def test_hard_stops_end_the_motion(arm: PumaModel) -> None:
     plant = released(arm, [arm.upper[0] - 0.05, *arm.poses["home"][1:].tolist()], range(1))
     for _ in range(600):
         plant.step(0.001, [90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -224,13 +224,13 @@ def test_hard_stops_end_the_motion(arm: ArmModel) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, 1.5])
-def test_a_bad_speed_factor_is_refused(arm: ArmModel, factor: float) -> None:
+def test_a_bad_speed_factor_is_refused(arm: PumaModel, factor: float) -> None:
     plant = ArmPlant(arm, GRAVITY, QZ)
     with pytest.raises(ValueError, match="speed factor"):
         plant.slow_down(factor)
 
 
-def test_step_size_hardly_matters(arm: ArmModel) -> None:
+def test_step_size_hardly_matters(arm: PumaModel) -> None:
     def swing(dt: float) -> Vector:
         plant = released(arm, arm.poses["home"].tolist())
         for _ in range(round(0.3 / dt)):

@@ -20,7 +20,7 @@ from petrobot.services.comm.location_file import load
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Answer, Call, Command, Hello, Outcome
 from petrobot.services.comm.streams.camera import StreamImages
-from petrobot.sim.catching.laboratory import Laboratory
+from petrobot.sim.catching.laboratory import CatchingLaboratory
 from petrobot.sim.catching.truth import LaboratoryError
 from petrobot.sim.realtime import LaboratoryShell, bus_channel, camera_address
 from tests.ports import free_ports
@@ -107,7 +107,7 @@ async def test_drives_answer_on_the_bus(
         return bool(master.enabled)
 
     await until(exchange)
-    assert isinstance(lab, Laboratory)
+    assert isinstance(lab, CatchingLaboratory)
     assert master.position == pytest.approx(lab.plant.q, abs=1e-3)
     port.close()
 
@@ -231,7 +231,7 @@ def test_an_address_that_is_taken_is_told_by_file_address_and_remedy(
     assert (
         f"python -m petrobot.sim: {file}: " in said
         and str(port) in said
-        and "or give another port" in said
+        and "or use another port" in said
     )
 
 

@@ -63,7 +63,7 @@ def test_every_disturbance_of_the_file_is_tried_here(site: Site) -> None:
     [
         ("D", "must begin with one of A, B, C"),
         ("dim", "must begin with"),
-        ("A+fog", "no disturbance 'fog'"),
+        ("A+fog", "unknown disturbance 'fog'"),
         ("A+latency200+latency400", "latency200 and latency400 both set image_latency"),
     ],
 )

@@ -12,11 +12,11 @@ import pytest
 
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.catching.ball import BallState, TableMotion, fly
-from petrobot.sim.catching.course import Course, Outcome
+from petrobot.sim.catching.course import ThrowCourse, ThrowOutcome
 from petrobot.sim.catching.puma_model import Frame3
 from petrobot.sim.catching.site import Site
 from petrobot.sim.catching.thrower import Throw, draw_throw
-from petrobot.sim.catching.world import Where, World
+from petrobot.sim.catching.world import BallWorld, Where
 
 AWAY = Frame3((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, 0.0, 0.3))
 
@@ -27,19 +27,19 @@ def leaned(angle: float, origin: tuple[float, float, float]) -> Frame3:
     return Frame3((c, 0.0, -s), (0.0, 1.0, 0.0), (s, 0.0, c), origin)
 
 
-class Hand:
+class WorldByHand:
     """A world stepped by hand."""
 
     def __init__(self, site: Site, regime: str) -> None:
         self.site, self.truth = site, site.truth(regime)
-        self.world = World(site.cell, self.truth)
+        self.world = BallWorld(site.cell, self.truth)
         self.tick = 0
 
     @property
     def now(self) -> float:
         return self.tick * TICK
 
-    def throw(self, n: int, **changes: object) -> Course:
+    def throw(self, n: int, **changes: object) -> ThrowCourse:
         thrown = draw_throw(5, n, self.site.cell, self.truth)
         return self.world.release(self.now, replace(thrown, **changes))  # type: ignore[arg-type]
 
@@ -67,7 +67,7 @@ class Hand:
             self.step(cup)
         assert until()
 
-    def hold_under(self, course: Course, aside: float = 0.0, lean: float = 0.5) -> Frame3:
+    def hold_under(self, course: ThrowCourse, aside: float = 0.0, lean: float = 0.5) -> Frame3:
         """The cup where the ball comes, `aside` (m) of it along y, leaning by a share of the ball's
         slant."""
         _, state = self.where_it_will_be(course.throw, 0.10)
@@ -75,20 +75,20 @@ class Hand:
         return leaned(lean * math.atan2(-vx, -vz), (x, y + aside, z))
 
 
-def _left(course: Course) -> bool:
+def _left(course: ThrowCourse) -> bool:
     return course.exit_state is not None
 
 
-def _free(world: World) -> bool:
+def _free(world: BallWorld) -> bool:
     return not world.barrier
 
 
 @pytest.fixture
-def hand(site: Site) -> Iterator[Callable[[str], Hand]]:
-    hands: list[Hand] = []
+def hand(site: Site) -> Iterator[Callable[[str], WorldByHand]]:
+    hands: list[WorldByHand] = []
 
-    def make(regime: str) -> Hand:
-        hands.append(Hand(site, regime))
+    def make(regime: str) -> WorldByHand:
+        hands.append(WorldByHand(site, regime))
         return hands[-1]
 
     yield make
@@ -98,7 +98,7 @@ def hand(site: Site) -> Iterator[Callable[[str], Hand]]:
 
 @pytest.mark.parametrize("regime", "ABC")
 def test_a_cup_in_the_right_place_catches_every_ball(
-    hand: Callable[[str], Hand], regime: str
+    hand: Callable[[str], WorldByHand], regime: str
 ) -> None:
     here = hand(regime)
     for n in range(1, 13):
@@ -106,7 +106,7 @@ def test_a_cup_in_the_right_place_catches_every_ball(
         cup = here.hold_under(course)
         due = here.now + here.where_it_will_be(course.throw, 0.10)[0]
         here.run(cup, lambda: here.world.where is Where.AT_REST)
-        assert course.outcome is Outcome.CAUGHT and course.miss < 0.002
+        assert course.outcome is ThrowOutcome.CAUGHT and course.miss < 0.002
         assert course.released_at + course.caught_at == pytest.approx(due + 0.1, abs=0.05)
         assert here.world.barrier
         here.world.take_away(here.now)
@@ -115,17 +115,21 @@ def test_a_cup_in_the_right_place_catches_every_ball(
 
 @pytest.mark.parametrize("aside", [0.07, -0.12])
 def test_a_miss_is_measured_in_the_plane_of_the_mouth(
-    hand: Callable[[str], Hand], aside: float
+    hand: Callable[[str], WorldByHand], aside: float
 ) -> None:
     here = hand("A")
     course = here.throw(3)
     cup = here.hold_under(course, aside)
     here.run(cup, lambda: here.world.course is None)
-    assert course.outcome is Outcome.MISSED and course.miss == pytest.approx(abs(aside), abs=0.002)
+    assert course.outcome is ThrowOutcome.MISSED and course.miss == pytest.approx(
+        abs(aside), abs=0.002
+    )
     assert course.ended_at < 12.0 and here.world.ball is None
 
 
-def test_exit_is_noted_exactly_also_with_the_cup_at_the_edge(hand: Callable[[str], Hand]) -> None:
+def test_exit_is_noted_exactly_also_with_the_cup_at_the_edge(
+    hand: Callable[[str], WorldByHand],
+) -> None:
     here = hand("C")
     for n, fall in ((1, 0.10), (2, 0.005)):
         course = here.throw(n)
@@ -141,11 +145,11 @@ def test_exit_is_noted_exactly_also_with_the_cup_at_the_edge(hand: Callable[[str
 
 @pytest.mark.parametrize(("restitution", "least", "most"), [(0.3, 1.0, 1.0), (0.8, 0.0, 0.4)])
 def test_restitution_decides_whether_fast_balls_stay_in(
-    hand: Callable[[str], Hand], restitution: float, least: float, most: float
+    hand: Callable[[str], WorldByHand], restitution: float, least: float, most: float
 ) -> None:
     here = hand("C")
     here.world.close()
-    here.world = World(
+    here.world = BallWorld(
         here.site.cell, replace(here.truth, cup=replace(here.truth.cup, restitution=restitution))
     )
     outcomes = []
@@ -157,10 +161,12 @@ def test_restitution_decides_whether_fast_balls_stay_in(
         if here.world.course is not None:
             here.world.take_away(here.now)
         here.run(AWAY, lambda: not here.world.barrier)
-    assert least <= outcomes.count(Outcome.CAUGHT) / len(outcomes) <= most
+    assert least <= outcomes.count(ThrowOutcome.CAUGHT) / len(outcomes) <= most
 
 
-def test_a_ball_that_is_jerked_out_of_the_cup_was_dropped(hand: Callable[[str], Hand]) -> None:
+def test_a_ball_that_is_jerked_out_of_the_cup_was_dropped(
+    hand: Callable[[str], WorldByHand],
+) -> None:
     here = hand("A")
     course = here.throw(2)
     cup = here.hold_under(course, lean=0.0)
@@ -170,11 +176,11 @@ def test_a_ball_that_is_jerked_out_of_the_cup_was_dropped(hand: Callable[[str], 
     for k in range(1, 16):  # up at 2.5 m/s, then away from under it
         here.step(cup._replace(origin=(x, y, z + 0.010 * k)))
     here.run(cup._replace(origin=(x, y + 0.3, z)), lambda: here.world.course is None)
-    assert course.outcome is Outcome.DROPPED
+    assert course.outcome is ThrowOutcome.DROPPED
 
 
 def test_a_turned_cup_loses_its_ball_to_the_floor_and_it_stays_caught(
-    hand: Callable[[str], Hand],
+    hand: Callable[[str], WorldByHand],
 ) -> None:
     here = hand("A")
     course = here.throw(2)
@@ -184,10 +190,10 @@ def test_a_turned_cup_loses_its_ball_to_the_floor_and_it_stays_caught(
         here.step(leaned(math.pi * k / 100, cup.origin))
     here.run(leaned(math.pi, cup.origin), lambda: here.world.course is None, 2.0)
     here.run(leaned(math.pi, cup.origin), lambda: not here.world.barrier, 1.0)
-    assert course.outcome is Outcome.CAUGHT
+    assert course.outcome is ThrowOutcome.CAUGHT
 
 
-def test_the_barrier_waits_its_delay(hand: Callable[[str], Hand]) -> None:
+def test_the_barrier_waits_its_delay(hand: Callable[[str], WorldByHand]) -> None:
     here = hand("B")
     course = here.throw(1)
     cup = here.hold_under(course)
@@ -196,7 +202,9 @@ def test_the_barrier_waits_its_delay(hand: Callable[[str], Hand]) -> None:
     assert 0.098 < here.now - came < 0.125
 
 
-def test_a_slow_ball_tips_over_the_edge_and_falls_near_it(hand: Callable[[str], Hand]) -> None:
+def test_a_slow_ball_tips_over_the_edge_and_falls_near_it(
+    hand: Callable[[str], WorldByHand],
+) -> None:
     here = hand("A")
     slow = BallState(
         (0.8, 0.0, here.truth.table.top + 0.02),
@@ -212,30 +220,30 @@ def test_a_slow_ball_tips_over_the_edge_and_falls_near_it(hand: Callable[[str], 
         return here.world.course is None
 
     here.run(AWAY, gone)
-    assert course.exit_state is not None and course.outcome is Outcome.MISSED
+    assert course.exit_state is not None and course.outcome is ThrowOutcome.MISSED
     assert here.truth.table.near_edge - 0.25 < lowest[-1][0] < here.truth.table.near_edge - 0.02
 
 
 @pytest.mark.parametrize(("velocity", "exits"), [((-0.1, 0.0), False), ((-0.4, 0.9), False)])
 def test_a_ball_that_stops_or_leaves_sideways_is_missed_and_taken_away(
-    hand: Callable[[str], Hand], velocity: tuple[float, float], exits: bool
+    hand: Callable[[str], WorldByHand], velocity: tuple[float, float], exits: bool
 ) -> None:
     here = hand("A")
     spin = here.world.model.spin_of_rolling(*velocity)
     start = BallState((1.5, 0.0, here.truth.table.top + 0.02), (*velocity, 0.0), spin)
     course = here.throw(1, start=start, rolling_resistance=0.006)
     here.run(AWAY, lambda: here.world.course is None)
-    assert course.outcome is Outcome.MISSED and (course.exit_state is not None) is exits
+    assert course.outcome is ThrowOutcome.MISSED and (course.exit_state is not None) is exits
 
 
-def test_one_ball_at_a_time(hand: Callable[[str], Hand]) -> None:
+def test_one_ball_at_a_time(hand: Callable[[str], WorldByHand]) -> None:
     here = hand("A")
     here.throw(1)
     with pytest.raises(RuntimeError, match="one at a time"):
         here.throw(2)
 
 
-def test_two_worlds_go_the_same_way_to_the_bit(hand: Callable[[str], Hand]) -> None:
+def test_two_worlds_go_the_same_way_to_the_bit(hand: Callable[[str], WorldByHand]) -> None:
     traces = []
     for _ in range(2):
         here, trace = hand("B"), []

@@ -40,7 +40,7 @@ def true_view(cell: Mapping[str, Any], **changes: Any) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Ball:
+class RolledBall:
     """A ball that slides, then rolls on a straight line; written from the mechanics, not from
     services or sim.
 
@@ -100,9 +100,9 @@ class Ball:
         return self.arrival(float(way)), float(self.start[1] + way * self.heading[1])
 
 
-def draw_ball(rng: np.random.Generator, regime: str = "A") -> Ball:
+def draw_ball(rng: np.random.Generator, regime: str = "A") -> RolledBall:
     """A throw of the regime, as the cell's notes have it."""
-    return Ball(
+    return RolledBall(
         start=(2.12, float(rng.uniform(-0.3, 0.3))),
         aim=(0.62, float(rng.uniform(-0.3, 0.3))),
         speed=float(rng.uniform(*REGIMES[regime])),
@@ -112,12 +112,12 @@ def draw_ball(rng: np.random.Generator, regime: str = "A") -> Ball:
 
 
 @dataclass
-class Bench:
+class CameraBench:
     """The simulated camera over a table with at most one ball, in lock step; `drawn` may add arm
     and cup."""
 
     camera: PinholeCamera
-    ball: Ball | None = None
+    ball: RolledBall | None = None
     release: float = 0.5
     latency: float = 0.012
     light: Callable[[float], float] = lambda time: 1.0
@@ -167,7 +167,7 @@ class Bench:
 class BenchPorts:
     """What the camera's driver may reach on the bench."""
 
-    def __init__(self, bench: Bench, files: Mapping[str, bytes] | None = None) -> None:
+    def __init__(self, bench: CameraBench, files: Mapping[str, bytes] | None = None) -> None:
         self._bench = bench
         self._files = files or {}
 
@@ -196,7 +196,7 @@ class BenchContext:
     """The context of one run, driven by `run_action`. `published` holds (time, values), values None
     where withdrawn."""
 
-    bench: Bench
+    bench: CameraBench
     device: Any
     run: str = "1"
     published: list[tuple[float, list[float] | None]] = field(default_factory=list)
@@ -246,7 +246,7 @@ class BenchContext:
 
 
 def run_action(
-    bench: Bench,
+    bench: CameraBench,
     action: Coroutine[Any, Any, Result],
     limit: float = 20.0,
     cancel_at: float = float("inf"),

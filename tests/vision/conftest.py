@@ -9,7 +9,7 @@ import pytest
 
 from petrobot.services.vision.camera import Camera
 from petrobot.sim.catching.camera import PinholeCamera
-from tests.vision.bench import Bench, BenchContext, BenchPorts, read_cell, true_view
+from tests.vision.bench import BenchContext, BenchPorts, CameraBench, read_cell, true_view
 
 
 @pytest.fixture(scope="session")
@@ -26,13 +26,13 @@ def pinhole(cell: dict[str, Any]) -> PinholeCamera:
 
 
 @pytest.fixture
-def bench(pinhole: PinholeCamera) -> Bench:
+def bench(pinhole: PinholeCamera) -> CameraBench:
     """A bench whose noise begins anew."""
     pinhole.reseed(np.random.default_rng(11))
-    return Bench(pinhole)
+    return CameraBench(pinhole)
 
 
 @pytest.fixture
-def context(bench: Bench) -> BenchContext:
+def context(bench: CameraBench) -> BenchContext:
     """A context with a camera that knows its shipped calibration only."""
     return BenchContext(bench, Camera({}, BenchPorts(bench)))

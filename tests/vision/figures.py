@@ -20,7 +20,7 @@ import numpy as np
 from petrobot.services.action import Result
 from petrobot.services.vision import actions
 from petrobot.services.vision.camera import Camera
-from petrobot.services.vision.location import Window
+from petrobot.services.vision.location import BallWindow
 from petrobot.services.vision.prediction import (
     ConstantVelocity,
     Kalman,
@@ -32,9 +32,9 @@ from petrobot.sim.catching.camera import PinholeCamera
 from tests.vision.bench import (
     ROOT,
     Array,
-    Bench,
     BenchContext,
     BenchPorts,
+    CameraBench,
     draw_ball,
     read_cell,
     run_action,
@@ -57,7 +57,7 @@ LIGHTS: dict[str, Callable[[float], float]] = {
 }
 
 
-class TimedBench(Bench):
+class TimedBench(CameraBench):
     """A bench that knows how much CPU its own pictures took."""
 
     own = 0.0
@@ -69,7 +69,7 @@ class TimedBench(Bench):
 
 
 @dataclass
-class Tally:
+class LocatorTally:
     """What many runs of one alternative came to."""
 
     ends: Counter[str] = field(default_factory=Counter)
@@ -102,10 +102,10 @@ class Tally:
 
 def throws(
     camera: PinholeCamera, locator: str, predictor: str, regime: str, light: str, count: int
-) -> tuple[Tally, Tally, Array]:
+) -> tuple[LocatorTally, LocatorTally, Array]:
     """Throws one after the other before one camera; errors (n, 2) of time and place at 0.45 s
     before the ball leaves."""
-    rng, located, tracked, errors = np.random.default_rng(3), Tally(), Tally(), []
+    rng, located, tracked, errors = np.random.default_rng(3), LocatorTally(), LocatorTally(), []
     camera.reseed(np.random.default_rng(4))
     bench = TimedBench(camera, light=LIGHTS[light])
     driver = Camera({}, BenchPorts(bench))
@@ -192,7 +192,7 @@ def draw_picture(camera: PinholeCamera) -> None:
     """The camera's view with places seen, the window, and the predicted exit with two standard
     deviations."""
     camera.reseed(np.random.default_rng(4))
-    bench = Bench(camera, draw_ball(np.random.default_rng(12), "A"))
+    bench = CameraBench(camera, draw_ball(np.random.default_rng(12), "A"))
     bench.cup = np.eye(4)
     bench.cup[:3, 3] = [0.56, 0.0, 0.55]
     bench.arm = (
@@ -217,7 +217,9 @@ def draw_picture(camera: PinholeCamera) -> None:
     print(f"{PICTURE.relative_to(ROOT)}: {PICTURE.stat().st_size / 1000:.0f} kB")
 
 
-def annotate(bench: Bench, camera: Camera, places: list[list[float]], values: list[float]) -> Any:
+def annotate(
+    bench: CameraBench, camera: Camera, places: list[list[float]], values: list[float]
+) -> Any:
     """Draw over the image of now; noise is averaged away so that the file stays small."""
     stack = np.mean([bench.picture() for _ in range(60)], axis=0)
     canvas = cv2.cvtColor(
@@ -260,13 +262,15 @@ def annotate(bench: Bench, camera: Camera, places: list[list[float]], values: li
     return canvas
 
 
-def window_sees(bench: Bench, camera: Camera) -> Array:
+def window_sees(bench: CameraBench, camera: Camera) -> Array:
     """The ball's centre (px) as the tracker's window measures it now."""
     assert bench.ball is not None and camera.background.picture is not None
     near = camera.view.to_pixels(bench.ball.place(bench.now - bench.release)) + np.array(
         [3.0, -2.0]
     )
-    seen = Window(camera.view).measure(bench.picture(), camera.background.picture, near, spread=6.0)
+    seen = BallWindow(camera.view).measure(
+        bench.picture(), camera.background.picture, near, spread=6.0
+    )
     assert seen is not None
     return seen.centre
 

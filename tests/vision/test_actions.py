@@ -13,7 +13,14 @@ from petrobot.services.action import Cancelled, Result, Status
 from petrobot.services.vision import actions
 from petrobot.services.vision.camera import Camera
 from petrobot.sim.catching.camera import PinholeCamera
-from tests.vision.bench import Ball, Bench, BenchContext, BenchPorts, draw_ball, run_action
+from tests.vision.bench import (
+    BenchContext,
+    BenchPorts,
+    CameraBench,
+    RolledBall,
+    draw_ball,
+    run_action,
+)
 
 LOCATORS = {
     "background": actions.locate_background,
@@ -83,7 +90,7 @@ def test_a_ball_is_located_tracked_and_predicted(
 
 @pytest.mark.parametrize("predictor", sorted(PREDICTORS))
 def test_every_predictor_tracks_a_slow_ball(context: BenchContext, predictor: str) -> None:
-    context.bench.ball = Ball((2.12, 0.1), (0.62, -0.15), 1.0)
+    context.bench.ball = RolledBall((2.12, 0.1), (0.62, -0.15), 1.0)
     _, tracked = catch(context, predictor)
     assert tracked.status in (Status.SUCCESS, Status.FAILURE)
     assert tracked.values["seen"] > 0.9 * tracked.values["images"]
@@ -108,7 +115,7 @@ def test_time_to_go_is_right_however_old_the_images_are(
 
 def test_late_images_of_a_fast_ball_are_a_failure_not_an_error(context: BenchContext) -> None:
     context.bench.latency = 0.4
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 2.4)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 2.4)
     _, tracked = catch(context)
     assert (tracked.status, tracked.cause) == (Status.FAILURE, "late")
     assert "exit" in tracked.values
@@ -118,7 +125,7 @@ def test_between_images_the_stream_goes_on_with_fresh_times(context: BenchContex
     """When images fail to come for a moment, set points still do, and their time to go runs
     down."""
     bench = context.bench
-    bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 1.2)
+    bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(bench, actions.locate_background(context))
     whole, bench.dead_from = bench.dead_from, bench.now + 0.5
     action = actions.predict_least_squares(context, ball=located.values["ball"], image_timeout=0.4)
@@ -155,7 +162,7 @@ def test_dead_camera(context: BenchContext) -> None:
 
 
 def test_camera_that_dies_while_tracking(context: BenchContext) -> None:
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 0.8)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 0.8)
     located = run_action(context.bench, actions.locate_background(context))
     context.bench.dead_from = context.bench.now + 0.3
     tracked = run_action(
@@ -168,7 +175,7 @@ def test_camera_that_dies_while_tracking(context: BenchContext) -> None:
 
 @pytest.mark.parametrize("predictor", sorted(PREDICTORS))
 def test_lost_ball(context: BenchContext, predictor: str) -> None:
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 1.0)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.0)
     context.bench.gone_after = 0.6
     _, tracked = catch(context, predictor)
     assert (tracked.status, tracked.cause) == (Status.ERROR, "ball_lost")
@@ -180,7 +187,7 @@ def test_lost_ball(context: BenchContext, predictor: str) -> None:
 
 @pytest.mark.parametrize("predictor", sorted(PREDICTORS))
 def test_side_exit(context: BenchContext, predictor: str) -> None:
-    context.bench.ball = Ball((2.12, 0.1), (1.1, 0.5), 1.4)
+    context.bench.ball = RolledBall((2.12, 0.1), (1.1, 0.5), 1.4)
     _, tracked = catch(context, predictor)
     assert (tracked.status, tracked.cause) == (Status.FAILURE, "side_exit")
     assert tracked.values["exit"]["point"][1] == pytest.approx(0.45, abs=0.01)
@@ -189,7 +196,7 @@ def test_side_exit(context: BenchContext, predictor: str) -> None:
 
 
 def test_a_ball_that_stops_on_the_table(context: BenchContext) -> None:
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.0), 0.34, spin=1.0)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.0), 0.34, spin=1.0)
     _, tracked = catch(context)
     assert (tracked.status, tracked.cause) == (Status.FAILURE, "stays")
 
@@ -197,7 +204,7 @@ def test_a_ball_that_stops_on_the_table(context: BenchContext) -> None:
 def test_arm_and_cup_at_the_edge_do_not_lose_the_ball(context: BenchContext) -> None:
     """The cup waits where the ball leaves and hides the last centimetres."""
     bench = context.bench
-    bench.ball = Ball((2.12, 0.05), (0.62, 0.05), 1.2)
+    bench.ball = RolledBall((2.12, 0.05), (0.62, 0.05), 1.2)
     bench.cup = np.eye(4)
     bench.cup[:3, 3] = [0.60, 0.05, 0.68]
     bench.arm = (np.array([[[0.1, 0.0, 1.1], [0.62, 0.05, 0.95]]]), [0.05])
@@ -228,7 +235,7 @@ def test_threshold_fails_in_dim_light_and_the_others_do_not(context: BenchContex
     bench.light = lambda time: 0.6
     outcomes = {}
     for name, locate in LOCATORS.items():
-        bench.ball, bench.release = Ball((2.12, 0.1), (0.62, 0.0), 1.3), bench.now + 0.4
+        bench.ball, bench.release = RolledBall((2.12, 0.1), (0.62, 0.0), 1.3), bench.now + 0.4
         outcomes[name] = run_action(bench, locate(context, timeout=2.5)).status
         run_action(bench, _pause(context, 2.0))
     assert outcomes.pop("threshold") is Status.ERROR
@@ -244,7 +251,7 @@ def test_beating_lamps_make_the_stored_background_late_and_the_compensated_one_n
     for name in late:
         for phase in range(8):
             run_action(bench, _pause(context, 2.0 - bench.now % 1.0 + phase / 8))
-            bench.ball, bench.release = Ball((2.12, 0.1), (0.62, 0.0), 2.3), bench.now + 0.4
+            bench.ball, bench.release = RolledBall((2.12, 0.1), (0.62, 0.0), 2.3), bench.now + 0.4
             located = run_action(bench, LOCATORS[name](context, timeout=2.5))
             late[name] += located.status is not Status.SUCCESS
             context.device.end()
@@ -259,12 +266,12 @@ async def _pause(context: BenchContext, seconds: float) -> Result:
 def test_late_and_inaccurate_locations_are_failures_that_still_give_the_ball(
     context: BenchContext,
 ) -> None:
-    context.bench.ball = Ball((2.12, 0.1), (0.62, 0.0), 1.3)
+    context.bench.ball = RolledBall((2.12, 0.1), (0.62, 0.0), 1.3)
     late = run_action(context.bench, actions.locate_background(context, min_ahead=1.49))
     assert (late.status, late.cause) == (Status.FAILURE, "late") and "ball" in late.values
     context.device.end()
     context.bench.ball, context.bench.release = (
-        Ball((2.12, 0.1), (0.62, 0.0), 1.3),
+        RolledBall((2.12, 0.1), (0.62, 0.0), 1.3),
         context.bench.now + 0.4,
     )
     coarse = run_action(context.bench, actions.locate_mog2(context, max_residual=0.00005))
@@ -289,7 +296,7 @@ def test_background_is_kept_between_runs(context: BenchContext) -> None:
 
 @pytest.mark.parametrize("stage", ["locate", "track"])
 def test_cancel_ends_the_images(context: BenchContext, stage: str) -> None:
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 1.0)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.0)
     action = actions.locate_background(context)
     if stage == "track":
         located = run_action(context.bench, action)
@@ -302,7 +309,7 @@ def test_cancel_ends_the_images(context: BenchContext, stage: str) -> None:
 
 def test_tracker_goes_on_from_ages_when_the_image_is_not_remembered(context: BenchContext) -> None:
     """Another process of the camera: sequence numbers mean nothing to it, ages do."""
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 1.2)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(context.bench, actions.locate_background(context))
     fresh = Camera({}, BenchPorts(context.bench))
     fresh.background = context.device.background
@@ -340,13 +347,13 @@ def test_bad_options_are_refused_by_name(context: BenchContext, option: str, val
 def test_results_are_plain_data(context: BenchContext) -> None:
     import msgpack
 
-    context.bench.ball = Ball((2.12, 0.0), (0.62, 0.1), 1.2)
+    context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     for result in catch(context):
         assert msgpack.unpackb(msgpack.packb(dict(result.values))) == result.values
 
 
 def test_images_of_another_size_are_refused(pinhole: PinholeCamera) -> None:
-    class Small(Bench):
+    class Small(CameraBench):
         def picture(self) -> Any:
             return super().picture()[::2, ::2]
 
@@ -361,7 +368,7 @@ def test_the_same_seed_gives_the_same_stream(pinhole: PinholeCamera) -> None:
     streams = []
     for _ in range(2):
         pinhole.reseed(np.random.default_rng(3))
-        bench = Bench(pinhole, draw_ball(np.random.default_rng(5), "B"))
+        bench = CameraBench(pinhole, draw_ball(np.random.default_rng(5), "B"))
         context = BenchContext(bench, Camera({}, BenchPorts(bench)))
         catch(context)
         streams.append(context.published)

@@ -175,11 +175,11 @@ def test_file_round_trip(found: Calibration) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "fault"),
     [
-        ("schema = 1", "schema = 7", "schema must be 1"),
+        ("schema = 1", "schema = 7", "schema: expected 1, got 7"),
         ("centre_px", "center_px", "key 'centre_px' is missing"),
-        ("[pose]", "[pose", "no TOML"),
+        ("[pose]", "[pose", "not valid TOML"),
         ("position = [", "position = [1.0, ", "cannot reshape"),
-        ("rotation = [\n  [", "rotation = [\n  [9", "no rotation"),
+        ("rotation = [\n  [", "rotation = [\n  [9", "expected an orthogonal matrix"),
     ],
 )
 def test_bad_file_is_refused_with_file_and_remedy(old: str, new: str, fault: str) -> None:
@@ -193,12 +193,15 @@ def test_bad_file_is_refused_with_file_and_remedy(old: str, new: str, fault: str
     ("text", "fault"),
     [
         (None, "cannot be read"),
-        ("[board", "no TOML"),
+        ("[board", "not valid TOML"),
         ("[board]\ncolumns = 9\nrows = 6\n", "key 'square' is missing"),
-        ('[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n', "a.png: not there"),
+        (
+            '[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\n',
+            "a.png: file not found",
+        ),
         (
             '[board]\ncolumns=9\nrows=6\nsquare=0.06\n[[views]]\nfile="a.png"\npose=[1]\n',
-            "4 rows of 4",
+            "expected 4 rows of 4",
         ),
     ],
 )
@@ -250,7 +253,7 @@ def test_missing_images_are_taken_from_the_camera(
 
     said: list[str] = []
     command.take_missing(tmp_path, Hand(), said.append, press_enter)
-    assert said == ["the board is not seen whole; once more"]
+    assert said == ["the board is not completely in view; try again"]
     assert asked[-1] == "closed" and len(asked) == 4
     taken, _ = read_views(tmp_path)
     assert np.array_equal(taken[0].pixels, views[0].pixels) and np.array_equal(
@@ -297,4 +300,4 @@ def test_shipped_calibration_is_what_the_command_makes(
         main(["calibrate", "--views", str(views), "--output", str(tmp_path / "nowhere" / "c.toml")])
         == 2
     )
-    assert "nowhere/c.toml: there is no folder" in capsys.readouterr().err
+    assert "nowhere/c.toml: folder" in capsys.readouterr().err

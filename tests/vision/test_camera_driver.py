@@ -15,10 +15,10 @@ from petrobot.services.vision.actions import locate_background, predict_least_sq
 from petrobot.services.vision.calibration_file import DEFAULT, CalibrationFileError
 from petrobot.services.vision.camera import CELL, Camera, CameraError
 from petrobot.services.vision.location import FixedThreshold
-from tests.vision.bench import Bench, BenchContext, BenchPorts, draw_ball, run_action
+from tests.vision.bench import BenchContext, BenchPorts, CameraBench, draw_ball, run_action
 
 
-def test_shipped_files_are_the_default_and_others_can_be_named(bench: Bench) -> None:
+def test_shipped_files_are_the_default_and_others_can_be_named(bench: CameraBench) -> None:
     usual = Camera({}, BenchPorts(bench))
     calibration = DEFAULT.read_bytes().replace(b"focal_px = [6", b"focal_px = [7")
     cell = CELL.read_bytes().replace(b"near_edge = 0.62", b"near_edge = 0.70")
@@ -35,11 +35,11 @@ def test_shipped_files_are_the_default_and_others_can_be_named(bench: Bench) -> 
 @pytest.mark.parametrize(
     ("config", "files", "error", "text"),
     [
-        ({"rate": 0}, {}, CameraError, "rate = 0 images/s"),
+        ({"rate": 0}, {}, CameraError, "such as 50, got 0"),
         ({"rate": 5000}, {}, CameraError, "above 0 and at most 1000"),
-        ({"rate": "fast"}, {}, CameraError, "rate = 'fast' images/s"),
+        ({"rate": "fast"}, {}, CameraError, "such as 50, got 'fast'"),
         ({"rat": 50.0}, {}, ValueError, "unknown key 'rat'; did you mean 'rate'?"),
-        ({"cell": "cell.toml"}, {"cell.toml": b"[table"}, CameraError, "cell.toml: no TOML"),
+        ({"cell": "cell.toml"}, {"cell.toml": b"[table"}, CameraError, "cell.toml: not valid TOML"),
         (
             {"calibration": "lab.toml"},
             {"lab.toml": b"schema = 1"},
@@ -49,7 +49,11 @@ def test_shipped_files_are_the_default_and_others_can_be_named(bench: Bench) -> 
     ],
 )
 def test_bad_config_is_refused_with_name_and_remedy(
-    bench: Bench, config: dict[str, Any], files: dict[str, bytes], error: type[Exception], text: str
+    bench: CameraBench,
+    config: dict[str, Any],
+    files: dict[str, bytes],
+    error: type[Exception],
+    text: str,
 ) -> None:
     with pytest.raises(error, match=re.escape(text)):
         Camera(config, BenchPorts(bench, files))

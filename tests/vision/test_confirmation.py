@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from petrobot.services.vision.confirmation import Confirmation, Track
+from petrobot.services.vision.locating import BallTrack, Confirmation
 
 STICKERS = [(0.87, 0.22), (1.42, 0.36), (1.92, 0.28), (1.42, -0.20)]
 
 
 def follow(
     confirmation: Confirmation, places: list[list[tuple[float, float]]], step: float = 0.02
-) -> list[Track | None]:
+) -> list[BallTrack | None]:
     """Feed candidates image by image."""
     return [confirmation.add(k * step, found) for k, found in enumerate(places)]
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from petrobot.services.vision.calibration_file import DEFAULT, parse_calibration
-from petrobot.services.vision.confirmation import Confirmation
+from petrobot.services.vision.locating import Confirmation
 from petrobot.services.vision.location import (
     Background,
     BackgroundSubtraction,
+    BallDetector,
+    BallWindow,
     CompensatedSubtraction,
-    Detector,
     FixedThreshold,
     HoughCircles,
     MixtureOfGaussians,
-    Window,
     ball_blobs,
 )
 from petrobot.services.vision.optics import Array
@@ -47,10 +47,10 @@ class Scores:
     false: float
 
 
-def make(name: str, view: TableView, camera: PinholeCamera, light: float = 1.0) -> Detector:
+def make(name: str, view: TableView, camera: PinholeCamera, light: float = 1.0) -> BallDetector:
     """A detector that has seen the empty table in the given light."""
     background = Background()
-    makers: dict[str, Callable[[TableView], Detector]] = {
+    makers: dict[str, Callable[[TableView], BallDetector]] = {
         "background": lambda view: BackgroundSubtraction(view, background),
         "mog2": MixtureOfGaussians,
         "hough": HoughCircles,
@@ -80,7 +80,7 @@ def balls(
 
 
 def score(
-    detector: Detector, view: TableView, camera: PinholeCamera, light: float = 1.0, **where: Any
+    detector: BallDetector, view: TableView, camera: PinholeCamera, light: float = 1.0, **where: Any
 ) -> Scores:
     """Judge a detector over many balls."""
     errors, false = [], 0
@@ -206,7 +206,7 @@ def picture(pinhole: PinholeCamera) -> np.ndarray:
 def test_window_is_accurate_in_any_light(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray, light: float
 ) -> None:
-    window, rng, errors = Window(view), np.random.default_rng(1), []
+    window, rng, errors = BallWindow(view), np.random.default_rng(1), []
     sample = balls(9)
     for place, velocity in sample:
         expected = view.to_pixels(place[:2]) + rng.uniform(-3, 3, 2)
@@ -223,7 +223,7 @@ def test_window_is_accurate_in_any_light(
 def test_window_scatter_is_a_fraction_of_a_millimetre(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray
 ) -> None:
-    window, place = Window(view), np.array([1.5, 0.1, 0.62])
+    window, place = BallWindow(view), np.array([1.5, 0.1, 0.62])
     seen = [
         window.measure(pinhole.render(place), picture, view.to_pixels(place[:2])) for _ in range(30)
     ]
@@ -235,7 +235,7 @@ def test_window_scatter_is_a_fraction_of_a_millimetre(
 def test_window_with_nothing_there(
     view: TableView, pinhole: PinholeCamera, picture: np.ndarray
 ) -> None:
-    window, empty = Window(view), pinhole.render(None)
+    window, empty = BallWindow(view), pinhole.render(None)
     for place, _ in balls(2, 40):
         assert window.measure(empty, picture, view.to_pixels(place[:2]), 3.0, 8.0) is None
 
@@ -245,7 +245,7 @@ def test_a_half_hidden_ball_is_not_measured_wrongly(
 ) -> None:
     """An arm slides over the ball: as soon as it hides a part that would bias the place there is no
     measurement."""
-    window, place, kept = Window(view), np.array([0.90, 0.0, 0.62]), []
+    window, place, kept = BallWindow(view), np.array([0.90, 0.0, 0.62]), []
     for edge in np.linspace(-0.06, 0.06, 25):
         arm = np.array([[[0.90 + 0.5, edge - 0.05, 0.75], [0.90 - 0.5, edge - 0.05, 0.75]]])
         image = pinhole.render(place, arm_points=arm, arm_radii=[0.05])
@@ -261,12 +261,12 @@ def test_the_window_leaves_what_is_not_near(
 ) -> None:
     place = np.array([1.5, 0.1, 0.62])
     far = view.to_pixels(place[:2]) + np.array([14.0, 0.0])
-    assert Window(view).measure(pinhole.render(place), picture, far, spread=5.0) is None
+    assert BallWindow(view).measure(pinhole.render(place), picture, far, spread=5.0) is None
 
 
 def test_window_outside_the_image(view: TableView, picture: np.ndarray) -> None:
     for pixel in ([-50.0, 100.0], [1e6, 5.0], [3.0, 479.0]):
-        assert Window(view).measure(picture, picture, np.array(pixel)) is None
+        assert BallWindow(view).measure(picture, picture, np.array(pixel)) is None
 
 
 def test_background_keeps_no_ghost_of_a_passing_ball(

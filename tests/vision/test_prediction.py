@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 
 from petrobot.services.vision.prediction import (
     ConstantVelocity,
-    Exit,
+    ExitWay,
     Kalman,
     LeastSquares,
+    PredictedExit,
     Predictor,
     Surface,
-    Way,
 )
-from tests.vision.bench import Ball, draw_ball, read_cell
+from tests.vision.bench import RolledBall, draw_ball, read_cell
 
 SURFACE = Surface.of(read_cell())
 PREDICTORS: dict[str, Callable[[Surface], Predictor]] = {
@@ -32,8 +32,8 @@ NOISE = 0.0003
 
 
 def watch(
-    predictor: Predictor, ball: Ball, count: int, rate: float, rng: np.random.Generator
-) -> Exit:
+    predictor: Predictor, ball: RolledBall, count: int, rate: float, rng: np.random.Generator
+) -> PredictedExit:
     """The exit that is predicted after `count` images, the first within one image of the
     release."""
     first = float(rng.uniform(0.0, 1.0 / rate))
@@ -55,7 +55,7 @@ def errors(
         ball = draw_ball(rng, regime)
         exit_ = watch(PREDICTORS[name](SURFACE), ball, count, rate, rng)
         time, y = ball.leaves()
-        assert exit_.way is Way.NEAR_EDGE
+        assert exit_.way is ExitWay.NEAR_EDGE
         times.append(exit_.time - time)
         places.append(exit_.point[1] - y)
         stated.append((exit_.time - time) / exit_.sigma_time)
@@ -122,12 +122,12 @@ def test_even_speed_knows_not_what_it_does_not_know() -> None:
 def test_exact_places_of_a_purely_rolling_ball_are_enough(
     speed: float, y: float, aim: float, name: str
 ) -> None:
-    ball = Ball((2.0, y), (0.62, aim), speed, spin=1.0, rolling=SURFACE.rolling)
+    ball = RolledBall((2.0, y), (0.62, aim), speed, spin=1.0, rolling=SURFACE.rolling)
     predictor = PREDICTORS[name](SURFACE)
     for k in range(25):
         predictor.add(0.02 * k, *ball.place(0.02 * k))
     exit_ = predictor.exit()
-    assert exit_ is not None and exit_.way is Way.NEAR_EDGE
+    assert exit_ is not None and exit_.way is ExitWay.NEAR_EDGE
     time, place = ball.leaves()
     slack = (
         0.2 * time**2 * 0.0589 / speed + 0.5 * 0.0589 * time**2 / speed
@@ -145,9 +145,9 @@ def test_exact_places_of_a_purely_rolling_ball_are_enough(
 
 @pytest.mark.parametrize("name", sorted(PREDICTORS))
 def test_a_ball_that_leaves_by_the_side(name: str) -> None:
-    ball = Ball((2.1, 0.1), (1.0, 0.6), 1.5)
+    ball = RolledBall((2.1, 0.1), (1.0, 0.6), 1.5)
     exit_ = watch(PREDICTORS[name](SURFACE), ball, 12, 50, np.random.default_rng(0))
-    assert exit_.way is Way.SIDE
+    assert exit_.way is ExitWay.SIDE
     way = (0.45 - 0.1) / ball.heading[1]
     assert exit_.point == pytest.approx([2.1 + way * ball.heading[0], 0.45], abs=0.02)
     assert exit_.time == pytest.approx(ball.arrival(way), abs=0.08)
@@ -155,9 +155,9 @@ def test_a_ball_that_leaves_by_the_side(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["least_squares", "kalman"])
 def test_a_ball_that_stops_before_the_edge(name: str) -> None:
-    ball = Ball((2.1, 0.0), (0.62, 0.0), 0.30, spin=1.0)
+    ball = RolledBall((2.1, 0.0), (0.62, 0.0), 0.30, spin=1.0)
     exit_ = watch(PREDICTORS[name](SURFACE), ball, 30, 50, np.random.default_rng(0))
-    assert exit_.way is Way.STAYS and exit_.time == float("inf")
+    assert exit_.way is ExitWay.STAYS and exit_.time == float("inf")
 
 
 @pytest.mark.parametrize("name", sorted(PREDICTORS))
@@ -166,7 +166,7 @@ def test_a_ball_that_rolls_away_never_leaves_over_the_near_edge(name: str) -> No
     for k in range(10):
         predictor.add(0.02 * k, 1.0 + 0.02 * k, 0.0)
     exit_ = predictor.exit()
-    assert exit_ is not None and exit_.way is Way.STAYS
+    assert exit_ is not None and exit_.way is ExitWay.STAYS
 
 
 @pytest.mark.parametrize("name", sorted(PREDICTORS))
@@ -185,7 +185,7 @@ def test_sliding_of_unknown_length_is_found(friction: float) -> None:
     it may end."""
     rng, late = np.random.default_rng(3), []
     for _ in range(40):
-        ball = Ball(
+        ball = RolledBall(
             (2.12, 0.0),
             (0.62, float(rng.uniform(-0.3, 0.3))),
             float(rng.uniform(1.5, 2.5)),
@@ -201,7 +201,7 @@ def test_sliding_of_unknown_length_is_found(friction: float) -> None:
 def test_known_resistance_is_taken_for_known() -> None:
     """With a resistance 25 % off, a predictor that takes the nominal for known is wrong; one that
     estimates it is not."""
-    ball = Ball((2.12, 0.0), (0.62, 0.0), 0.9, spin=1.0, rolling=1.25 * SURFACE.rolling)
+    ball = RolledBall((2.12, 0.0), (0.62, 0.0), 0.9, spin=1.0, rolling=1.25 * SURFACE.rolling)
     time, errors_of = ball.leaves()[0], {}
     for sigma in (0.0, None):
         rng = np.random.default_rng(4)
@@ -214,7 +214,7 @@ def test_known_resistance_is_taken_for_known() -> None:
 def test_coarse_places_count_less(make: Callable[[Surface], Predictor]) -> None:
     """Coarse places at the beginning (from a coarse locator) do not spoil the fine ones that
     follow."""
-    ball = Ball((2.12, 0.0), (0.62, 0.1), 1.8)
+    ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.8)
     spoiled: list[float] = []
     plain: list[float] = []
     for seed in range(20):
@@ -252,7 +252,7 @@ def test_cost_of_an_observation_does_not_grow() -> None:
 
 def test_gap_of_the_surface() -> None:
     gap, way = SURFACE.gap(np.array([1.62, 0.0]), np.array([-1.0, 0.0]))
-    assert way is Way.NEAR_EDGE and gap == pytest.approx(1.0)
+    assert way is ExitWay.NEAR_EDGE and gap == pytest.approx(1.0)
     gap, way = SURFACE.gap(np.array([1.62, 0.0]), np.array([-0.6, 0.8]))
-    assert way is Way.SIDE and gap == pytest.approx(0.45 / 0.8)
-    assert SURFACE.gap(np.array([1.62, 0.0]), np.array([1.0, 0.0])) == (float("inf"), Way.STAYS)
+    assert way is ExitWay.SIDE and gap == pytest.approx(0.45 / 0.8)
+    assert SURFACE.gap(np.array([1.62, 0.0]), np.array([1.0, 0.0])) == (float("inf"), ExitWay.STAYS)

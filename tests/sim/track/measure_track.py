@@ -20,7 +20,7 @@ sys.path[:0] = [str(Path(__file__).parents[3]), str(Path(__file__).parent)]
 IDLE_TICKS, IMAGES = 20_000, 500
 
 
-class Meter:
+class TrackMeter:
     """Adds up the CPU time that methods take, with what they call."""
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ def measure(regime: str) -> None:
     prepared = (time.process_time() - begun) / 10.0
     bench.enable()
     bench.want_images(25.0)
-    lab, meter = bench.lab, Meter()
+    lab, meter = bench.lab, TrackMeter()
     meter.watch(lab, "receive", "frames in")
     meter.watch(lab, "advance", "world, frames and images out")
     meter.watch(lab, "picture", "  of it images")

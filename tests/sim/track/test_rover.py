@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track.elements import Pose
-from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.elements import FloorPose
+from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.truth import RoverTruth, TrackSite, WheelTruth
 
 SETTINGS = {
@@ -40,20 +40,20 @@ IDEAL = RoverTruth(
 )
 
 
-def rover(pose: Pose = Pose(0.0, 0.0, 0.0), seed: int = 1, **changes: Any) -> Rover:  # noqa: B008
+def rover(pose: FloorPose = FloorPose(0.0, 0.0, 0.0), seed: int = 1, **changes: Any) -> RoverBody:  # noqa: B008
     rng = np.random.default_rng(seed)
-    made = Rover(replace(IDEAL, **changes), rng)
+    made = RoverBody(replace(IDEAL, **changes), rng)
     made.place(made.truth, pose, rng)
     return made
 
 
-def command(body: Rover, left: float, right: float) -> None:
+def command(body: RoverBody, left: float, right: float) -> None:
     """Wheels told so (rad/s), brakes off."""
     for wheel, target in zip(body.wheels, (left, right), strict=True):
         wheel.braked, wheel.target = False, target
 
 
-def settled(body: Rover, left: float, right: float) -> None:
+def settled(body: RoverBody, left: float, right: float) -> None:
     """Wheels that turn so already."""
     command(body, left, right)
     for wheel in body.wheels:
@@ -68,7 +68,7 @@ speeds = st.floats(-8.0, 8.0)
 def test_steady_wheels_lead_along_a_circular_arc(
     left: float, right: float, time: float, heading: float
 ) -> None:
-    body = rover(Pose(1.0, 2.0, heading))
+    body = rover(FloorPose(1.0, 2.0, heading))
     settled(body, left, right)
     body.move_to(time)
     v, w = 0.05 * (left + right), 0.1 * (right - left) / 0.4
@@ -175,14 +175,14 @@ def test_a_rover_put_elsewhere_keeps_its_counters() -> None:
     settled(body, 5.0, 5.0)
     body.move_to(1.0)
     counted = body.wheels[0].angle
-    body.place(body.truth, Pose(3.0, 4.0, 1.0), np.random.default_rng(2))
+    body.place(body.truth, FloorPose(3.0, 4.0, 1.0), np.random.default_rng(2))
     assert body.pose == (3.0, 4.0, 1.0)
     assert body.standing
     assert body.wheels[0].angle == counted == pytest.approx(5.0)
 
 
 def test_the_same_draws_give_the_same_way() -> None:
-    def way(seed: int) -> Pose:
+    def way(seed: int) -> FloorPose:
         body = rover(slip=0.02, seed=seed)
         settled(body, 5.0, 5.2)
         body.move_to(10.0)

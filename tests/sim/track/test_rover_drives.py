@@ -28,7 +28,7 @@ from petrobot.services.comm.canopen.cia402 import (
 )
 from petrobot.services.comm.canopen.hub import Hub
 from petrobot.sim.track.drives import RoverBus
-from petrobot.sim.track.rover import Rover
+from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.sensor import Echo, ReflectorSensor
 from petrobot.sim.track.truth import TrackSite
 
@@ -224,7 +224,7 @@ class LiveRover:
         truth = site.truth("plain")
         self.hub = Hub()
         self.channel = self.hub.channel
-        self.rover = Rover(truth.rover, np.random.default_rng(1))
+        self.rover = RoverBody(truth.rover, np.random.default_rng(1))
         self.bus = RoverBus(self.rover, ReflectorSensor(lambda now: [Echo(0.25, 2.0)]))
         self._port = self.hub.port()
         self._over = threading.Event()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track.elements import Pose
+from petrobot.sim.track.elements import FloorPose
 from petrobot.sim.track.sensor import look
 from petrobot.sim.track.truth import SensorTruth, TrackSite
 
@@ -50,7 +50,7 @@ def test_bearing_and_range_from_any_pose(
         x + 0.1 * math.cos(heading) + level * math.cos(heading + bearing),
         y + 0.1 * math.sin(heading) + level * math.sin(heading + bearing),
     )
-    (echo,) = look(PERFECT, Pose(x, y, heading), [there], rng())
+    (echo,) = look(PERFECT, FloorPose(x, y, heading), [there], rng())
     assert echo.bearing == pytest.approx(bearing, abs=1e-7)
     assert echo.range == pytest.approx(math.hypot(level, 0.3), abs=1e-9)
 
@@ -72,12 +72,12 @@ def test_bearing_and_range_from_any_pose(
 )
 def test_the_field_of_view_has_limits(level: float, bearing: float, seen: bool) -> None:
     there = (0.1 + level * math.cos(bearing), level * math.sin(bearing))
-    assert bool(look(PERFECT, Pose(0.0, 0.0, 0.0), [there], rng())) is seen
+    assert bool(look(PERFECT, FloorPose(0.0, 0.0, 0.0), [there], rng())) is seen
 
 
 def test_several_reflectors_answer_the_nearest_first() -> None:
     echoes = look(
-        PERFECT, Pose(0.0, 0.0, 0.0), [(4.1, 1.0), (2.1, -0.5), (-3.0, 0.0), (5.1, 0.0)], rng()
+        PERFECT, FloorPose(0.0, 0.0, 0.0), [(4.1, 1.0), (2.1, -0.5), (-3.0, 0.0), (5.1, 0.0)], rng()
     )
     assert [round(echo.range, 2) for echo in echoes] == [2.08, 4.13, 5.01]
 
@@ -92,7 +92,7 @@ def test_noise_offsets_and_rounding() -> None:
         step=0.0005,
     )
     draws = rng()
-    echoes = [look(truth, Pose(0.0, 0.0, 0.0), [(3.1, 0.0)], draws)[0] for _ in range(4000)]
+    echoes = [look(truth, FloorPose(0.0, 0.0, 0.0), [(3.1, 0.0)], draws)[0] for _ in range(4000)]
     bearings, ranges = np.array([e.bearing for e in echoes]), np.array([e.range for e in echoes])
     assert bearings.mean() == pytest.approx(0.01, abs=5e-4)
     assert bearings.std() == pytest.approx(0.005, rel=0.06)
@@ -104,10 +104,12 @@ def test_noise_offsets_and_rounding() -> None:
 def test_misses_and_false_returns_come_as_often_as_told() -> None:
     draws = rng()
     missing = replace(PERFECT, miss=0.4)
-    seen = sum(bool(look(missing, Pose(0.0, 0.0, 0.0), [(3.1, 0.0)], draws)) for _ in range(4000))
+    seen = sum(
+        bool(look(missing, FloorPose(0.0, 0.0, 0.0), [(3.1, 0.0)], draws)) for _ in range(4000)
+    )
     assert seen / 4000 == pytest.approx(0.6, abs=0.03)
     inventing = replace(PERFECT, false=0.15)
-    echoes = [look(inventing, Pose(0.0, 0.0, 0.0), [], draws) for _ in range(4000)]
+    echoes = [look(inventing, FloorPose(0.0, 0.0, 0.0), [], draws) for _ in range(4000)]
     false = [echo for row in echoes for echo in row]
     assert len(false) / 4000 == pytest.approx(0.15, abs=0.02)
     assert all(abs(echo.bearing) <= 1.047 and 0.5 <= echo.range <= 6.0 for echo in false)

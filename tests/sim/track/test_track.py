@@ -12,7 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.sim.track.course import BOARD, KINDS, Track, TrackError
-from petrobot.sim.track.elements import BAR_LENGTH, BAR_MARGIN, HALF_WIDTH, SQUARE, Element, Kind
+from petrobot.sim.track.elements import (
+    BAR_LENGTH,
+    BAR_MARGIN,
+    HALF_WIDTH,
+    SQUARE,
+    Element,
+    ElementKind,
+)
 from petrobot.sim.track.floor import COARSE, FINE, ORIGIN, Floor
 
 tracks = st.builds(
@@ -41,7 +48,7 @@ def test_random_tracks_keep_to_the_rules(track: Track) -> None:
     assert all(0 <= i < BOARD and 0 <= j < BOARD for i, j in squares)
     assert all(abs(i - k) + abs(j - m) == 1 for (i, j), (k, m) in pairwise(squares))
     assert track.elements[-1].next_square not in squares
-    assert track.elements[0].kind is track.elements[-1].kind is Kind.STRAIGHT
+    assert track.elements[0].kind is track.elements[-1].kind is ElementKind.STRAIGHT
     unpainted = [number for number, element in enumerate(track.elements) if not element.painted]
     assert all(b - a >= 3 for a, b in pairwise([-1, *unpainted, len(squares)]))
 
@@ -107,7 +114,7 @@ def test_the_share_of_arcs_is_what_is_asked_for() -> None:
 def test_the_competition_like_track_is_valid_and_has_everything() -> None:
     track = Track.contest()
     kinds = {element.kind for element in track.elements if element.painted}
-    assert kinds == {Kind.STRAIGHT, Kind.LEFT, Kind.RIGHT}
+    assert kinds == {ElementKind.STRAIGHT, ElementKind.LEFT, ElementKind.RIGHT}
     assert {element.kind for element in track.elements if not element.painted} == kinds
     assert track.length > 40.0
 
@@ -169,7 +176,7 @@ def test_no_point_of_the_line_is_nearer_than_the_nearest(track: Track, x: float,
 
 
 def test_the_line_goes_on_straight_before_the_start_and_after_the_end() -> None:
-    element = Element(Kind.LEFT, (0, 0), 0, 0.0)
+    element = Element(ElementKind.LEFT, (0, 0), 0, 0.0)
     assert element.at(-0.5) == pytest.approx((-0.5, 1.0, 0.0))
     assert element.at(math.pi / 2 + 0.5) == pytest.approx((1.0, 2.5, math.pi / 2))
 

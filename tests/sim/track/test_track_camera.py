@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.sim.track.camera import FloorCamera, Motion, Mount
+from petrobot.sim.track.camera import Motion, Mount, RoverCamera
 from petrobot.sim.track.course import Track
 from petrobot.sim.track.floor import Floor
 from petrobot.sim.track.laboratory import Hall
@@ -29,11 +29,11 @@ def floor() -> Floor:
     return painted
 
 
-def camera(noise: float = 0.0, exposure: float = 0.008, mount: Mount = NOMINAL) -> FloorCamera:
-    return FloorCamera(mount, exposure, (40.0, 200.0), noise, 0.0)
+def camera(noise: float = 0.0, exposure: float = 0.008, mount: Mount = NOMINAL) -> RoverCamera:
+    return RoverCamera(mount, exposure, (40.0, 200.0), noise, 0.0)
 
 
-def take(eye: FloorCamera, floor: Floor, motion: Motion, **light: float) -> Any:
+def take(eye: RoverCamera, floor: Floor, motion: Motion, **light: float) -> Any:
     return eye.take(floor, motion, np.random.default_rng(1), **light)
 
 

@@ -173,15 +173,15 @@ def test_interruptions_are_of_the_regimes_kind(rover_bench: Bench) -> None:
     [
         ("laboratory_prepare", {"regime": "loops"}, "'loops'"),
         ("laboratory_prepare", {"regime": "arcs+fog"}, "'fog'"),
-        ("laboratory_prepare", {"seed": -1}, "seed is -1"),
-        ("laboratory_prepare", {"seed": 1.5}, "seed is 1.5"),
-        ("laboratory_prepare", {"elements": "many"}, "elements is 'many'"),
+        ("laboratory_prepare", {"seed": -1}, "of 0 or more, got -1"),
+        ("laboratory_prepare", {"seed": 1.5}, "of 0 or more, got 1.5"),
+        ("laboratory_prepare", {"elements": "many"}, "or none, got 'many'"),
         ("laboratory_prepare", {"elements": 3}, "3 elements"),
         ("laboratory_prepare", {"interruptions": 9}, "9 interruptions"),
         ("laboratory_fault", {"kind": "rain"}, "'rain'"),
         ("laboratory_fault", {"kind": "drive_fault"}, "joint is missing"),
         ("laboratory_fault", {"kind": "drive_fault", "joint": 3}, "from 1 to 2"),
-        ("laboratory_fault", {"kind": "dead_sensor", "share": 0.5}, "takes no 'share'"),
+        ("laboratory_fault", {"kind": "dead_sensor", "share": 0.5}, "unknown key 'share'"),
     ],
 )
 def test_what_cannot_be_is_refused_and_changes_nothing(

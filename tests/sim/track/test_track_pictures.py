@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from petrobot.sim.track.course import Track
-from petrobot.sim.track.film import FilmError, View, film, images, main
+from petrobot.sim.track.film import FilmError, FilmView, film, images, main
 from petrobot.sim.track.plan import floor_plan, pictures, summary
 
 ROVER_FILE = Path(__file__).parents[3] / "services" / "mobile" / "rover.toml"
@@ -97,7 +97,7 @@ def test_a_plan_needs_a_run() -> None:
 def test_the_films_images_show_the_rover_where_it_was(
     score: dict[str, Any], nominal: dict[str, Any]
 ) -> None:
-    view = View(Track.read(score["track"]))
+    view = FilmView(Track.read(score["track"]))
     shown = list(images(score, nominal, fps=5.0, speedup=5.0))
     path = np.array(score["path"])
     assert len(shown) == pytest.approx(path[-1, 0], abs=1.0)

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from petrobot.sim.track.course import Track
-from petrobot.sim.track.elements import Pose
-from petrobot.sim.track.referee import Referee
+from petrobot.sim.track.elements import FloorPose
+from petrobot.sim.track.referee import TrackReferee
 
 TRACK = Track.of((0, 3), 0, "SSSSSSS", (3,))  # along y = 7 from x = 0; no paint from x = 6 to x = 8
 DT, SPEED = 0.02, 0.5
@@ -18,27 +18,27 @@ DT, SPEED = 0.02, 0.5
 
 def ride(
     points: Iterable[tuple[float, float]], track: Track = TRACK, stand: float = 1.0
-) -> tuple[Referee, float]:
+) -> tuple[TrackReferee, float]:
     """Past points (m) at a constant speed in straight lines, then standing; gives referee and
     time."""
-    referee, now, at = Referee(track, 1, "straight", 0.0), 0.0, None
+    referee, now, at = TrackReferee(track, 1, "straight", 0.0), 0.0, None
     for x, y in points:
         if at is None:
             at = x, y
-            referee.watch(now, Pose(x, y, 0.0), 0.0)
+            referee.watch(now, FloorPose(x, y, 0.0), 0.0)
             continue
         way = math.hypot(x - at[0], y - at[1])
         for k in range(1, max(1, round(way / (SPEED * DT))) + 1):
             share = k / max(1, round(way / (SPEED * DT)))
             now += DT
             referee.watch(
-                now, Pose(at[0] + share * (x - at[0]), at[1] + share * (y - at[1]), 0.0), SPEED
+                now, FloorPose(at[0] + share * (x - at[0]), at[1] + share * (y - at[1]), 0.0), SPEED
             )
         at = x, y
     assert at is not None
     for _ in range(round(stand / DT)):
         now += DT
-        referee.watch(now, Pose(*at, 0.0), 0.0)
+        referee.watch(now, FloorPose(*at, 0.0), 0.0)
     return referee, now
 
 
@@ -165,11 +165,11 @@ def test_coming_back_after_running_over_the_t_does_not_count_as_stopping() -> No
 
 
 def test_a_rover_that_leaves_the_board_is_stopped_once() -> None:
-    referee, now = Referee(TRACK, 1, "straight", 0.0), 0.0
+    referee, now = TrackReferee(TRACK, 1, "straight", 0.0), 0.0
     told = []
     for k in range(1200):
         now += DT
-        told.append(referee.watch(now, Pose(0.01 * k, 7.0 + 0.01 * k, 0.0), SPEED))
+        told.append(referee.watch(now, FloorPose(0.01 * k, 7.0 + 0.01 * k, 0.0), SPEED))
     assert told.count(True) == 1
     score = referee.score(now)
     assert kinds(score) == ["track_left", "left_board"]
@@ -177,11 +177,11 @@ def test_a_rover_that_leaves_the_board_is_stopped_once() -> None:
 
 
 def test_the_clock_starts_with_the_first_motion() -> None:
-    referee = Referee(TRACK, 1, "straight", 5.0)
+    referee = TrackReferee(TRACK, 1, "straight", 5.0)
     for k in range(500):
-        referee.watch(5.0 + k * DT, Pose(0.0, 7.0, 0.0), 0.0)
+        referee.watch(5.0 + k * DT, FloorPose(0.0, 7.0, 0.0), 0.0)
     assert referee.score(15.0)["time_s"] == 0.0
-    referee.watch(15.0, Pose(0.02, 7.0, 0.0), 0.5)
+    referee.watch(15.0, FloorPose(0.02, 7.0, 0.0), 0.5)
     assert referee.score(16.0)["time_s"] == pytest.approx(1.0)
 
 
