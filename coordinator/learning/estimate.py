@@ -33,7 +33,7 @@ SIZE = 512
 probability."""
 
 
-class Kept(NamedTuple):
+class SampledRun(NamedTuple):
     """One run in the sample."""
 
     priority: int
@@ -48,11 +48,13 @@ class Kept(NamedTuple):
 class Sample:
     """At most `SIZE` runs, in order of their priorities."""
 
-    kept: tuple[Kept, ...] = ()
+    kept: tuple[SampledRun, ...] = ()
 
     def adding(self, name: str, seconds: float, cpu_seconds: float | None, exit_: str) -> Sample:
         """With one more run. `name` must not have been used before."""
-        entry = Kept(_priority(name), seconds, -1.0 if cpu_seconds is None else cpu_seconds, exit_)
+        entry = SampledRun(
+            _priority(name), seconds, -1.0 if cpu_seconds is None else cpu_seconds, exit_
+        )
         if len(self.kept) == SIZE and entry >= self.kept[-1]:
             return self
         grown = list(self.kept)
@@ -89,7 +91,7 @@ class Sample:
         kept = []
         for row in rows:
             priority, seconds, cpu, exit_ = row
-            kept.append(Kept(int(priority), float(seconds), float(cpu), str(exit_)))
+            kept.append(SampledRun(int(priority), float(seconds), float(cpu), str(exit_)))
         return cls(tuple(sorted(kept)[:SIZE]))
 
 
@@ -116,7 +118,7 @@ COUNT = "count"
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Key:
+class TallyKey:
     """Whose tally: an action as translation of a primitive task, in a context ("" where contexts
     are not told apart)."""
 
@@ -386,7 +388,7 @@ class Tally:
             raise ValueError("seconds below 0")
 
 
-def merge(one: Tally, other: Tally) -> Tally:
+def merge_tallies(one: Tally, other: Tally) -> Tally:
     """The tally of both sets of runs."""
     if not one.changes or not other.changes:
         return one if one.changes else other
@@ -427,3 +429,44 @@ def _put(entries: Mapping[Any, Any], key: Any, value: Any) -> dict[Any, Any]:
 
 def _summed(one: Mapping[Any, int], other: Mapping[Any, int]) -> dict[Any, int]:
     return {key: one.get(key, 0) + other.get(key, 0) for key in sorted({*one, *other})}
+
+
+# --- firings ---
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class FiringsKey:
+    """A transition of a task, in a context."""
+
+    task: str
+    transition: str
+    context: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Firings:
+    """Firings of one transition. Immutable, mergeable."""
+
+    fired: int = 0
+    waits: Moments = EMPTY
+    """Seconds from the marking that enabled it to each firing."""
+
+    def to_plain(self) -> list[Any]:
+        """Plain data."""
+        return [self.fired, self.waits.to_plain()]
+
+    @classmethod
+    def of_plain(cls, data: Sequence[Any]) -> Firings:
+        """What `to_plain` gave. Raises ValueError or TypeError."""
+        fired, waits = whole(data[0], "firings"), Moments.of_plain(data[1])
+        whole(waits.n, "waits", fired)
+        return cls(fired, waits)
+
+    def adding(self, waited: float | None = None) -> Firings:
+        """With one more firing."""
+        return Firings(self.fired + 1, self.waits if waited is None else self.waits.adding(waited))
+
+
+def merge_firings(one: Firings, other: Firings) -> Firings:
+    """Of both sets of firings."""
+    return Firings(one.fired + other.fired, one.waits.merged(other.waits))

@@ -21,8 +21,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key
-from petrobot.coordinator.learning.estimate import merge as merge_tallies
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    TallyKey,
+    merge_firings,
+    merge_tallies,
+)
 from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
     CHOICE,
@@ -54,8 +59,6 @@ from petrobot.coordinator.learning.estimates_tables import (
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
-from petrobot.coordinator.learning.waits import Flow, PassageKey
-from petrobot.coordinator.learning.waits import merge as merge_flows
 from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
@@ -70,7 +73,7 @@ class EstimatesError(Exception):
 
 
 @dataclass
-class Kept:
+class FileContents:
     """What a file holds: all origins' estimates together, selectors' states by (primitive task,
     selector)."""
 
@@ -107,25 +110,25 @@ class EstimatesFile:
 
     # --- reading ------------------------------------------------------------------------------
 
-    def read(self) -> Kept:
+    def read(self) -> FileContents:
         """All that the file holds. Raises EstimatesError."""
         if not self.path.exists():
-            return Kept()
+            return FileContents()
         with self._open() as db:
             return self._kept(db)
 
-    def _kept(self, db: sqlite3.Connection) -> Kept:
+    def _kept(self, db: sqlite3.Connection) -> FileContents:
         if is_empty(db):  # made, but killed before anything was written
-            return Kept()
+            return FileContents()
         about = dict(db.execute("SELECT name, value FROM about"))
-        kept = Kept(about["origin"], int(about["generation"]))
+        kept = FileContents(about["origin"], int(about["generation"]))
         for row in db.execute("SELECT * FROM tally"):
-            key = Key(*row[1:4])
+            key = TallyKey(*row[1:4])
             kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), tally_of(row))
         for row in db.execute("SELECT * FROM flow"):
-            where = PassageKey(*row[1:4])
-            kept.estimates.flows[where] = merge_flows(
-                kept.estimates.flows.get(where, Flow()), flow_of(row)
+            where = FiringsKey(*row[1:4])
+            kept.estimates.flows[where] = merge_firings(
+                kept.estimates.flows.get(where, Firings()), flow_of(row)
             )
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)

@@ -11,13 +11,17 @@ from contextlib import suppress
 from math import inf
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key, Tally
-from petrobot.coordinator.learning.estimate import merge as merge_tallies
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    Tally,
+    TallyKey,
+    merge_firings,
+    merge_tallies,
+)
 from petrobot.coordinator.learning.learning import corrected
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
-from petrobot.coordinator.learning.waits import Flow, PassageKey
-from petrobot.coordinator.learning.waits import merge as merge_flows
 
 # Two states of one selector, learned apart (on two machines, or in a file and its copy), as one: context by context.
 
@@ -122,7 +126,7 @@ def fact(db: sqlite3.Connection, name: str) -> str:
     return str(row[0]) if row else ""
 
 
-def add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
+def add_tally(db: sqlite3.Connection, origin: str, key: TallyKey, gained: Tally) -> None:
     """Add to an origin's sums."""
     _put_tally(db, origin, key, merge_tallies(_own_tally(db, origin, key), gained))
 
@@ -130,12 +134,12 @@ def add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> N
 def correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
     """A verdict on a run that an origin's sums have counted already; left alone if they have
     not."""
-    key = Key(correction.primitive_task, correction.action, correction.context)
+    key = TallyKey(correction.primitive_task, correction.action, correction.context)
     with suppress(KeyError):  # the run is not among this origin's any more
         _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
 
 
-def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
+def _own_tally(db: sqlite3.Connection, origin: str, key: TallyKey) -> Tally:
     where = (origin, key.primitive_task, key.action, key.context)
     row = db.execute(
         "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND "
@@ -145,30 +149,30 @@ def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
     return tally_of(row) if row else Tally()
 
 
-def _put_tally(db: sqlite3.Connection, origin: str, key: Key, tally: Tally) -> None:
+def _put_tally(db: sqlite3.Connection, origin: str, key: TallyKey, tally: Tally) -> None:
     db.execute(
         "INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", tally_row(origin, key, tally)
     )
 
 
-def tally_row(origin: str, key: Key, tally: Tally) -> tuple[Any, ...]:
+def tally_row(origin: str, key: TallyKey, tally: Tally) -> tuple[Any, ...]:
     """A row of the table `tally`."""
     body = json.dumps(tally.to_plain(), separators=(",", ":"))
     return origin, key.primitive_task, key.action, key.context, tally.changes, body
 
 
-def add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow) -> None:
+def add_flow(db: sqlite3.Connection, origin: str, key: FiringsKey, gained: Firings) -> None:
     """Add to an origin's firings."""
     where = (origin, key.task, key.transition, key.context)
     row = db.execute(
         "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?",
         where,
     ).fetchone()
-    flow = merge_flows(flow_of(row) if row else Flow(), gained)
+    flow = merge_firings(flow_of(row) if row else Firings(), gained)
     db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", flow_row(origin, key, flow))
 
 
-def flow_row(origin: str, key: PassageKey, flow: Flow) -> tuple[Any, ...]:
+def flow_row(origin: str, key: FiringsKey, flow: Firings) -> tuple[Any, ...]:
     """A row of the table `flow`."""
     return origin, key.task, key.transition, key.context, flow.fired, json.dumps(flow.to_plain())
 
@@ -295,11 +299,11 @@ def state_of(body: str) -> dict[str, Any]:
     return state
 
 
-def flow_of(row: Sequence[Any]) -> Flow:
+def flow_of(row: Sequence[Any]) -> Firings:
     """Of a row of the table `flow`. Raises ValueError naming the row."""
     _, _, transition, context, version, body = row
     try:
-        flow = Flow.of_plain(json.loads(body))
+        flow = Firings.of_plain(json.loads(body))
         _agree(flow.fired, version)
     except (ValueError, KeyError, TypeError, IndexError) as fault:
         raise ValueError(f"transition {transition}{_in(context)}: {_said(fault)}") from fault

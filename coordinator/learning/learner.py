@@ -28,7 +28,7 @@ from petrobot.coordinator.engine.state import Phase
 from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
 from petrobot.coordinator.learning.estimate import Observation
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
@@ -139,7 +139,7 @@ class LearningSelector(FirstAlternative):
         self._declared = declared
         self._values: Mapping[str, Any] = {}
         self._going: dict[str, _Going] = {}
-        self._deferred: dict[str, tuple[End, int]] = {}
+        self._deferred: dict[str, tuple[RunEnd, int]] = {}
         """Runs whose verdict may still come, each with the trials of its primitive task and context
         up to then."""
         self._trials: Counter[tuple[str, str]] = Counter()
@@ -273,7 +273,7 @@ class LearningSelector(FirstAlternative):
             preempted,
             round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
         )
-        end = End(record.primitive_task, record.action, context, outcome)
+        end = RunEnd(record.primitive_task, record.action, context, outcome)
         selector, where = (
             self.learning.selectors.get(end.primitive_task),
             (end.primitive_task, context),

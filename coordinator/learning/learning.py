@@ -15,12 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.learning.estimate import Key, Tally, merge
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    Tally,
+    TallyKey,
+    merge_firings,
+    merge_tallies,
+)
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
-from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
 from petrobot.coordinator.learning.selectors import DEFAULT, RuleSelector, make
-from petrobot.coordinator.learning.waits import Flow, PassageKey
-from petrobot.coordinator.learning.waits import merge as merge_flows
 from petrobot.coordinator.task import Task
 
 NOTHING = Tally()
@@ -35,21 +40,25 @@ def corrected(tally: Tally, record: Correction) -> Tally:
 class Estimates:
     """Tallies and flows of one counter: a machine's file, or what one session has gained."""
 
-    tallies: dict[Key, Tally] = field(default_factory=dict)
-    flows: dict[PassageKey, Flow] = field(default_factory=dict)
+    tallies: dict[TallyKey, Tally] = field(default_factory=dict)
+    flows: dict[FiringsKey, Firings] = field(default_factory=dict)
 
     def merged(self, other: Estimates) -> Estimates:
         """Of both sets of runs."""
         tallies = {
-            k: merge(self.tally(k), other.tally(k)) for k in sorted({*self.tallies, *other.tallies})
+            k: merge_tallies(self.tally(k), other.tally(k))
+            for k in sorted({*self.tallies, *other.tallies})
         }
         keys = sorted({*self.flows, *other.flows})
         return Estimates(
             tallies,
-            {k: merge_flows(self.flows.get(k, Flow()), other.flows.get(k, Flow())) for k in keys},
+            {
+                k: merge_firings(self.flows.get(k, Firings()), other.flows.get(k, Firings()))
+                for k in keys
+            },
         )
 
-    def tally(self, key: Key) -> Tally:
+    def tally(self, key: TallyKey) -> Tally:
         """What is known of an action in a context; an empty tally if nothing is."""
         return self.tallies.get(key, NOTHING)
 
@@ -69,15 +78,15 @@ class Estimates:
 
     def apply(self, record: Record, task: str, salt: str) -> None:
         """Count a record."""
-        if isinstance(record, End):
-            key = Key(record.primitive_task, record.action, record.context)
+        if isinstance(record, RunEnd):
+            key = TallyKey(record.primitive_task, record.action, record.context)
             self.tallies[key] = self.tally(key).adding(record.outcome, salt)
         elif isinstance(record, Correction):
-            key = Key(record.primitive_task, record.action, record.context)
+            key = TallyKey(record.primitive_task, record.action, record.context)
             self.tallies[key] = corrected(self.tally(key), record)
         elif isinstance(record, Passage):
-            where = PassageKey(task, record.transition, record.context)
-            self.flows[where] = self.flows.get(where, Flow()).adding(record.waited)
+            where = FiringsKey(task, record.transition, record.context)
+            self.flows[where] = self.flows.get(where, Firings()).adding(record.waited)
 
 
 class Learning:
@@ -136,7 +145,7 @@ class Learning:
             return
         if isinstance(record, Choice):
             selector.chosen(record.context, record.action)
-        elif isinstance(record, End):
+        elif isinstance(record, RunEnd):
             selector.update(record.context, record.action, record.outcome)
         elif record.was.status is not None:
             selector.correct(
@@ -183,7 +192,7 @@ class Learning:
         for name in self.task.primitive_tasks:
             measure = self.question(name).measure
             for action, by_context in self.gained.of(name).items():
-                whole = reduce(merge, by_context.values(), NOTHING)
+                whole = reduce(merge_tallies, by_context.values(), NOTHING)
                 if whole.runs and not whole.cost(measure).n:
                     found.append((name, action, measure))
         return found

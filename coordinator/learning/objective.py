@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from math import inf, isnan, nan
 
-from petrobot.coordinator.learning.estimate import Tally, merge
+from petrobot.coordinator.learning.estimate import Tally, merge_tallies
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,7 @@ def compare(
     unmet = not any(inside.values())
     rows = []
     for action, by_scenario in over.items():
-        whole = reduce(merge, actions[action].values(), Tally())
+        whole = reduce(merge_tallies, actions[action].values(), Tally())
         rows.append(_row(action, whole, by_scenario, inside[action], question, unmet))
     rho = cost_weight(f.cost for f in rows) if question.rho is None else question.rho
     known = any(f.runs for f in rows)

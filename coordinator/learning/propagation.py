@@ -21,7 +21,7 @@ from petrobot.coordinator.analysis.net.space import Limits
 from petrobot.coordinator.analysis.time.stochastic import Measured, is_cause, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
-from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge
+from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallies
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import cost_weight, objective
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
@@ -104,7 +104,7 @@ def measured_from(
             continue
         takers = _preempting(task, place.name)
         for action, by_context in estimates.of(place.task, context).items():
-            tally = reduce(merge, by_context.values(), Tally())
+            tally = reduce(merge_tallies, by_context.values(), Tally())
             started = tally.runs + tally.censored + sum(tally.not_executed.values())
             if not tally.runs and not tally.censored:
                 continue
@@ -163,24 +163,24 @@ def _cause(exit_: str, takers: set[str]) -> str | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Law:
+class _EndShare:
     share: float
     mean: float
     cv: float
 
 
-def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | Incidence]:
+def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndShare | Incidence]:
     """Nothing was cut off: relative frequencies and the moments as they were summed."""
     whole = sum(m.n for m in tally.durations.values())
     out: dict[str, Any] = {}
     for cause in sorted({c for c in causes.values() if c is not None}):
         parts = [tally.durations[e] for e, c in causes.items() if c == cause]
         moments = reduce(lambda a, b: a.merged(b), parts)
-        out[cause] = _Law(moments.n / whole, moments.mean, moments.cv)
+        out[cause] = _EndShare(moments.n / whole, moments.mean, moments.cv)
     return out
 
 
-def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | Incidence]:
+def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndShare | Incidence]:
     """Some runs were cut off: Aalen-Johansen over the kept sample, at a constant rate beyond its
     longest run."""
     kept = tally.sample.kept
@@ -204,13 +204,13 @@ def unended(times: Sequence[float], causes: Sequence[str | None]) -> tuple[float
     return left, max(times, default=0.0)
 
 
-def _with_tail(law: Incidence, left: float, longest: float, mean: float) -> _Law:
+def _with_tail(law: Incidence, left: float, longest: float, mean: float) -> _EndShare:
     """A law whose part `left` ends after `longest` s, by an exponential time of this mean (s)
     later."""
     first = (1 - left) * law.mean + left * (longest + mean)
     own = (law.cv**2 + 1) * law.mean**2
     second = (1 - left) * own + left * (longest**2 + 2 * longest * mean + 2 * mean**2)
-    return _Law(law.share, first, sqrt(max(0.0, second - first**2)) / first)
+    return _EndShare(law.share, first, sqrt(max(0.0, second - first**2)) / first)
 
 
 def _with_missing(
@@ -273,7 +273,7 @@ def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class PrimitiveFigures:
     """A primitive task, its alternatives mixed as they are chosen: R, mean C, J, and expected runs
     in one mission run."""
 
@@ -289,7 +289,7 @@ class Propagated:
     """R and C of the task. R_conj, R_goal and P_complete are three numbers, not one
     (docs/analysis.md)."""
 
-    parts: Mapping[str, Part]
+    parts: Mapping[str, PrimitiveFigures]
     forecast: Forecast
     cost: float
     """Expected cost of a mission run: it adds over runs, parallel branches included. Time is the
@@ -332,12 +332,12 @@ def propagate(
     measured = measured_from(task, estimates, context, choice)
     solved = forecast(stochastic_view(task, measured), limits=limits)
     visits = _visits(solved)
-    parts: dict[str, Part] = {}
+    parts: dict[str, PrimitiveFigures] = {}
     for name, primitive in task.primitive_tasks.items():
         places = [p.name for p in task.flat.places.values() if p.task == name]
         runs = sum(n for (place, _), n in visits.items() if place in places)
         by_context = estimates.of(name, context)
-        tallies = {a: reduce(merge, by_context[a].values(), Tally()) for a in by_context}
+        tallies = {a: reduce(merge_tallies, by_context[a].values(), Tally()) for a in by_context}
         part = _part(name, tallies, measured.choice.get(name, {}), measure or primitive.cost, runs)
         if part is not None:
             parts[name] = part
@@ -348,7 +348,7 @@ def propagate(
 
 def _part(
     name: str, tallies: Mapping[str, Tally], shares: Mapping[str, float], measure: str, runs: float
-) -> Part | None:
+) -> PrimitiveFigures | None:
     """The alternatives of a primitive task mixed; None where none that is chosen was measured."""
     used = [a for a, share in shares.items() if share > 0 and a in tallies and tallies[a].runs]
     if not used:
@@ -357,7 +357,7 @@ def _part(
     costed = [a for a in used if a in costs]
     r = _mixed(shares, {a: tallies[a].availability * tallies[a].reliability for a in used})
     c = _mixed(shares, {a: costs[a] for a in costed}) if costed else nan
-    return Part(name, r, c, objective(r, c, cost_weight(costs.values())), runs)
+    return PrimitiveFigures(name, r, c, objective(r, c, cost_weight(costs.values())), runs)
 
 
 def _mixed(shares: Mapping[str, float], values: Mapping[str, float]) -> float:

@@ -13,16 +13,20 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.special import ndtri
 
-from petrobot.coordinator.learning.automata import (
-    DiscretisedPursuit,
-    NikolicFu,
-    RewardInaction,
-    Tracking,
-)
 from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Response
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.rules import UCB1, Fixed, RoundRobin, Rule, Thompson
+from petrobot.coordinator.learning.rules import (
+    UCB1,
+    DiscretisedPursuit,
+    Fixed,
+    NikolicFu,
+    RewardInaction,
+    RoundRobin,
+    Rule,
+    Thompson,
+    Tracking,
+)
 from petrobot.coordinator.task import Executed, Status
 
 # Which actions meet a target reliability, for many learners at once: the lower confidence bound decides, with hysteresis.

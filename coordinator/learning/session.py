@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learner import Contexts, LearningSelector, usual_contexts
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.records import Correction, End
+from petrobot.coordinator.learning.records import Correction, RunEnd
 from petrobot.coordinator.learning.selectors import DEFAULT, RULES
 from petrobot.coordinator.task import Task
 
@@ -129,7 +129,9 @@ class LearningSession:
         """What came after so many records, and the verdicts in it on runs that the file has counted
         already."""
         counted = {
-            id(record.outcome) for record in self.selector.records[:done] if isinstance(record, End)
+            id(record.outcome)
+            for record in self.selector.records[:done]
+            if isinstance(record, RunEnd)
         }
         gained, late = Estimates(), []
         for record in self.selector.records[done:]:
@@ -143,7 +145,7 @@ class LearningSession:
 def _learning(
     task: Task,
     setting: LearningSetting,
-    kept: Kept,
+    kept: FileContents,
     states: Mapping[str, Mapping[str, Any]] | None,
     salt: str,
 ) -> Learning:

@@ -15,31 +15,30 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.learning.estimate import Key, Observation
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, TallyKey
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.selectors import make
-from petrobot.coordinator.learning.waits import Flow, PassageKey
 from petrobot.coordinator.task import Status
 from tests.learning.conftest import OBSERVATIONS, tally_of
 
-KEY = Key("pick", "pick_fast", "regime=A")
-OTHER = Key("place", "place_soft")
+KEY = TallyKey("pick", "pick_fast", "regime=A")
+OTHER = TallyKey("place", "place_soft")
 
 
-def gained(good: int, key: Key = KEY, salt: str = "") -> Estimates:
+def gained(good: int, key: TallyKey = KEY, salt: str = "") -> Estimates:
     """So many successes of one action, and as many firings."""
     tally = tally_of(
         [Observation(Status.SUCCESS, 0.1 * (i + 1), cpu_seconds=0.01) for i in range(good)], salt
     )
-    flow = Flow()
+    flow = Firings()
     for _ in range(good):
         flow = flow.adding(0.02)
-    return Estimates({key: tally}, {PassageKey("sorting", "begin", "regime=A"): flow})
+    return Estimates({key: tally}, {FiringsKey("sorting", "begin", "regime=A"): flow})
 
 
-def file_of(path: Path, good: int, key: Key = KEY) -> EstimatesFile:
+def file_of(path: Path, good: int, key: TallyKey = KEY) -> EstimatesFile:
     """A file with an origin of its own."""
     file = EstimatesFile(path)
     file.add(gained(good, key, path.name), {})
@@ -57,7 +56,7 @@ def test_what_was_added_is_there_again(tmp_path: Path) -> None:
     """Sums of several sessions, selectors' states, the generation; a file that is not there holds
     nothing."""
     path = tmp_path / "deep" / "learned.db"
-    assert EstimatesFile(path).read() == Kept()
+    assert EstimatesFile(path).read() == FileContents()
     selector = make("ucb1", ("pick_fast", "pick_slow"))
     selector.update("regime=A", "pick_fast", Observation(Status.SUCCESS, 1.0))
     for session in range(3):
@@ -66,7 +65,7 @@ def test_what_was_added_is_there_again(tmp_path: Path) -> None:
     assert kept.generation == 3
     assert kept.estimates.tally(KEY).runs == 12
     assert len(kept.estimates.tally(KEY).sample.kept) == 12
-    assert kept.estimates.flows[PassageKey("sorting", "begin", "regime=A")].waits.n == 12
+    assert kept.estimates.flows[FiringsKey("sorting", "begin", "regime=A")].waits.n == 12
     assert kept.states("ucb1") == {"pick": selector.state()}
     assert kept.states("thompson") == {}
 
@@ -196,7 +195,7 @@ def test_a_file_that_was_only_begun_holds_nothing(tmp_path: Path) -> None:
     path = tmp_path / "begun.db"
     path.touch()
     file = EstimatesFile(path)
-    assert file.read() == Kept()
+    assert file.read() == FileContents()
     assert file.records_of("m") == 0
     whole = file_of(tmp_path / "whole.db", 2)
     whole.merge(path)
@@ -454,7 +453,7 @@ def old_file(path: Path, good: int, origin: str) -> EstimatesFile:
         gained(good, salt=origin).tally(KEY),
         state_of("ucb1", {"A": 3}) | {"cost": "value:images"},
     )
-    flow = gained(good).flows[PassageKey("sorting", "begin", "regime=A")]
+    flow = gained(good).flows[FiringsKey("sorting", "begin", "regime=A")]
     with closing(sqlite3.connect(path)) as db, db:
         rows = [("origin", origin), ("generation", "1")]
         db.executemany("INSERT INTO about VALUES (?, ?)", rows)

@@ -12,7 +12,7 @@ import pytest
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import Engine
 from petrobot.coordinator.launch import resumed_mission, with_runs
-from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
@@ -278,7 +278,9 @@ def shares(seconds: float, **by_context: tuple[int, int]) -> dict[str, Tally]:
 
 def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tally]) -> Path:
     """An estimates file of one primitive task."""
-    tallies = {Key("pick", a, c): tally for a, by in actions.items() for c, tally in by.items()}
+    tallies = {
+        TallyKey("pick", a, c): tally for a, by in actions.items() for c, tally in by.items()
+    }
     EstimatesFile(path).add(Estimates(tallies), {}, asked={"pick": asked} if asked else None)
     return path
 
@@ -450,7 +452,7 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
                 "learning": {k: v for k, v in header["learning"].items() if k != "declared"},
             },
         )
-    assert Key("pick", "pick_slow", "regime=A") in kept.estimates.tallies
+    assert TallyKey("pick", "pick_slow", "regime=A") in kept.estimates.tallies
 
 
 def test_a_resumed_mission_brings_its_selector_to_where_it_was(tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ from pathlib import Path
 
 from petrobot.coordinator.cli.loading import task_path
 from petrobot.coordinator.launch import Setting, lockstep_cell
-from petrobot.coordinator.studies.campaign.block import Bench, run_block
-from petrobot.coordinator.studies.campaign.plan import Plan
+from petrobot.coordinator.studies.campaign.block import LoadedPlan, run_block
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan
 
 ROOT = Path(__file__).parents[2]
 
 
-def bare(bench: Bench, seed: int, throws: int) -> float:
+def bare(bench: LoadedPlan, seed: int, throws: int) -> float:
     """CPU seconds of `petrobot run` without its terminal and report."""
     begun = time.process_time()
     cell, party = lockstep_cell(bench.directory, Setting(bench.task, {"regime": "B"}, throws, seed))
@@ -29,7 +29,7 @@ def bare(bench: Bench, seed: int, throws: int) -> float:
     return time.process_time() - begun
 
 
-def block(bench: Bench, seed: int, throws: int) -> float:
+def block(bench: LoadedPlan, seed: int, throws: int) -> float:
     """CPU seconds of the same as a campaign's block."""
     begun = time.process_time()
     one = replace(bench.plan.blocks[0], seed=seed, count=throws)
@@ -49,8 +49,8 @@ def main() -> None:
         "--rounds", type=int, default=3, metavar="N", help="that count (%(default)s)"
     )
     options = parser.parse_args()
-    bench = Bench.of(
-        Plan(
+    bench = LoadedPlan.of(
+        CampaignPlan(
             str(task_path("catch_ball")),
             str(ROOT / "services.toml"),
             options.trials,

@@ -23,7 +23,7 @@ from petrobot.coordinator.launch import (
 from petrobot.coordinator.learning.estimate import COUNT
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import Mission, MissionError
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan, digest
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.trials import CostOf, TrialLog
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError
@@ -42,15 +42,15 @@ PLOTS = "plots"
 
 
 @dataclass(frozen=True)
-class Bench:
+class LoadedPlan:
     """Everything that the blocks of one plan share: read once in each process."""
 
-    plan: Plan
+    plan: CampaignPlan
     task: Task
     directory: Directory
 
     @classmethod
-    def of(cls, plan: Plan) -> Bench:
+    def of(cls, plan: CampaignPlan) -> LoadedPlan:
         """Read the plan's files. Raises CampaignError, also when they are not those that the
         campaign began with."""
         for key, said in plan.digests.items():
@@ -100,7 +100,7 @@ class BlockSelector:
         return offered[index][0], f"drawn with probability {offered[index][1] / bounds[-1]:.3f}"
 
 
-def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
+def run_block(bench: LoadedPlan, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
     """Run a block. `weights`: for each of its trials, the probabilities of each primitive task's
     actions.
 
@@ -151,7 +151,7 @@ def resident_mb() -> float:
     return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
 
 
-def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission, list[Party]]:
+def _cell(bench: LoadedPlan, block: Block, selector: BlockSelector) -> tuple[Mission, list[Party]]:
     plan, directory = bench.plan, bench.directory
     regime = {"regime": block.regime} if block.regime else {}
     setting = Setting(bench.task, {**plan.parameters, **regime}, block.count, block.seed, selector)

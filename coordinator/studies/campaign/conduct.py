@@ -11,25 +11,30 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
-from petrobot.coordinator.studies.campaign.block import PLOTS, Bench
+from petrobot.coordinator.studies.campaign.block import PLOTS, LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import write_estimates
 from petrobot.coordinator.studies.campaign.plan import (
     MANIFEST,
     TABLE,
     Block,
     CampaignError,
-    Plan,
+    CampaignPlan,
     differences,
     identity,
     read_manifest,
     write_manifest,
 )
-from petrobot.coordinator.studies.campaign.policies import Policy, policy_of
-from petrobot.coordinator.studies.campaign.rows import Row, rows_of
+from petrobot.coordinator.studies.campaign.policies import ChoicePolicy, policy_of
+from petrobot.coordinator.studies.campaign.rows import TrialRow, rows_of
 from petrobot.coordinator.studies.campaign.summary import Summary, result_of
-from petrobot.coordinator.studies.campaign.table import Table, note_block, note_sessions, sessions
+from petrobot.coordinator.studies.campaign.table import (
+    CampaignTable,
+    note_block,
+    note_sessions,
+    sessions,
+)
 from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import make_folder, write_whole
 
@@ -38,7 +43,7 @@ AHEAD = 3
 one is awaited."""
 
 
-class Pool(Protocol):
+class WorkerPool(Protocol):
     """Whoever does blocks."""
 
     count: int
@@ -49,7 +54,7 @@ class Pool(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class CampaignProgress:
     """How far a campaign is."""
 
     done: int
@@ -62,10 +67,10 @@ class Progress:
     """Since this session began (wall clock)."""
 
 
-Watch = Callable[[Progress], None]
+Watch = Callable[[CampaignProgress], None]
 
 
-def open_folder(folder: Path, plan: Plan) -> None:
+def open_folder(folder: Path, plan: CampaignPlan) -> None:
     """Make the folder of a campaign, or see that what it holds is the same campaign. Raises
     CampaignError."""
     try:
@@ -87,13 +92,13 @@ def open_folder(folder: Path, plan: Plan) -> None:
 class Campaign:
     """One campaign in its folder."""
 
-    def __init__(self, folder: Path, plan: Plan, watch: Watch | None = None) -> None:
+    def __init__(self, folder: Path, plan: CampaignPlan, watch: Watch | None = None) -> None:
         """Raises CampaignError for files, choices or a folder that do not fit."""
         self.plan, self.folder = plan, folder
-        self.bench = Bench.of(plan)
-        self.policy: Policy = policy_of(plan, self.bench.task, self.bench.directory)
+        self.bench = LoadedPlan.of(plan)
+        self.policy: ChoicePolicy = policy_of(plan, self.bench.task, self.bench.directory)
         open_folder(folder, plan)
-        self.table = Table(folder, self.bench.task)
+        self.table = CampaignTable(folder, self.bench.task)
         self._watch = watch
         self._goals = self._trials = self._already = 0
         self._began = time.monotonic()
@@ -106,7 +111,7 @@ class Campaign:
         blocks = self.plan.blocks
         return self.table.recover(blocks) == len(blocks)
 
-    async def run(self, pool: Pool) -> None:
+    async def run(self, pool: WorkerPool) -> None:
         """Do what is left. Interrupted at any point, the next `run` in the same folder goes on.
         Raises CampaignError."""
         blocks = self.plan.blocks
@@ -127,7 +132,7 @@ class Campaign:
             async for _ in self._results(pool, self._orders(blocks[done:])):
                 pass
 
-    async def _learn(self, pool: Pool, done: int) -> None:
+    async def _learn(self, pool: WorkerPool, done: int) -> None:
         """Batch by batch; what had been done before is learned again from the table."""
         before = self.table.rows()
         for batch in self.plan.batches:
@@ -148,8 +153,8 @@ class Campaign:
         return result_of(self.folder, self.plan, summary, self.policy.state())
 
     async def _results(
-        self, pool: Pool, orders: Iterator[tuple[Block, dict[str, Any]]]
-    ) -> AsyncIterator[list[Row]]:
+        self, pool: WorkerPool, orders: Iterator[tuple[Block, dict[str, Any]]]
+    ) -> AsyncIterator[list[TrialRow]]:
         """The rows of blocks in order; each block's are in the table before they are given."""
         going: deque[tuple[Block, asyncio.Task[dict[str, Any]]]] = deque()
         try:
@@ -171,7 +176,7 @@ class Campaign:
         for block in blocks:
             yield block, {"block": block.to_plain(), "weights": self.policy.weights(block)}
 
-    def _keep(self, pool: Pool, block: Block, result: Mapping[str, Any]) -> list[Row]:
+    def _keep(self, pool: WorkerPool, block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
         if "fault" in result:
             raise CampaignError(str(result["fault"]))
         rows = rows_of(block, result)
@@ -185,11 +190,68 @@ class Campaign:
         self._goals += sum(1 for row in rows if row.trial is not None and row.trial.goals > 0)
         if self._watch is not None:
             now = time.monotonic() - self._began
-            self._watch(Progress(self._trials, self.plan.runs, self._already, self._goals, now))
+            self._watch(
+                CampaignProgress(self._trials, self.plan.runs, self._already, self._goals, now)
+            )
         return rows
 
-    def _note_session(self, pool: Pool) -> None:
+    def _note_session(self, pool: WorkerPool) -> None:
         """Write down this session so far, so that one that is killed is known, too."""
         self._session["blocks"] += 1
         self._session |= {"wall_s": round(time.monotonic() - self._began, 3), "lost": pool.lost}
         note_sessions(self.folder, [*self._sessions, self._session])
+
+
+# --- progress ---
+
+
+WIDTH = 30
+BEFORE = 0.2
+"""s between two updates at least."""
+
+
+def clock(seconds: float) -> str:
+    """Seconds as m:ss or h:mm:ss."""
+    minutes, rest = divmod(max(0, round(seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def line(progress: CampaignProgress) -> str:
+    """The line: a bar, how many trials are done, how many met their goal in this session, time gone
+    and to go."""
+    full = round(WIDTH * progress.done / max(1, progress.of))
+    fresh = progress.done - progress.already
+    left = progress.seconds / fresh * (progress.of - progress.done) if fresh else 0.0
+    met = f"{progress.goals / fresh:.1%} met" if fresh else ""
+    bar = "#" * full + "." * (WIDTH - full)
+    return (
+        f"[{bar}] {progress.done}/{progress.of}  {met}  {clock(progress.seconds)} gone, "
+        f"{clock(left)} to go"
+    )
+
+
+class ProgressLine:
+    """Writes the line to a terminal; nothing where there is none."""
+
+    def __init__(self, out: TextIO) -> None:
+        self._out = out
+        self._shown = -BEFORE
+        self._length = 0
+        self.wanted = out.isatty()
+
+    def __call__(self, progress: CampaignProgress) -> None:
+        """Show it, unless the last update was a moment ago and this is not the end."""
+        if not self.wanted or (
+            progress.seconds - self._shown < BEFORE and progress.done < progress.of
+        ):
+            return
+        self._shown = progress.seconds
+        text = line(progress)
+        print("\r" + text.ljust(self._length), end="", file=self._out, flush=True)
+        self._length = len(text)
+
+    def close(self) -> None:
+        """End the line."""
+        if self._length:
+            print(file=self._out, flush=True)

@@ -7,14 +7,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, Tally, TallyKey
 from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.waits import Flow, PassageKey
 from petrobot.coordinator.studies.campaign.plan import CampaignError
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry
 from petrobot.coordinator.task import Executed, Status, Task
 
@@ -48,13 +47,13 @@ def observation(task: Task, run: RunEntry) -> Observation:
     )
 
 
-def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
+def add_row(estimates: Estimates, task: Task, row: TrialRow, salt: str) -> None:
     """Count a row's runs and firings."""
     if row.trial is None:
         return
     context = context_of(row.regime)
     for run in row.trial.runs:
-        key = Key(task.primitive_task_of(run.place).name, run.action, context)
+        key = TallyKey(task.primitive_task_of(run.place).name, run.action, context)
         name = f"{salt}/{row.regime}/{row.seed}/{row.k}"
         estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(
             observation(task, run), name
@@ -63,15 +62,15 @@ def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
     for transition, seconds in row.trial.waits:
         waits.setdefault(transition, []).append(seconds)
     for transition, count in row.trial.fired.items():
-        where = PassageKey(task.name, transition, context)
-        flow = estimates.flows.get(where, Flow())
+        where = FiringsKey(task.name, transition, context)
+        flow = estimates.flows.get(where, Firings())
         known = waits.get(transition, [])
         for i in range(count):
             flow = flow.adding(known[i] if i < len(known) else None)
         estimates.flows[where] = flow
 
 
-def estimates_of(task: Task, rows: Iterable[Row], salt: str) -> Estimates:
+def estimates_of(task: Task, rows: Iterable[TrialRow], salt: str) -> Estimates:
     """The estimates of a whole table. `salt` names the campaign."""
     made = Estimates()
     for row in rows:

@@ -30,7 +30,7 @@ class CampaignError(Exception):
 
 
 @dataclass(frozen=True)
-class Plan:
+class CampaignPlan:
     """A campaign. Paths are kept as given; digests tell whether what they name has changed
     since."""
 
@@ -62,7 +62,7 @@ class Plan:
         return json.loads(json_text({"schema": SCHEMA, **asdict(self)}))  # type: ignore[no-any-return]
 
     @classmethod
-    def from_plain(cls, data: Mapping[str, Any]) -> Plan:
+    def from_plain(cls, data: Mapping[str, Any]) -> CampaignPlan:
         """Back from `to_plain`. Raises CampaignError for another schema."""
         if data.get("schema") != SCHEMA:
             raise CampaignError(
@@ -141,19 +141,19 @@ def digest(path: Path | str) -> str:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
 
 
-def write_manifest(folder: Path, plan: Plan) -> None:
+def write_manifest(folder: Path, plan: CampaignPlan) -> None:
     """Keep the plan beside its table."""
     write_whole(folder / MANIFEST, json_text(plan.to_plain(), indent=2) + "\n")
 
 
-def read_manifest(folder: Path) -> Plan:
+def read_manifest(folder: Path) -> CampaignPlan:
     """The plan of a campaign's folder. Raises CampaignError."""
     path = folder / MANIFEST
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(data, Mapping):
             raise ValueError(f"a {type(data).__name__} is no plan")
-        return Plan.from_plain(data)
+        return CampaignPlan.from_plain(data)
     except (FileNotFoundError, NotADirectoryError) as fault:
         remedy = "give a folder that `petrobot campaign --out FOLDER` wrote"
         raise CampaignError(
@@ -178,7 +178,7 @@ def _remedy(folder: Path) -> str:
     )
 
 
-def differences(old: Plan, new: Plan) -> list[str]:
+def differences(old: CampaignPlan, new: CampaignPlan) -> list[str]:
     """Keys in which two plans differ, but for paths whose files are the same."""
     before, after = old.to_plain(), new.to_plain()
     same_file = {
@@ -187,7 +187,7 @@ def differences(old: Plan, new: Plan) -> list[str]:
     return [key for key in before if key not in same_file and before[key] != after.get(key)]
 
 
-def identity(plan: Plan) -> str:
+def identity(plan: CampaignPlan) -> str:
     """A short name of what a campaign runs, the same wherever its files lie: trials of equal
     identity are the same trials."""
     data = plan.to_plain()

@@ -16,17 +16,17 @@ import numpy as np
 
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.records import Choice, End
+from petrobot.coordinator.learning.records import Choice, RunEnd
 from petrobot.coordinator.learning.selectors import RULES
 from petrobot.coordinator.studies.campaign.block import Weights
 from petrobot.coordinator.studies.campaign.observed import context_of, observation, regime_of
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
 
 
-class Policy(Protocol):
+class ChoicePolicy(Protocol):
     """Chooses before a batch, learns after it."""
 
     learns: bool
@@ -35,7 +35,7 @@ class Policy(Protocol):
     def weights(self, block: Block) -> list[Weights]:
         """For each trial of a block, the probabilities of each primitive task's actions."""
 
-    def update(self, rows: Sequence[Row]) -> None:
+    def update(self, rows: Sequence[TrialRow]) -> None:
         """Take the rows of a whole batch, in the order of the table."""
 
     def state(self) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def offered(task: Task, directory: Directory) -> dict[str, tuple[str, ...]]:
     }
 
 
-class Fixed:
+class FixedActions:
     """The actions chosen by hand; the first alternative of every other primitive task.
 
     `by_regime`: further choices, by regime (what a learning campaign has come to).
@@ -79,7 +79,7 @@ class Fixed:
         """The same for every trial of a regime."""
         return [self._by_regime.get(block.regime, self._weights)] * block.count
 
-    def update(self, rows: Sequence[Row]) -> None:
+    def update(self, rows: Sequence[TrialRow]) -> None:
         """Nothing is learned."""
 
     def state(self) -> dict[str, Any]:
@@ -91,7 +91,7 @@ class Fixed:
         return {}
 
 
-class RoundRobin:
+class AllCombinations:
     """All combinations of alternatives in turn (of those not chosen by hand), from trial to trial
     of a regime."""
 
@@ -118,7 +118,7 @@ class RoundRobin:
         combinations = [self.combination(block.regime_first + k) for k in range(block.count)]
         return [{task: {action: 1.0} for task, action in c.items()} for c in combinations]
 
-    def update(self, rows: Sequence[Row]) -> None:
+    def update(self, rows: Sequence[TrialRow]) -> None:
         """Nothing is learned."""
 
     def state(self) -> dict[str, Any]:
@@ -130,7 +130,7 @@ class RoundRobin:
         return {}
 
 
-class Random(RoundRobin):
+class RandomActions(AllCombinations):
     """Every alternative with the same probability, drawn anew at each choice: what estimates and
     forecasts train on."""
 
@@ -143,7 +143,7 @@ class Random(RoundRobin):
         return [even] * block.count
 
 
-class Learned:
+class LearnedActions:
     """A learner for each primitive task with alternatives and each regime (docs/learning.md).
 
     One choice for each trial and primitive task: a run that is repeated within its trial takes the
@@ -186,7 +186,7 @@ class Learned:
             out[name] = {action: 1.0}
         return out
 
-    def update(self, rows: Sequence[Row]) -> None:
+    def update(self, rows: Sequence[TrialRow]) -> None:
         """Take what was really run, in the order of the table."""
         for selector in self._learning.selectors.values():
             selector.reset()
@@ -197,7 +197,9 @@ class Learned:
             for run in row.trial.runs if row.trial is not None else ():
                 name = self._task.primitive_task_of(run.place).name
                 self._learning.apply(Choice(name, run.action, context))
-                self._learning.apply(End(name, run.action, context, observation(self._task, run)))
+                self._learning.apply(
+                    RunEnd(name, run.action, context, observation(self._task, run))
+                )
 
     def state(self) -> dict[str, Any]:
         """By regime and primitive task: learned probabilities, J from the learner's sums, and the
@@ -225,10 +227,10 @@ class Learned:
         }
 
 
-PLAIN: Mapping[str, type[Fixed] | type[RoundRobin]] = {
-    "fixed": Fixed,
-    "round_robin": RoundRobin,
-    "random": Random,
+PLAIN: Mapping[str, type[FixedActions] | type[AllCombinations]] = {
+    "fixed": FixedActions,
+    "round_robin": AllCombinations,
+    "random": RandomActions,
 }
 
 
@@ -253,7 +255,7 @@ def check_chosen(task: Task, directory: Directory, chosen: Mapping[str, str]) ->
             )
 
 
-def policy_of(plan: Plan, task: Task, directory: Directory) -> Policy:
+def policy_of(plan: CampaignPlan, task: Task, directory: Directory) -> ChoicePolicy:
     """The policy that a plan names. Raises CampaignError."""
     check_chosen(task, directory, plan.chosen)
     alternatives = offered(task, directory)
@@ -261,14 +263,14 @@ def policy_of(plan: Plan, task: Task, directory: Directory) -> Policy:
         by_regime = plan.options.get("by_regime", {})
         for more in by_regime.values():
             check_chosen(task, directory, more)
-        return Fixed(alternatives, plan.chosen, by_regime)
+        return FixedActions(alternatives, plan.chosen, by_regime)
     if plan.selector in PLAIN:
         return PLAIN[plan.selector](alternatives, plan.chosen)
     if plan.selector not in RULES:
         known = ", ".join(dict.fromkeys([*PLAIN, *RULES]))
         raise CampaignError(f"--selector {plan.selector}: not known; choose among {known}")
     question = Question(target=plan.options.get("target"), rho=plan.options.get("rho"))
-    return Learned(task, plan.selector, alternatives, plan.chosen, question)
+    return LearnedActions(task, plan.selector, alternatives, plan.chosen, question)
 
 
 def learned_choices(folder: Path) -> dict[str, dict[str, str]]:

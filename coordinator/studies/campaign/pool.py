@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -14,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from petrobot.coordinator.run.supervisor import LAST_WORDS, output_pipe
-from petrobot.coordinator.studies.campaign.plan import CampaignError, Plan
+from petrobot.coordinator.studies.campaign.plan import CampaignError, CampaignPlan
+from petrobot.coordinator.studies.campaign.worker import answer
 from petrobot.services.host.parent_death import until_ended
 
 RETIRES_AFTER = 200
@@ -120,7 +122,7 @@ class _Worker:
 class LocalPool:
     """`count` worker processes; use as an async context."""
 
-    def __init__(self, plan: Plan, count: int, log: Path) -> None:
+    def __init__(self, plan: CampaignPlan, count: int, log: Path) -> None:
         self.count = count
         self._log = log
         self.lost = 0
@@ -173,3 +175,73 @@ class LocalPool:
         else:
             self._idle.append(worker)
         return answer
+
+
+# --- workers of a cluster ---
+
+
+PATIENCE = 30.0
+"""s in which a first worker has to be there."""
+RETRIES = 5
+"""Times that a block whose worker was lost is given to another one."""
+
+
+def dask_distributed() -> Any:
+    """The module. Raises CampaignError when it is not installed."""
+    try:
+        return importlib.import_module("distributed")
+    except ImportError as fault:
+        raise CampaignError(
+            "--cluster needs dask.distributed: pip install 'petrobot[cluster]'"
+        ) from fault
+
+
+class ClusterPool:
+    """The workers of a dask scheduler; each has petrobot installed and the campaign's files at the
+    same paths.
+
+    Use as an async context. Raises CampaignError when dask.distributed is missing or the scheduler
+    does not answer.
+    """
+
+    def __init__(self, plan: CampaignPlan, address: str) -> None:
+        self._plan, self._address = json.dumps(plan.to_plain()), address
+        self._client: Any = None
+        self.lost = 0
+        self.count = 1
+        """Threads of all workers, as the scheduler told when the campaign began."""
+
+    async def __aenter__(self) -> ClusterPool:
+        distributed = dask_distributed()
+        try:
+            self._client = await distributed.Client(self._address, asynchronous=True, timeout=10)
+        except (OSError, TimeoutError, ValueError) as fault:
+            raise CampaignError(
+                f"--cluster {self._address}: no scheduler answers: {fault}"
+            ) from fault
+        await self.workers(1, PATIENCE)
+        return self
+
+    async def workers(self, least: int, patience: float) -> None:
+        """Wait until so many workers are there, and count them. Raises CampaignError after
+        `patience` s."""
+        try:
+            await self._client.wait_for_workers(least, timeout=patience)
+        except TimeoutError as fault:
+            raise CampaignError(
+                f"--cluster {self._address}: fewer than {least} workers in {patience:g} s"
+            ) from fault
+        self.count = sum((await self._client.nthreads()).values())
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._client.close()
+
+    async def run(self, order: Mapping[str, Any]) -> dict[str, Any]:
+        """Have a block done. Raises CampaignError."""
+        future = self._client.submit(answer, self._plan, dict(order), pure=False, retries=RETRIES)
+        try:
+            return dict(await future)
+        except dask_distributed().KilledWorker as fault:
+            raise CampaignError(
+                f"block {order['block']['index']} (seed {order['block']['seed']}): {fault}"
+            ) from fault

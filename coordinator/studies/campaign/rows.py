@@ -40,7 +40,7 @@ Cell = str | int | float | None
 
 
 @dataclass
-class Row:
+class TrialRow:
     """A trial of a campaign. `trial` is None when the mission run was given up before it."""
 
     n: int
@@ -54,11 +54,11 @@ class Row:
     """The task's own results, as `table.column`."""
 
 
-def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
+def rows_of(block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
     """The rows of a block's result."""
     trials = {t["k"]: Trial.from_plain(t) for t in result["trials"]}
     return [
-        Row(
+        TrialRow(
             block.first + k,
             block.regime,
             block.seed,
@@ -72,7 +72,7 @@ def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
     ]
 
 
-def columns(task: Task, rows: Sequence[Row]) -> list[str]:
+def columns(task: Task, rows: Sequence[TrialRow]) -> list[str]:
     """The table's columns: the general ones, those of the task file, and those of the task's score
     in these first rows."""
     chosen = [f"chosen.{name}" for name in task.primitive_tasks]
@@ -86,7 +86,7 @@ def columns(task: Task, rows: Sequence[Row]) -> list[str]:
     return [*GENERAL, *chosen, *places, *own, *LAST]
 
 
-def cells(task: Task, row: Row, names: Sequence[str]) -> list[str]:
+def cells(task: Task, row: TrialRow, names: Sequence[str]) -> list[str]:
     """A row as texts, in the order of the columns."""
     found = {**_general(row), **_runs(task, row.trial), **row.score}
     more = {k: v for k, v in row.score.items() if k not in names}
@@ -94,7 +94,7 @@ def cells(task: Task, row: Row, names: Sequence[str]) -> list[str]:
     return [_text(found.get(name)) for name in names]
 
 
-def _general(row: Row) -> dict[str, Any]:
+def _general(row: TrialRow) -> dict[str, Any]:
     base = {name: getattr(row, name) for name in ("n", "regime", "seed", "k", "block", "mission_s")}
     trial = row.trial
     if trial is None:
@@ -139,7 +139,7 @@ def _text(value: Any) -> str:
     return str(value) if isinstance(value, int) else _json(value)
 
 
-def read_row(record: Mapping[str, str]) -> Row:
+def read_row(record: Mapping[str, str]) -> TrialRow:
     """A row back from its texts. Raises KeyError or ValueError for a record that is none."""
     trial = None
     if record["begun"] == "true":
@@ -157,7 +157,7 @@ def read_row(record: Mapping[str, str]) -> Row:
         )
     own = {key: value_of(text) for key, text in record.items() if _is_own(key) and text != ""}
     own |= json.loads(record["more"]) if record.get("more") else {}
-    return Row(
+    return TrialRow(
         int(record["n"]),
         record["regime"],
         int(record["seed"]),

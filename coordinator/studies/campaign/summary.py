@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
-from petrobot.coordinator.studies.campaign.plan import TABLE, Plan
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.plan import TABLE, CampaignPlan
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.table import sessions, times
 from petrobot.coordinator.task import PrimitiveTask, Task
 
 
 @dataclass
-class Counts:
+class TrialCounts:
     """Trials of one regime, or of all."""
 
     runs: int = 0
@@ -36,7 +36,7 @@ class Counts:
     times: list[float] = field(default_factory=list)
     """s, of the completed ones."""
 
-    def add(self, row: Row) -> None:
+    def add(self, row: TrialRow) -> None:
         """Count a trial."""
         if row.trial is None:
             self.not_begun += 1
@@ -82,7 +82,7 @@ def question_of(
 
 def comparisons(
     task: Task,
-    tallies: Mapping[Key, Tally],
+    tallies: Mapping[TallyKey, Tally],
     regime: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> dict[str, Comparison]:
@@ -113,8 +113,8 @@ class Summary:
     """Everything that is counted in one pass over the rows."""
 
     task: Task
-    whole: Counts = field(default_factory=Counts)
-    by_regime: dict[str, Counts] = field(default_factory=dict)
+    whole: TrialCounts = field(default_factory=TrialCounts)
+    by_regime: dict[str, TrialCounts] = field(default_factory=dict)
     chosen: dict[str, dict[str, int]] = field(default_factory=dict)
     estimates: Estimates = field(default_factory=Estimates)
     salt: str = ""
@@ -126,7 +126,7 @@ class Summary:
     def of(
         cls,
         task: Task,
-        rows: Iterable[Row],
+        rows: Iterable[TrialRow],
         salt: str = "",
         options: Mapping[str, Any] | None = None,
     ) -> Summary:
@@ -137,10 +137,10 @@ class Summary:
             made.add(row)
         return made
 
-    def add(self, row: Row) -> None:
+    def add(self, row: TrialRow) -> None:
         """Count a row."""
         self.whole.add(row)
-        self.by_regime.setdefault(row.regime, Counts()).add(row)
+        self.by_regime.setdefault(row.regime, TrialCounts()).add(row)
         self.mission_s[row.block] = row.mission_s
         for run in row.trial.runs if row.trial is not None else ():
             primitive = self.task.primitive_task_of(run.place).name
@@ -194,7 +194,9 @@ class Summary:
         }
 
 
-def result_of(folder: Path, plan: Plan, made: Summary, policy: Mapping[str, Any]) -> dict[str, Any]:
+def result_of(
+    folder: Path, plan: CampaignPlan, made: Summary, policy: Mapping[str, Any]
+) -> dict[str, Any]:
     """The result of a campaign as the command line writes it."""
     summary, task = made.to_plain(), made.task
     held, took = sessions(folder), times(folder)

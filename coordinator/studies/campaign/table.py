@@ -15,14 +15,14 @@ from typing import Any
 
 from petrobot.coordinator.studies.campaign.plan import TABLE as TABLE
 from petrobot.coordinator.studies.campaign.plan import Block, CampaignError
-from petrobot.coordinator.studies.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.studies.campaign.rows import TrialRow, cells, columns, read_row
 from petrobot.coordinator.task import Task
 from petrobot.services.host.whole_file import sync_folder, write_whole
 
 PARQUET = "table.parquet"
 
 
-class Table:
+class CampaignTable:
     """The table of a task's campaign in a folder."""
 
     def __init__(self, folder: Path, task: Task) -> None:
@@ -53,7 +53,7 @@ class Table:
             file.truncate(end)
         return done
 
-    def append(self, rows: Sequence[Row]) -> None:
+    def append(self, rows: Sequence[TrialRow]) -> None:
         """Add a block's rows; they are on disk when this returns."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
@@ -70,12 +70,12 @@ class Table:
         if first:
             sync_folder(self.path.parent)
 
-    def rows(self) -> Iterator[Row]:
+    def rows(self) -> Iterator[TrialRow]:
         """All rows, one after the other."""
         return read_table(self.path) if self.path.exists() else iter(())
 
 
-def read_table(path: Path) -> Iterator[Row]:
+def read_table(path: Path) -> Iterator[TrialRow]:
     """The rows of a table. Raises CampaignError naming the line that is none."""
     csv.field_size_limit(1 << 26)
     try:

@@ -16,14 +16,14 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any, TextIO
 
-from petrobot.coordinator.studies.campaign.block import Bench, run_block
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan
+from petrobot.coordinator.studies.campaign.block import LoadedPlan, run_block
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan
 from petrobot.services.host.parent_death import die_with
 
 
 @lru_cache(maxsize=1)
-def _bench(plan: str) -> Bench:
-    return Bench.of(Plan.from_plain(json.loads(plan)))
+def _bench(plan: str) -> LoadedPlan:
+    return LoadedPlan.of(CampaignPlan.from_plain(json.loads(plan)))
 
 
 def answer(plan: str, order: Mapping[str, Any]) -> dict[str, Any]:

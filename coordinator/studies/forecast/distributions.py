@@ -52,7 +52,7 @@ outcomes."""
 
 
 @dataclass(frozen=True)
-class Law:
+class EndDistribution:
     """Ends that were seen in one context. Arrays over its members."""
 
     outcome: Codes
@@ -121,17 +121,17 @@ def codes_of(seen: Seen, kind: str) -> Codes:
 
 
 @dataclass
-class Context:
+class ContextNode:
     """A node of the tree: a law, and a split with children unless it is a leaf."""
 
-    law: Law
+    law: EndDistribution
     number: int
     split: Split | None = None
-    children: list[Context] = field(default_factory=list)
-    durations: dict[int, Context] = field(default_factory=dict)
+    children: list[ContextNode] = field(default_factory=list)
+    durations: dict[int, ContextNode] = field(default_factory=dict)
     """In a leaf of an outcome tree: the tree of the durations of each outcome."""
 
-    def leaves(self) -> list[Context]:
+    def leaves(self) -> list[ContextNode]:
         """All contexts that no test splits further."""
         return (
             [leaf for child in self.children for leaf in child.leaves()]
@@ -140,12 +140,12 @@ class Context:
         )
 
 
-class Laws:
+class RunDistributions:
     """Laws of all actions of one regime: `contexts[(place code, action code)]`."""
 
     def __init__(self, training: Training, *, unfold: bool = True) -> None:
         self.vocabulary = training.vocabulary
-        self.contexts: dict[tuple[int, int], Context] = {}
+        self.contexts: dict[tuple[int, int], ContextNode] = {}
         self._numbers = 0
         runs = training.runs
         for key in sorted(set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))):
@@ -157,9 +157,11 @@ class Laws:
         """Nodes of all trees."""
         return self._numbers
 
-    def _grow(self, runs: Runs, deepest: int, *, outcomes: bool) -> Context:
+    def _grow(self, runs: Runs, deepest: int, *, outcomes: bool) -> ContextNode:
         ended = with_weights(runs) if outcomes else runs
-        context = Context(_law(ended, trend=not outcomes and bool(deepest)), self._numbers)
+        context = ContextNode(
+            _distribution(ended, trend=not outcomes and bool(deepest)), self._numbers
+        )
         self._numbers += 1
         found = best_split(runs, outcomes=outcomes) if deepest and len(runs) >= 2 * LEAST else None
         if found is not None:
@@ -218,10 +220,10 @@ def with_weights(runs: Runs) -> Runs:
     )
 
 
-def _law(runs: Runs, *, trend: bool) -> Law:
+def _distribution(runs: Runs, *, trend: bool) -> EndDistribution:
     whole = runs.weight.sum()
     weight = runs.weight / whole if whole else runs.weight
-    return Law(
+    return EndDistribution(
         runs.outcome, runs.preempted, runs.took, weight, runs.trial, _trend(runs) if trend else None
     )
 
@@ -382,7 +384,7 @@ class Drawer:
 
     def __init__(
         self,
-        laws: Laws,
+        laws: RunDistributions,
         waits: Mapping[str, tuple[Values, Codes]],
         weights: Values,
         random: np.random.Generator,
@@ -403,7 +405,7 @@ class Drawer:
         return out
 
     def _descend(
-        self, node: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+        self, node: ContextNode, columns: Codes, replicate: Codes, seen: Seen, out: Ends
     ) -> None:
         if node.split is None:
             self._draw_leaf(node, columns, replicate, seen, out)
@@ -415,7 +417,7 @@ class Drawer:
                 self._descend(below, own, replicate, seen, out)
 
     def _draw_leaf(
-        self, leaf: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+        self, leaf: ContextNode, columns: Codes, replicate: Codes, seen: Seen, out: Ends
     ) -> None:
         """First the outcome, then the duration from the outcome's own tree."""
         law = leaf.law
@@ -433,7 +435,7 @@ class Drawer:
             if len(own):
                 self._descend(tree, own, replicate, seen, out)
 
-    def _draw_beyond(self, leaf: Context, columns: Codes, replicate: Codes, out: Ends) -> None:
+    def _draw_beyond(self, leaf: ContextNode, columns: Codes, replicate: Codes, out: Ends) -> None:
         """Longer than the longest run: at a constant rate, with outcomes in the shares of those
         that were seen."""
         law, seen = leaf.law, np.flatnonzero(~leaf.law.beyond)
@@ -480,7 +482,7 @@ class Drawer:
         return self._random.random(n)
 
 
-def _along(law: Law, index: Codes, took: Values) -> Values:
+def _along(law: EndDistribution, index: Codes, took: Values) -> Values:
     """What the trend of a law adds to drawn durations, for columns in which other runs took other
     times before."""
     if law.trend is None:

@@ -17,7 +17,7 @@ from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import End, Kind, Status, Task, Transition
 
@@ -203,7 +203,7 @@ class Training:
         )
 
 
-def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
+def by_regime(task: Task, rows: Iterable[TrialRow]) -> dict[str, Training]:
     """The training of each regime of a table."""
     trials: dict[str, list[Trial]] = {}
     for row in rows:

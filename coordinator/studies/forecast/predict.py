@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
-from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws, dependences
+from petrobot.coordinator.studies.forecast.distributions import (
+    Drawer,
+    RunDistributions,
+    dependences,
+)
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
@@ -57,7 +61,7 @@ def figures(played: Played) -> dict[str, float]:
 def predict(training: Training, request: Request) -> dict[str, Any]:
     """Forecast further trials of a regime. Raises ValueError for a choice that was never
     measured."""
-    structure, laws = Structure.of(training.task), Laws(training)
+    structure, laws = Structure.of(training.task), RunDistributions(training)
     _refuse_unmeasured(training, laws, request.choices)
     random = np.random.default_rng(request.seed)
     even = np.ones((1, len(training.trials)))
@@ -100,7 +104,7 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     }
 
 
-def _refuse_unmeasured(training: Training, laws: Laws, choices: Choices) -> None:
+def _refuse_unmeasured(training: Training, laws: RunDistributions, choices: Choices) -> None:
     names = training.vocabulary
     for q, place in enumerate(names.places):
         primitive = training.task.primitive_task_of(place).name
@@ -119,7 +123,7 @@ def _refuse_unmeasured(training: Training, laws: Laws, choices: Choices) -> None
 def _played(
     training: Training,
     structure: Structure,
-    laws: Laws,
+    laws: RunDistributions,
     request: Request,
     weights: Values,
     replicate: np.ndarray,
@@ -135,7 +139,9 @@ def _played(
         raise ValueError(text) from fault
 
 
-def _replayed(training: Training, structure: Structure, laws: Laws, request: Request) -> Played:
+def _replayed(
+    training: Training, structure: Structure, laws: RunDistributions, request: Request
+) -> Played:
     """Four times as many trials as were run, with the choices of the training."""
     n = len(training.trials)
     own = Request(request.runs, choices_of(training), request.seed)
@@ -154,7 +160,7 @@ def longest_of(training: Training) -> int:
 def _bootstrap(
     training: Training,
     structure: Structure,
-    laws: Laws,
+    laws: RunDistributions,
     request: Request,
     whole: Played,
     random: np.random.Generator,

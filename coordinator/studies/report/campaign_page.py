@@ -13,8 +13,8 @@ import numpy as np
 from petrobot.coordinator.learning.objective import Figures, break_even, pareto
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.campaign.observed import regime_of
-from petrobot.coordinator.studies.campaign.plan import Plan
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.trials import Trial
 from petrobot.coordinator.studies.report import charts
@@ -24,11 +24,12 @@ from petrobot.coordinator.studies.report.action_pictures import (
     action_pictures,
     add_latencies,
     latency_svg,
+    learned_curves,
+    objective_curves,
     put,
     trial_pictures,
 )
 from petrobot.coordinator.studies.report.comparing import Weighting, objectives
-from petrobot.coordinator.studies.report.learning_curves import learned_curves, objective_curves
 from petrobot.coordinator.studies.report.page import gallery, html_page, section, table, text
 from petrobot.coordinator.studies.report.plots import declared
 from petrobot.coordinator.studies.report.run_page import gantt_svg
@@ -42,7 +43,7 @@ file."""
 
 
 @dataclass(frozen=True)
-class Judged:
+class CombinationFigures:
     """One combination. J is the mean over the primitive tasks with alternatives; `task_objective`
     that of the whole task."""
 
@@ -66,7 +67,7 @@ class Judged:
         }
 
 
-def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]:
+def combination_of(task: Task, row: TrialRow, names: Sequence[str]) -> dict[str, str]:
     """The actions of a trial's first runs."""
     out: dict[str, str] = {}
     for run in row.trial.runs if row.trial is not None else ():
@@ -78,10 +79,10 @@ def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]
 
 def by_combination(
     task: Task,
-    rows: Iterable[Row],
+    rows: Iterable[TrialRow],
     planned: Sequence[dict[str, str]] | None = None,
     weighting: Weighting | None = None,
-) -> list[Judged]:
+) -> list[CombinationFigures]:
     """Every combination in these rows, the lowest J first.
 
     `planned`: the combination meant for each row; a trial that ended before all of its runs still
@@ -90,7 +91,7 @@ def by_combination(
     kept = [row for row in rows if row.trial is not None]
     names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
     weighting = weighting or Weighting.of(task, kept)
-    groups: dict[Combination, list[Row]] = {}
+    groups: dict[Combination, list[TrialRow]] = {}
     for i, row in enumerate(kept):
         chosen = planned[i] if planned is not None else combination_of(task, row, names)
         if all(name in chosen for name in names):
@@ -102,14 +103,14 @@ def by_combination(
 
 
 def _judged(
-    task: Task, combination: Combination, rows: Sequence[Row], weighting: Weighting
-) -> Judged:
+    task: Task, combination: Combination, rows: Sequence[TrialRow], weighting: Weighting
+) -> CombinationFigures:
     found = objectives(task, rows, weighting)
     times = [row.trial.time for row in rows if row.trial is not None and row.trial.time is not None]
     goal = float(np.mean([row.trial is not None and row.trial.goals > 0 for row in rows]))
     mean = float(np.mean(times)) if times else float("nan")
     known = [value for name, value in found.items() if name != "task" and not np.isnan(value)]
-    return Judged(
+    return CombinationFigures(
         combination,
         len(rows),
         goal,
@@ -133,7 +134,7 @@ class CampaignReport:
     heading."""
 
     def __init__(
-        self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]
+        self, plan: CampaignPlan, task: Task, rows: Sequence[TrialRow], plots: Mapping[str, Any]
     ) -> None:
         self.plan, self.task, self.rows = plan, task, rows
         self.summary = Summary.of(task, rows, options=plan.options)
@@ -264,7 +265,7 @@ class CampaignReport:
 
     def _causes(self) -> list[dict[str, Any]]:
         counts: dict[tuple[str, str, str, str, str], int] = {}
-        first: dict[tuple[str, str, str, str, str], Row] = {}
+        first: dict[tuple[str, str, str, str, str], TrialRow] = {}
         for row in self.rows:
             for run in row.trial.runs if row.trial is not None else ():
                 key = (row.regime, run.place, run.action, run.status or "none", run.cause)
@@ -324,7 +325,7 @@ def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, 
     }
 
 
-def timeline_of(rows: Sequence[Row]) -> Timeline:
+def timeline_of(rows: Sequence[TrialRow]) -> Timeline:
     """The runs of a mission run as bars."""
     made = Timeline()
     for row in rows:

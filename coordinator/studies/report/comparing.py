@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.task import Status, Task
 
 REPLICATES = 2000
@@ -28,13 +28,13 @@ Values = NDArray[np.float64]
 class Pairs:
     """Trials of two campaigns with equal regime, seed and number that were begun in both."""
 
-    one: tuple[Row, ...]
-    other: tuple[Row, ...]
+    one: tuple[TrialRow, ...]
+    other: tuple[TrialRow, ...]
     left_out: int
     """Trials without a partner, or not begun."""
 
 
-def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
+def paired(one: Iterable[TrialRow], other: Iterable[TrialRow]) -> Pairs:
     """Match two tables."""
     first = {(row.regime, row.seed, row.k): row for row in one}
     second = {(row.regime, row.seed, row.k): row for row in other}
@@ -49,8 +49,8 @@ def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
 
 def compare(
     task: Task,
-    one: Iterable[Row],
-    other: Iterable[Row],
+    one: Iterable[TrialRow],
+    other: Iterable[TrialRow],
     weighting: Weighting | None = None,
     seed: int = 1,
 ) -> dict[str, Any]:
@@ -96,11 +96,11 @@ def own_flags(pairs: Pairs) -> list[str]:
     ]
 
 
-def _flag(name: str) -> Callable[[Row], bool]:
+def _flag(name: str) -> Callable[[TrialRow], bool]:
     return lambda row: bool(row.score[name])
 
 
-def share_difference(pairs: Pairs, met: Callable[[Row], bool]) -> dict[str, Any]:
+def share_difference(pairs: Pairs, met: Callable[[TrialRow], bool]) -> dict[str, Any]:
     """Both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
     interval."""
     a = np.array([met(row) for row in pairs.one])
@@ -153,7 +153,7 @@ class Weighting:
     task: float
 
     @classmethod
-    def of(cls, task: Task, rows: Sequence[Row]) -> Weighting:
+    def of(cls, task: Task, rows: Sequence[TrialRow]) -> Weighting:
         """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of
         their trials."""
         names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
@@ -166,7 +166,7 @@ class Weighting:
         )
 
 
-def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[str, float]:
+def objectives(task: Task, rows: Sequence[TrialRow], weighting: Weighting) -> dict[str, float]:
     """J of each primitive task with alternatives and of the task ("task"), with the given rho; nan
     where nothing was run."""
     whole = np.ones((1, len(rows)))
@@ -221,7 +221,7 @@ Sums = tuple[Values, Values, Values, Values]
 """By trial: counted runs, successes, cost, runs with a cost."""
 
 
-def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
+def _sums(task: Task, name: str, rows: Sequence[TrialRow]) -> Sums:
     """Of a primitive task."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
@@ -232,7 +232,7 @@ def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
     return out[0], out[1], out[2], out[3]
 
 
-def _task_sums(rows: Sequence[Row]) -> Sums:
+def _task_sums(rows: Sequence[TrialRow]) -> Sums:
     """Of the whole task: a trial is a run, a met goal its success, its time the cost."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
@@ -242,7 +242,7 @@ def _task_sums(rows: Sequence[Row]) -> Sums:
     return out[0], out[1], out[2], out[3]
 
 
-def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
+def cost_weight(task: Task, name: str, rows: Iterable[TrialRow]) -> float:
     """rho = 1 / the largest mean cost of an action of the primitive task in these rows; 0 without
     costs."""
     costs: dict[str, list[float]] = {}

@@ -9,18 +9,19 @@ from typing import Any
 
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import End, Record
+from petrobot.coordinator.learning.records import Record, RunEnd
 from petrobot.coordinator.run.recording import Step
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.report.action_pictures import (
+    Curves,
     Pictures,
     action_pictures,
     add_latencies,
     latency_svg,
     put,
+    recorded_curves,
     trial_pictures,
 )
-from petrobot.coordinator.studies.report.learning_curves import Curves, recorded_curves
 from petrobot.coordinator.studies.report.page import (
     apart,
     gallery,
@@ -225,10 +226,10 @@ class ObservedRun:
         for record in records:
             selector = (
                 None
-                if not isinstance(record, End)
+                if not isinstance(record, RunEnd)
                 else self._selector.learning.selectors.get(record.primitive_task)
             )
-            if selector is None or not isinstance(record, End) or record.outcome.status is None:
+            if selector is None or not isinstance(record, RunEnd) or record.outcome.status is None:
                 continue
             curves = self._probability.setdefault((record.primitive_task, record.context), {})
             for action, p in selector.learned(record.context).items():
@@ -247,7 +248,7 @@ class ObservedRun:
         )
         latencies: dict[str, list[float]] = {}
         for record in self._selector.records:
-            if isinstance(record, End):
+            if isinstance(record, RunEnd):
                 add_latencies(latencies, record.action, record.outcome.values)
         if latencies:
             put(out, "latencies", "Times", latency_svg(latencies))

@@ -21,12 +21,12 @@ from petrobot.coordinator.cli.campaign import text_of
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.objective import Question, compare
-from petrobot.coordinator.studies.campaign.conduct import Campaign, Progress
+from petrobot.coordinator.studies.campaign.conduct import Campaign, CampaignProgress
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import (
     MANIFEST,
     CampaignError,
-    Plan,
+    CampaignPlan,
     digest,
     read_manifest,
     write_manifest,
@@ -44,7 +44,7 @@ def table(folder: Path) -> bytes:
     return (folder / TABLE).read_bytes()
 
 
-def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
+def test_blocks_cover_all_throws_whatever_their_size(toy_plan: CampaignPlan) -> None:
     """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
         blocks = replace(toy_plan, runs=runs, block=block).blocks
@@ -177,7 +177,7 @@ def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> N
 
 
 def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
-    conduct: Conduct, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    conduct: Conduct, toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever had been written when the process died: before the file is on the disk it has
     another name."""
@@ -221,11 +221,11 @@ def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
     assert len(seen) >= 5  # one of six may have been unseen
 
 
-def test_progress_counts_throws(tmp_path: Path, toy_plan: Plan) -> None:
+def test_progress_counts_throws(tmp_path: Path, toy_plan: CampaignPlan) -> None:
     """Up to the last one; a resumed campaign says how many it found."""
     from tests.studies.campaign.conftest import InlinePool
 
-    seen: list[Progress] = []
+    seen: list[CampaignProgress] = []
     campaign = Campaign(tmp_path / "a", toy_plan, seen.append)
     asyncio.run(campaign.run(InlinePool(toy_plan)))
     assert [p.done for p in seen] == [3, 6, 9, 12]
@@ -234,7 +234,7 @@ def test_progress_counts_throws(tmp_path: Path, toy_plan: Plan) -> None:
 
 @pytest.mark.processes
 def test_workers_in_any_number_and_a_killed_one_change_nothing(
-    conduct: Conduct, tmp_path: Path, toy_plan: Plan
+    conduct: Conduct, tmp_path: Path, toy_plan: CampaignPlan
 ) -> None:
     """kill -9 of a busy worker: its block is done again by another one."""
     alone = conduct("alone", selector="random")
@@ -258,7 +258,7 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
 
 
 def test_nothing_of_a_block_is_there_when_the_next_one_begins(
-    toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker's memory stays flat although a mission refers to itself in circles and the collector
     has its own time."""
@@ -510,7 +510,7 @@ def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> 
 
 @pytest.mark.processes
 async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
-    tmp_path: Path, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its child holds its output and its input open; it ends with it."""
     mark, program = tmp_path / "left", tmp_path / "worker"

@@ -16,8 +16,8 @@ from petrobot.coordinator.engine.instructions import Corrected
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import scores
-from petrobot.coordinator.studies.campaign.plan import Plan, identity
-from petrobot.coordinator.studies.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, identity
+from petrobot.coordinator.studies.campaign.rows import TrialRow, cells, columns, read_row
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load
@@ -150,7 +150,7 @@ def test_rows_come_back_as_they_were(
 ) -> None:
     """Through CSV, whatever texts hold; results that the first block did not have travel in
     `more`."""
-    row = Row(7, "easy", 1_000_000, throw.k if throw else 2, 1, 3.25, throw, score)
+    row = TrialRow(7, "easy", 1_000_000, throw.k if throw else 2, 1, 3.25, throw, score)
     names = columns(TOY, [row] if known else [])
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -172,7 +172,7 @@ def test_rows_come_back_as_they_were(
 
 def test_carriage_returns_do_not_break_the_table() -> None:
     """They become newlines, which CSV quotes."""
-    row = Row(1, "", 1, 1, 0, 1.0, Trial(1, 0.0, cause="one\rtwo\r\nthree"))
+    row = TrialRow(1, "", 1, 1, 0, 1.0, Trial(1, 0.0, cause="one\rtwo\r\nthree"))
     names = columns(TOY, [])
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([names, cells(TOY, row, names)])
@@ -207,7 +207,7 @@ def test_scores_go_to_the_throw_that_they_are_of() -> None:
     assert scores({"time_s": 4.0}, 2) == [{}, {}]
 
 
-def test_identity_is_of_what_runs_not_where_it_lies(toy_plan: Plan) -> None:
+def test_identity_is_of_what_runs_not_where_it_lies(toy_plan: CampaignPlan) -> None:
     """The same files elsewhere are the same campaign."""
     from dataclasses import replace
 

@@ -16,7 +16,7 @@ from scipy.stats import binom
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.agreement import agreement, quantile_interval
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.distributions import Laws, dependences
+from petrobot.coordinator.studies.forecast.distributions import RunDistributions, dependences
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, distance, figures, predict
 from petrobot.coordinator.studies.forecast.registered import read, register, write
@@ -159,7 +159,11 @@ def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
         for took, status in ((1.0, "success"), (2.0, ""), (3.0, "failure"))
     ]
     law = next(
-        iter(Laws(Training.of(pair, [Trial(1, 0.0, runs=[run]) for run in runs])).contexts.values())
+        iter(
+            RunDistributions(
+                Training.of(pair, [Trial(1, 0.0, runs=[run]) for run in runs])
+            ).contexts.values()
+        )
     ).law
     assert law.took.tolist() == [1.0, 3.0]
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
@@ -252,12 +256,12 @@ def test_the_stochastic_view_stands_beside(pair: Task, make_throws: Make) -> Non
     """It keeps shares and means exactly, but takes statuses for independent: its R_conj is the
     product, not the truth."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of
-    from petrobot.coordinator.studies.campaign.rows import Row
+    from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.forecast.registered import exact
 
     throws = make_throws(1500, np.random.default_rng(14))
     training = Training.of(pair, throws)
-    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
+    rows = [TrialRow(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
     found = exact(pair, estimates_of(pair, rows, "t"), "", choices_of(training))
     own = figures(measured(training))
     assert found["R_goal"] == pytest.approx(own["R_goal"], abs=1e-3)

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.studies.campaign.plan import Plan, digest, write_manifest
-from petrobot.coordinator.studies.campaign.rows import Row
-from petrobot.coordinator.studies.campaign.table import Table
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, write_manifest
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import CampaignTable
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import misfit
 from petrobot.coordinator.studies.forecast.history import Training
@@ -39,7 +39,7 @@ def write_campaign(tmp_path: Path) -> Write:
         path.write_text(text, encoding="utf-8")
         folder = tmp_path / name
         folder.mkdir()
-        plan = Plan(
+        plan = CampaignPlan(
             str(path),
             "nowhere.toml",
             len(throws),
@@ -49,8 +49,8 @@ def write_campaign(tmp_path: Path) -> Write:
             **more,
         )
         write_manifest(folder, plan)
-        Table(folder, task).append(
-            [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws, 1)]
+        CampaignTable(folder, task).append(
+            [TrialRow(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws, 1)]
         )
         return folder
 
@@ -208,7 +208,7 @@ def test_estimates_of_another_task_are_refused(
 
     random = np.random.default_rng(1)
     task = loads(ONE_WAY, "scan.toml")
-    rows = [Row(i, "", i, 1, i, 1.0, dependent(random)) for i in range(20)]
+    rows = [TrialRow(i, "", i, 1, i, 1.0, dependent(random)) for i in range(20)]
     path = write_estimates(tmp_path, estimates_of(task, rows, "t"), {}, "t")
     own = tmp_path / "pair.toml"
     own.write_text(TASK, encoding="utf-8")

@@ -16,10 +16,10 @@ import pytest
 from petrobot.coordinator.analysis.time.stochastic import is_cause, stochastic_view
 from petrobot.coordinator.learning.propagation import incidences, propagate, unended
 from petrobot.coordinator.studies.campaign.observed import estimates_of
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.distributions import Laws, with_weights
+from petrobot.coordinator.studies.forecast.distributions import RunDistributions, with_weights
 from petrobot.coordinator.studies.forecast.history import NONE, Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
@@ -218,7 +218,9 @@ def test_the_stochastic_view_preempts_when_the_other_has_ended(
     """It always completes, and what is preempted has not ended as it was drawn to; phase-type
     durations cost it some points."""
     task = loads(text, "scan.toml")
-    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws_of(make, 1500, 2))]
+    rows = [
+        TrialRow(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws_of(make, 1500, 2))
+    ]
     task = replace(task, runs_place="parts")
     found = propagate(task, estimates_of(task, rows, "t"))
     assert found.complete == pytest.approx(1.0, abs=1e-9)
@@ -236,7 +238,7 @@ def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
     assert made["figures"]["R_goal"]["value"] == pytest.approx(
         np.mean([t.goals for t in throws]), abs=0.02
     )
-    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
+    rows = [TrialRow(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
     assert propagate(task, estimates_of(task, rows, "t")).complete == pytest.approx(1.0, abs=1e-9)
 
 
@@ -452,7 +454,7 @@ def test_beyond_the_longest_run_by_hand() -> None:
         )
         for status, took, taken in runs
     ]
-    (context,) = Laws(Training.of(task, throws)).contexts.values()
+    (context,) = RunDistributions(Training.of(task, throws)).contexts.values()
     assert context.law.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
     assert context.law.beyond.tolist() == [False, True, True]
     assert context.law.rate == pytest.approx(-math.log(2 / 3) / 3.0)

@@ -11,11 +11,11 @@ import pytest
 from scipy.stats import binomtest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
+from petrobot.coordinator.studies.report.action_pictures import objective_curves
 from petrobot.coordinator.studies.report.campaign_page import CampaignReport, story, timeline_of
 from petrobot.coordinator.studies.report.comparing import Weighting, compare, cost_weight, paired
-from petrobot.coordinator.studies.report.learning_curves import objective_curves
 from petrobot.coordinator.studies.report.plots import declared, finished
 from petrobot.coordinator.studies.report.run_page import own_pictures
 from petrobot.coordinator.task.file import load
@@ -24,13 +24,15 @@ from tests.studies.campaign.conftest import HERE, SERVICES, TASK
 TOY = load(TASK)
 
 
-def row(k: int, action: str, status: str, seconds: float, goal: bool, regime: str = "easy") -> Row:
+def row(
+    k: int, action: str, status: str, seconds: float, goal: bool, regime: str = "easy"
+) -> TrialRow:
     """A throw with one run of look."""
     run = RunEntry(
         "look", action, 0.0, seconds, status, seconds=seconds, cost=seconds, taken="seen"
     )
     throw = Trial(1, 0.0, seconds, True, int(goal), status, "", [run])
-    return Row(
+    return TrialRow(
         k,
         regime,
         1,
@@ -191,7 +193,7 @@ def test_a_throws_story_says_what_took_what() -> None:
         == "1.00 s look_quick success, seen; 1.50 s grip_soft ERROR (jammed: stuck fast), stuck"
     )
     bars = timeline_of(
-        [Row(1, "", 1, 1, 0, 1.5, Trial(1, 2.0, 1.5, True, 0, "error", "", runs))]
+        [TrialRow(1, "", 1, 1, 0, 1.5, Trial(1, 2.0, 1.5, True, 0, "error", "", runs))]
     ).bars
     assert [(bar.begun, bar.ended) for bar in bars.values()] == [(2.0, 3.0), (3.0, 3.5)]
 
@@ -272,12 +274,12 @@ def test_learned_probabilities_are_derived_from_the_table(
     import asyncio
 
     from petrobot.coordinator.studies.campaign.conduct import Campaign
-    from petrobot.coordinator.studies.campaign.plan import Plan, digest
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
     from tests.studies.campaign.conftest import InlinePool
 
     monkeypatch.syspath_prepend(str(HERE))
     digests = {"task": digest(TASK), "services": digest(SERVICES)}
-    plan = Plan(
+    plan = CampaignPlan(
         str(TASK),
         str(SERVICES),
         40,
