@@ -96,8 +96,7 @@ def whole(n: Any, what: str, most: float = inf) -> int:
     from 0 to `most`."""
     if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n <= most:
         raise ValueError(
-            f"{what}: expected a whole number from 0"
-            f"{'' if most == inf else f' to {most:g}'}, got {n!r}"
+            f"{n!r} {what}: expected a whole number from 0{'' if most == inf else f' to {most:g}'}"
         )
     return n
 

@@ -14,7 +14,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from petrobot.coordinator.learning.estimate import SIZE, Observation, Sample, Tally, merge_tallies, quantile
+from petrobot.coordinator.learning.estimate import (
+    SIZE,
+    Observation,
+    Sample,
+    Tally,
+    merge_tallies,
+    quantile,
+)
 from petrobot.coordinator.learning.selectors import cost_of
 from petrobot.coordinator.learning.statistics import Moments, clopper_pearson, wilson
 from petrobot.coordinator.task import Executed, Status
@@ -173,7 +180,7 @@ def test_cost_by_measure(measure: str, mean: float) -> None:
         Observation(None, 50.0, preempted_by="gone"),
     ]
     assert tally_of(seen).cost(measure).mean == pytest.approx(mean)
-    with pytest.raises(ValueError, match="no cost measure"):
+    with pytest.raises(ValueError, match="not a cost measure"):
         tally_of(seen).cost("pictures")
 
 
@@ -263,7 +270,7 @@ def plain_of(*seen: Observation) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"counts": [["success", "", -5]]}, "-5 runs: a whole number"),
+        ({"counts": [["success", "", -5]]}, "-5 runs: expected a whole number"),
         ({"counts": [["success", "", 1.5]]}, "1.5 runs"),
         ({"counts": [["success", "", True]]}, "True runs"),
         ({"counts": [["success", "", 3]]}, "3 runs ended with success, but 2 such"),
@@ -272,18 +279,21 @@ def plain_of(*seen: Observation) -> dict[str, Any]:
         ({"durations": {"success": [2, 1.0, -1.0, 1.0, 1.0]}}, "low <= mean <= high"),
         ({"durations": {"success": [2, float("nan"), 0.0, 1.0, 1.0]}}, "low <= mean <= high"),
         ({"durations": {"success": [2, 9.0, 0.0, 1.0, 1.0]}}, "low <= mean <= high"),
-        ({"durations": {"success": [2, -1.0, 0.0, -1.0, -1.0]}}, "seconds below 0"),
+        ({"durations": {"success": [2, -1.0, 0.0, -1.0, -1.0]}}, "expected seconds from 0"),
         (
             {"durations": {"success": [2, 1.0, 0.0, 1.0, 1.0], "lost": [1, 1.0, 0.0, 1.0, 1.0]}},
-            "none of success",
+            "neither one of success",
         ),
-        ({"cpu": [3, 1.0, 0.0, 1.0, 1.0]}, "3 numbers called cpu: a whole number from 0 to 2"),
+        (
+            {"cpu": [3, 1.0, 0.0, 1.0, 1.0]},
+            "3 numbers called cpu: expected a whole number from 0 to 2",
+        ),
         ({"values": {"images": [3, 1.0, 0.0, 1.0, 1.0]}}, "called images"),
         ({"waited": [3, 1.0, 0.0, 1.0, 1.0]}, "3 waits"),
         ({"not_executed": {"dead": -1}}, "-1 runs that never began"),
         ({"unknown": 3}, "from 0 to 2"),
         ({"corrected": -1}, "-1 corrections"),
-        ({"changes": 1}, "1 changes made it, but 2 runs"),
+        ({"changes": 1}, "1 changes cannot have counted 2 runs"),
         ({"sample": [[i, 1.0, -1.0, "success"] for i in range(3)]}, "3 runs in the sample"),
     ],
 )

@@ -1,5 +1,5 @@
-"""One row of a campaign's table: what the columns are, and a trial as a row and back. Columns come
-from task and score."""
+"""Rows of a campaign's table: their columns, and a trial as a row and back. The columns depend on
+the task and its score."""
 
 from __future__ import annotations
 
@@ -28,20 +28,19 @@ GENERAL = (
     "at",
     "mission_s",
 )
-"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the trial took; `at`: s
-since the mission began."""
+"""`n`: number in the campaign; `k`: number in the mission run with `seed`; `time`: duration of the
+trial (s); `at`: its begin (s since the mission began)."""
 BY_PLACE = ("status", "cause", "seconds", "cost")
-"""Of the trial's first run in a place; all runs stand in the column `runs`."""
+"""Columns of the trial's first run in each place; the column `runs` holds all runs."""
 LAST = ("more", "runs", "waits", "fired")
-"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run;
-Trial.waits, Trial.fired."""
-
-Cell = str | int | float | None
+"""JSON columns: results of the task's own that the first block did not have; RunEntry.to_plain of
+each run; Trial.waits; Trial.fired."""
 
 
 @dataclass
 class TrialRow:
-    """A trial of a campaign. `trial` is None when the mission run was given up before it."""
+    """A trial of a campaign. `trial` is None if the mission run was given up before the trial
+    began."""
 
     n: int
     regime: str
@@ -55,7 +54,7 @@ class TrialRow:
 
 
 def rows_of(block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
-    """The rows of a block's result."""
+    """Return the rows of a block's result."""
     trials = {t["k"]: Trial.from_plain(t) for t in result["trials"]}
     return [
         TrialRow(
@@ -73,8 +72,8 @@ def rows_of(block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
 
 
 def columns(task: Task, rows: Sequence[TrialRow]) -> list[str]:
-    """The table's columns: the general ones, those of the task file, and those of the task's score
-    in these first rows."""
+    """Return the columns of a table: general ones, those of the task file, and those of the task's
+    score in these first rows."""
     chosen = [f"chosen.{name}" for name in task.primitive_tasks]
     places = [
         f"{p.name}.{part}"
@@ -87,7 +86,7 @@ def columns(task: Task, rows: Sequence[TrialRow]) -> list[str]:
 
 
 def cells(task: Task, row: TrialRow, names: Sequence[str]) -> list[str]:
-    """A row as texts, in the order of the columns."""
+    """Return a row as texts, in the order of the columns."""
     found = {**_general(row), **_runs(task, row.trial), **row.score}
     more = {k: v for k, v in row.score.items() if k not in names}
     found["more"] = _json(more) if more else ""
@@ -133,14 +132,13 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return repr(round(value, 9))
     if isinstance(value, str):
-        return value.replace("\r\n", "\n").replace(
-            "\r", "\n"
-        )  # a bare carriage return would end a line of the CSV file
+        # a bare carriage return would end a line of the CSV file
+        return value.replace("\r\n", "\n").replace("\r", "\n")
     return str(value) if isinstance(value, int) else _json(value)
 
 
 def read_row(record: Mapping[str, str]) -> TrialRow:
-    """A row back from its texts. Raises KeyError or ValueError for a record that is none."""
+    """Read a row from its texts. Raises KeyError or ValueError if the record is not a row."""
     trial = None
     if record["begun"] == "true":
         trial = Trial(
@@ -170,7 +168,7 @@ def read_row(record: Mapping[str, str]) -> TrialRow:
 
 
 def _is_own(key: str) -> bool:
-    """Whether a column may be the score's: those of places are read from `runs`."""
+    """Return whether a column may belong to the score; columns of places are read from `runs`."""
     return "." in key and not key.startswith("chosen.") and key.rpartition(".")[2] not in BY_PLACE
 
 
@@ -179,7 +177,7 @@ def _number(text: str) -> float | None:
 
 
 def value_of(text: str) -> Any:
-    """A cell's text as the value that it was written from, as far as a text tells."""
+    """Return the value of a cell's text, as far as a text shows it."""
     if text in ("true", "false"):
         return text == "true"
     try:

@@ -1,4 +1,5 @@
-"""Curves of learning over the trials, and pictures of the actions that were learned."""
+"""Curves of choices, reliability and J over the trials, and pictures of them, for reports of
+campaigns and of single runs."""
 
 from __future__ import annotations
 
@@ -23,29 +24,29 @@ from petrobot.coordinator.task import Status, Task
 Curve = list[tuple[float, float]]
 Curves = dict[str, Curve]
 POINTS = 300
-"""Points of a curve at most."""
+"""Largest number of points of a curve."""
 WINDOW = 50
 """Trials over which shares of choices are averaged."""
 
 
 @dataclass
 class LearningCurves:
-    """Curves of one primitive task in one regime, by action; x is the trial (runs of the primitive
+    """Curves of one primitive task in one regime, by action; x is the trial (a run of the primitive
     task in that regime)."""
 
     primitive_task: str
     regime: str
     context: str = ""
-    """Of a single run: the context that `regime` was told from."""
+    """For a single run: the context from which `regime` was derived."""
     probability: Curves = field(default_factory=dict)
-    """Learned p; of campaigns that do not learn, the share of choices over the last `WINDOW`
+    """Learned p; for campaigns that do not learn, the share of choices over the last `WINDOW`
     trials."""
     objective: Curves = field(default_factory=dict)
-    """J from the sums so far with the rho so far."""
+    """J computed from the sums so far, with the rho so far."""
 
 
 def objective_curves(task: Task, rows: Sequence[TrialRow]) -> list[LearningCurves]:
-    """J and shares of choices of every primitive task with alternatives, by regime."""
+    """Return J and shares of choices of every primitive task with alternatives, by regime."""
     out = []
     for primitive in task.primitive_tasks.values():
         if len(primitive.alternatives) < 2:
@@ -60,7 +61,7 @@ def objective_curves(task: Task, rows: Sequence[TrialRow]) -> list[LearningCurve
 
 
 def recorded_curves(task: Task, records: Iterable[Record]) -> list[LearningCurves]:
-    """The same of a single mission run, from what was observed of it."""
+    """Return the same curves for a single mission run, from its records of learning."""
     runs: dict[tuple[str, str], list[tuple[str, bool, float | None]]] = {}
     for record in records:
         if isinstance(record, RunEnd) and record.outcome.status is not None:
@@ -117,8 +118,8 @@ def _fill(
 def learned_curves(
     plan: CampaignPlan, rows: Sequence[TrialRow], trials: Sequence[LearningCurves]
 ) -> None:
-    """Replace shares of choices by the probabilities that the selectors had, batch after batch;
-    nothing to do without a learner."""
+    """Replace shares of choices by the probabilities that the selectors had after each batch; does
+    nothing for a campaign without learner."""
     bench = LoadedPlan.of(plan)
     policy = policy_of(plan, bench.task, bench.directory)
     if not isinstance(policy, LearnedActions):
@@ -150,17 +151,17 @@ def learned_curves(
 
 
 Pictures = dict[str, tuple[str, str]]
-"""Heading and SVG by file name."""
+"""Heading and SVG text by file name."""
 TRIALS, ACTIONS = "Choices and J over trials", "Reliability and cost of each action"
 
 
 def put(pictures: Pictures, name: str, heading: str, svg: str) -> None:
-    """Add a picture under a name that is fit for a file."""
+    """Add a picture under a name that is valid for a file."""
     pictures["".join(c if c.isalnum() else "_" for c in name)] = (heading, svg)
 
 
 def trial_pictures(trials: Iterable[LearningCurves], word: str) -> Pictures:
-    """`word`: what the curves of choices show."""
+    """Return the pictures of these curves. `word`: what the curves of choices show."""
     out: Pictures = {}
     for one in trials:
         where = f"{one.primitive_task}{', ' + one.regime if one.regime else ''}"
@@ -174,7 +175,7 @@ def trial_pictures(trials: Iterable[LearningCurves], word: str) -> Pictures:
 
 
 def action_pictures(task: Task, estimates: Estimates) -> Pictures:
-    """R and C of every action that ran, by primitive task."""
+    """Return pictures of R and C of every action that ran, by primitive task."""
     out: Pictures = {}
     for primitive in task.primitive_tasks.values():
         known = [
@@ -208,8 +209,8 @@ def action_pictures(task: Task, estimates: Estimates) -> Pictures:
 
 
 LATENCY = "latency"
-"""Numbers of results whose names begin so are drawn: seconds from an image to the set point that it
-led to, and the like."""
+"""Numbers of results whose names begin so are drawn as latencies: seconds from an image to the set
+point that it led to, for example."""
 
 
 def add_latencies(found: dict[str, list[float]], action: str, values: Mapping[str, Any]) -> None:
@@ -220,7 +221,7 @@ def add_latencies(found: dict[str, list[float]], action: str, values: Mapping[st
 
 
 def latency_svg(found: Mapping[str, list[float]]) -> str:
-    """How often which latency was reported."""
+    """Return a histogram of the reported latencies."""
     return charts.histogram("Latencies that runs reported", "s", found)
 
 
@@ -245,7 +246,8 @@ def _unit(measure: str) -> str:
 
 
 def _settled(trials: LearningCurves) -> Curves:
-    """J curves without the first few trials, where a single failure hides everything else."""
+    """Return the curves of J without the first 2 % of the trials, where a single failure would
+    dominate the axis."""
     last = max((points[-1][0] for points in trials.objective.values()), default=0.0)
     return {
         a: [p for p in points if p[0] > 0.02 * last] or points

@@ -1,5 +1,5 @@
-"""A campaign as one HTML page: shares, choices and J over trials, R and C of actions, the task's
-own pictures, faults."""
+"""A campaign as one HTML page: shares, choices and J over the trials, R and C of actions, the
+task's own pictures, faults."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from petrobot.coordinator.studies.report.plots import declared
 from petrobot.coordinator.studies.report.run_page import gantt_svg
 from petrobot.coordinator.task import Status, Task
 
-# Fixed combinations of actions side by side: what each came to over the trials in which it was chosen, with one rho for all.
+# --- combinations of actions ---
 
 Combination = tuple[tuple[str, str], ...]
 """(primitive task, action) of each primitive task with alternatives, in the order of the task
@@ -44,8 +44,8 @@ file."""
 
 @dataclass(frozen=True)
 class CombinationFigures:
-    """One combination. J is the mean over the primitive tasks with alternatives; `task_objective`
-    that of the whole task."""
+    """Figures of one combination of actions. `objective` is the mean J over the primitive tasks
+    with alternatives, `task_objective` is J of the whole task."""
 
     combination: Combination
     trials: int
@@ -53,10 +53,10 @@ class CombinationFigures:
     objective: float
     task_objective: float
     time: float
-    """Mean of the completed trials (s)."""
+    """Mean duration of the completed trials (s)."""
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return {
             **dict(self.combination),
             "runs": self.trials,
@@ -68,7 +68,7 @@ class CombinationFigures:
 
 
 def combination_of(task: Task, row: TrialRow, names: Sequence[str]) -> dict[str, str]:
-    """The actions of a trial's first runs."""
+    """Return the actions of a trial's first runs."""
     out: dict[str, str] = {}
     for run in row.trial.runs if row.trial is not None else ():
         name = task.primitive_task_of(run.place).name
@@ -83,10 +83,11 @@ def by_combination(
     planned: Sequence[dict[str, str]] | None = None,
     weighting: Weighting | None = None,
 ) -> list[CombinationFigures]:
-    """Every combination in these rows, the lowest J first.
+    """Compare the combinations of actions in these rows, all with one rho; the lowest J first.
 
     `planned`: the combination meant for each row; a trial that ended before all of its runs still
-    counts for it. Without it, only trials in which every primitive task ran can be told apart.
+    counts for it. Without it, only trials in which every primitive task ran can be assigned to a
+    combination.
     """
     kept = [row for row in rows if row.trial is not None]
     names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
@@ -122,11 +123,11 @@ def _judged(
 
 DIFFERENCES = "Differences, paired"
 AHEAD = (DIFFERENCES, TRIALS, ACTIONS)
-"""Headings of pictures that stand before the tables of actions."""
+"""Headings of pictures that come before the tables of actions."""
 MOST = 12
-"""Combinations that are listed."""
+"""Largest number of listed combinations."""
 WORST = 40
-"""Trials that went wrong which are listed."""
+"""Largest number of listed trials that went wrong."""
 
 
 class CampaignReport:
@@ -201,7 +202,7 @@ class CampaignReport:
     # --- page ---------------------------------------------------------------------------------
 
     def html(self, more: Sequence[str] = ()) -> str:
-        """The page; `more` are further sections, put behind the numbers."""
+        """Return the page; `more` are further sections, after the figures."""
         plan = self.plan
         lead = f"{len(self.rows)} of {plan.runs} runs, selector {plan.selector}, seed {plan.seed}"
         headings = list(dict.fromkeys(heading for heading, _ in self.pictures.values()))
@@ -254,8 +255,8 @@ class CampaignReport:
         return out
 
     def _combinations(self) -> dict[str, list[dict[str, Any]]]:
-        """The best combinations of actions by regime, of trials in which each primitive task ran;
-        none of a single one."""
+        """Return the best combinations of actions by regime, from trials in which each primitive
+        task ran; none if there is only one."""
         found = {}
         for regime in self.summary.by_regime:
             judged = by_combination(self.task, [row for row in self.rows if row.regime == regime])
@@ -326,7 +327,7 @@ def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, 
 
 
 def timeline_of(rows: Sequence[TrialRow]) -> Timeline:
-    """The runs of a mission run as bars."""
+    """Return the runs of a mission run as bars of a timeline."""
     made = Timeline()
     for row in rows:
         for i, run in enumerate(row.trial.runs if row.trial is not None else ()):
@@ -341,7 +342,8 @@ def timeline_of(rows: Sequence[TrialRow]) -> Timeline:
 
 
 def story(trial: Trial) -> str:
-    """A trial in one line: what ended when and how, and which transition took it."""
+    """Describe a trial in one line: what ended when and how, and which transition took its
+    token."""
     ends = sorted(trial.runs, key=lambda run: run.begun + run.took)
     parts = []
     for run in ends:
@@ -362,7 +364,7 @@ def story(trial: Trial) -> str:
 
 
 def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
-    """Two campaigns side by side."""
+    """Return a section that compares two campaigns."""
     shares = [
         {
             "share": name,
@@ -408,7 +410,7 @@ def _interval(ends: Sequence[float]) -> str:
 def comparison_pictures(
     found: Mapping[str, Any], one: str, other: str
 ) -> dict[str, tuple[str, str]]:
-    """Differences with their intervals."""
+    """Return a picture of the differences with their intervals."""
     rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
     rows += [(_objective_name(name), "", *_ends(row)) for name, row in found["J"].items()]
     svg = charts.intervals(f"{one} minus {other}, 95 % intervals, paired", "difference", rows)

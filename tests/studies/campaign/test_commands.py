@@ -332,7 +332,7 @@ def _until(condition: Callable[[], bool]) -> None:
         (["campaign", str(TASK)], "may not run with"),
         (["campaign", "--resume", "nowhere"], "holds no campaign"),
         (["campaign"], "give a TASK"),
-        (["campaign", *TOY, "--learned", "nowhere"], "no finished campaign"),
+        (["campaign", *TOY, "--learned", "nowhere"], "not the result of a finished campaign"),
         (["campaign", *TOY, "--check", "nowhere.json"], "nowhere.json is no forecast"),
         (["forecast", str(TASK)], "--estimates CAMPAIGN"),
         (["forecast", str(TASK), "--estimates", "nowhere.db"], "holds no estimates"),

@@ -164,7 +164,7 @@ def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
                 Training.of(pair, [Trial(1, 0.0, runs=[run]) for run in runs])
             ).contexts.values()
         )
-    ).law
+    ).ends
     assert law.took.tolist() == [1.0, 3.0]
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
 
@@ -237,12 +237,12 @@ def test_a_registered_forecast_stays_as_it_is(
     path = tmp_path / "f.json"
     write(path, made)
     assert read(path) == made
-    with pytest.raises(ForecastError, match="stays as it is"):
+    with pytest.raises(ForecastError, match="never overwritten"):
         write(path, made)
     path.write_text(path.read_text().replace('"runs": 100', '"runs": 101'), encoding="utf-8")
     with pytest.raises(ForecastError, match="was changed"):
         read(path)
-    with pytest.raises(ForecastError, match="no throw of regime B"):
+    with pytest.raises(ForecastError, match="no trial of regime B"):
         register(pair, training, {"B": request[""]}, {})
 
 

@@ -455,9 +455,9 @@ def test_beyond_the_longest_run_by_hand() -> None:
         for status, took, taken in runs
     ]
     (context,) = RunDistributions(Training.of(task, throws)).contexts.values()
-    assert context.law.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
-    assert context.law.beyond.tolist() == [False, True, True]
-    assert context.law.rate == pytest.approx(-math.log(2 / 3) / 3.0)
+    assert context.ends.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
+    assert context.ends.beyond.tolist() == [False, True, True]
+    assert context.ends.rate == pytest.approx(-math.log(2 / 3) / 3.0)
 
 
 def test_the_view_without_measurements_still_races(tmp_path: object) -> None:
