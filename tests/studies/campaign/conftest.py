@@ -44,7 +44,7 @@ def _toy_actions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def toy_plan() -> CampaignPlan:
-    """Twelve throws in two regimes, blocks of three."""
+    """Twelve trials in two regimes, blocks of three."""
     return CampaignPlan(
         str(TASK),
         str(SERVICES),

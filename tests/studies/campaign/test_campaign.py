@@ -44,7 +44,7 @@ def table(folder: Path) -> bytes:
     return (folder / TABLE).read_bytes()
 
 
-def test_blocks_cover_all_throws_whatever_their_size(toy_plan: CampaignPlan) -> None:
+def test_blocks_cover_all_trials_whatever_their_size(toy_plan: CampaignPlan) -> None:
     """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
         blocks = replace(toy_plan, runs=runs, block=block).blocks
@@ -61,7 +61,7 @@ def test_blocks_cover_all_throws_whatever_their_size(toy_plan: CampaignPlan) -> 
 
 
 def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
-    """One row a throw, with what the toy's own score says and what each run did."""
+    """One row a trial, with what the toy's own score says and what each run did."""
     campaign = conduct("a")
     rows = list(campaign.table.rows())
     assert [row.n for row in rows] == list(range(1, 13))
@@ -155,7 +155,7 @@ def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int
     path = plan_cut_off(whole.folder.parent / "a", size)
     with pytest.raises(
         CampaignError,
-        match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again",
+        match=r"campaign.json: .*empty, incomplete.*remove campaign.json and give the command again",
     ):
         conduct("a")
     path.unlink()
@@ -172,7 +172,7 @@ def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> N
     """Though it is JSON."""
     folder = conduct("a").folder
     (folder / MANIFEST).write_text(text, encoding="utf-8")
-    with pytest.raises(CampaignError, match="no plan"):
+    with pytest.raises(CampaignError, match="not a plan"):
         read_manifest(folder)
 
 
@@ -221,7 +221,7 @@ def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
     assert len(seen) >= 5  # one of six may have been unseen
 
 
-def test_progress_counts_throws(tmp_path: Path, toy_plan: CampaignPlan) -> None:
+def test_progress_counts_trials(tmp_path: Path, toy_plan: CampaignPlan) -> None:
     """Up to the last one; a resumed campaign says how many it found."""
     from tests.studies.campaign.conftest import InlinePool
 

@@ -316,8 +316,8 @@ def _until(condition: Callable[[], bool]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["campaign", *TOY, "--selector", "oracle"], "choose among fixed, round_robin"),
-        (["campaign", *TOY, "--choose", "look=stare"], "choose among look_quick"),
+        (["campaign", *TOY, "--selector", "oracle"], "choose one of fixed, round_robin"),
+        (["campaign", *TOY, "--choose", "look=stare"], "choose one of look_quick"),
         (["campaign", *TOY, "--choose", "look"], "write NAME=VALUE"),
         (["campaign", *TOY, "--regime", "easy,easy"], "each regime once"),
         (["campaign", *TOY, "--seed", "-1"], "-1 is not a whole number of at least 0"),
@@ -333,10 +333,10 @@ def _until(condition: Callable[[], bool]) -> None:
         (["campaign", "--resume", "nowhere"], "holds no campaign"),
         (["campaign"], "give a TASK"),
         (["campaign", *TOY, "--learned", "nowhere"], "not the result of a finished campaign"),
-        (["campaign", *TOY, "--check", "nowhere.json"], "nowhere.json is no forecast"),
+        (["campaign", *TOY, "--check", "nowhere.json"], "nowhere.json is not a forecast"),
         (["forecast", str(TASK)], "--estimates CAMPAIGN"),
         (["forecast", str(TASK), "--estimates", "nowhere.db"], "holds no estimates"),
-        (["forecast", "--compare", "nowhere.json", "nowhere"], "is no forecast"),
+        (["forecast", "--compare", "nowhere.json", "nowhere"], "is not a forecast"),
     ],
 )
 def test_bad_input(

@@ -27,11 +27,11 @@ TOY = load(TASK)
 def row(
     k: int, action: str, status: str, seconds: float, goal: bool, regime: str = "easy"
 ) -> TrialRow:
-    """A throw with one run of look."""
+    """A trial with one run of look."""
     run = RunEntry(
         "look", action, 0.0, seconds, status, seconds=seconds, cost=seconds, taken="seen"
     )
-    throw = Trial(1, 0.0, seconds, True, int(goal), status, "", [run])
+    trial = Trial(1, 0.0, seconds, True, int(goal), status, "", [run])
     return TrialRow(
         k,
         regime,
@@ -39,7 +39,7 @@ def row(
         k,
         0,
         1.0,
-        throw,
+        trial,
         {"parts.n": k, "parts.gripped": goal, "parts.x": 0.1 * k, "parts.y": seconds},
     )
 
@@ -87,7 +87,7 @@ def test_comparison_by_hand() -> None:
 
 
 def test_pairs_have_equal_seeds() -> None:
-    """Throws that only one of them has are left out and counted."""
+    """Trials that only one of them has are left out and counted."""
     one = [row(k, "look_quick", "success", 1.0, True) for k in range(4)]
     other = [row(k, "look_quick", "success", 1.0, True) for k in range(2, 8)]
     other[0].trial = None
@@ -181,7 +181,7 @@ def test_a_runs_own_pictures() -> None:
     assert list(own_pictures(result)) == ["Parts"]
 
 
-def test_a_throws_story_says_what_took_what() -> None:
+def test_a_trials_story_says_what_took_what() -> None:
     """In the order of ends, with reasons."""
     runs = [
         RunEntry("look", "look_quick", 0.0, 1.0, "success", taken="seen"),
@@ -299,7 +299,7 @@ def test_learned_probabilities_are_derived_from_the_table(
 
 
 def test_combinations_by_hand() -> None:
-    """Two combinations judged with one rho; the lower J first; a throw that ended early counts for
+    """Two combinations judged with one rho; the lower J first; a trial that ended early counts for
     what was planned."""
     from petrobot.coordinator.studies.report.campaign_page import by_combination
 
