@@ -26,7 +26,7 @@ from petrobot.services.host.command_line import number, probability, whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.studies.campaign.conduct import Campaign
-    from petrobot.coordinator.studies.campaign.plan import Plan
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.task import Task
 
 EXAMPLE = (
@@ -141,9 +141,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run or resume the campaign; print and write its result."""
-    from petrobot.coordinator.studies.campaign.conduct import Campaign
+    from petrobot.coordinator.studies.campaign.conduct import Campaign, ProgressLine
     from petrobot.coordinator.studies.campaign.plan import CampaignError, identity, read_manifest
-    from petrobot.coordinator.studies.campaign.progress import ProgressLine
     from petrobot.coordinator.studies.campaign.table import held, write_parquet
 
     shown = ProgressLine(sys.stderr)
@@ -204,7 +203,7 @@ def _written(folder: Path) -> Iterator[None]:
         raise CommandError(2, text) from fault
 
 
-def _refuse_misfit(forecast: Path, plan: Plan) -> None:
+def _refuse_misfit(forecast: Path, plan: CampaignPlan) -> None:
     from petrobot.coordinator.cli.forecast import fitting
     from petrobot.coordinator.studies.forecast.history import ForecastError
     from petrobot.coordinator.studies.forecast.registered import read
@@ -248,8 +247,7 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
 
 
 async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.studies.campaign.cluster import ClusterPool
-    from petrobot.coordinator.studies.campaign.pool import LocalPool
+    from petrobot.coordinator.studies.campaign.pool import ClusterPool, LocalPool
 
     if options.cluster:
         async with ClusterPool(campaign.plan, options.cluster) as cluster:
@@ -261,9 +259,9 @@ async def _conduct(campaign: Campaign, options: argparse.Namespace) -> None:
             await campaign.run(pool)
 
 
-def _plan(options: argparse.Namespace, task: Task) -> Plan:
+def _plan(options: argparse.Namespace, task: Task) -> CampaignPlan:
     from petrobot.coordinator.cli.options import parameter_of
-    from petrobot.coordinator.studies.campaign.plan import Plan, digest
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
     from petrobot.coordinator.studies.campaign.policies import learns
 
     given = dict(_pair("--set", text) for text in options.set)
@@ -277,7 +275,7 @@ def _plan(options: argparse.Namespace, task: Task) -> Plan:
     chosen = dict(_pair("--choose", text) for text in options.choose.split(",") if text)
     paths = {"task": str(task_path(options.task)), "services": str(options.services)}
     paths |= {"mock": str(options.mock)} if options.mock else {}
-    return Plan(
+    return CampaignPlan(
         **{key: str(Path(path).resolve()) for key, path in paths.items()},
         runs=options.runs,
         regimes=regimes,

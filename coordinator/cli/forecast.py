@@ -16,8 +16,8 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.learning import Estimates
-    from petrobot.coordinator.studies.campaign.plan import Plan
-    from petrobot.coordinator.studies.campaign.rows import Row
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan
+    from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.forecast.history import Training
     from petrobot.coordinator.task import Task
 
@@ -178,7 +178,7 @@ def _trainings(task: Task, path: Path) -> tuple[dict[str, Training], Estimates, 
     return found, estimates_of(task, rows, path.name), about
 
 
-def _refuse_other_task(task: Task, plan: Plan, path: Path) -> None:
+def _refuse_other_task(task: Task, plan: CampaignPlan, path: Path) -> None:
     """Raises CommandError when a campaign ran a task of another name, where its file still is."""
     from petrobot.coordinator.studies.campaign.plan import MANIFEST
 
@@ -193,7 +193,7 @@ def _refuse_other_task(task: Task, plan: Plan, path: Path) -> None:
         )
 
 
-def _refuse_other_runs(task: Task, rows: Iterable[Row], path: Path) -> None:
+def _refuse_other_runs(task: Task, rows: Iterable[TrialRow], path: Path) -> None:
     """Raises CommandError for runs in places or of actions that the task does not have (any
     more)."""
     from petrobot.coordinator.studies.campaign.table import TABLE
@@ -292,7 +292,7 @@ def _compare(registered: Path, folder: Path, options: argparse.Namespace) -> int
     return 0 if found["agrees"] else 1
 
 
-def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
+def fitting(registered: Path, forecast: dict[str, Any], plan: CampaignPlan) -> Task:
     """The task of a campaign that may be compared with a registered forecast. Raises
     CommandError."""
     task = load_task(plan.task)
@@ -312,7 +312,7 @@ def fitting(registered: Path, forecast: dict[str, Any], plan: Plan) -> Task:
     return task
 
 
-def _planned(plan: Plan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
+def _planned(plan: CampaignPlan, task: Task) -> dict[str, dict[str, dict[str, float]]]:
     """By regime: how a campaign that learns nothing will choose; empty where its file of services
     is not here."""
     from petrobot.coordinator.studies.campaign.policies import learns, policy_of

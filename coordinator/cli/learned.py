@@ -16,10 +16,10 @@ from petrobot.services.host.command_line import number, probability
 # `learned task`: R, C and J of primitive tasks and of a whole task, from an estimates file through the task's net.
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.learning.estimates_file import Kept
+    from petrobot.coordinator.learning.estimates_file import FileContents
 
 
-def show_task(kept: Kept, options: argparse.Namespace) -> int:
+def show_task(kept: FileContents, options: argparse.Namespace) -> int:
     """Print what the actions' estimates come to, for one run of the task."""
     if len(options.more) != 1:
         raise CommandError(2, "which task? Write `petrobot learned task FILE TASK`")
@@ -31,7 +31,7 @@ def show_task(kept: Kept, options: argparse.Namespace) -> int:
     return 0
 
 
-def figures(kept: Kept, name: str, context: str | None) -> dict[str, Any]:
+def figures(kept: FileContents, name: str, context: str | None) -> dict[str, Any]:
     """Plain data: the parts, and the whole for one token in the runs place."""
     from petrobot.coordinator.analysis.time.stochastic import NoEstimate
     from petrobot.coordinator.launch import with_runs
@@ -106,7 +106,7 @@ def _cell(value: float | None) -> str:
 
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.learning.estimates_file import EstimatesFile, Kept
+    from petrobot.coordinator.learning.estimates_file import EstimatesFile, FileContents
 
 EXAMPLE = (
     "petrobot learned show learned.db --target 0.95\n  petrobot learned merge "
@@ -209,13 +209,13 @@ def _merge(file: EstimatesFile, options: argparse.Namespace) -> int:
     return 0
 
 
-def _tasks(kept: Kept) -> list[str]:
+def _tasks(kept: FileContents) -> list[str]:
     return sorted(
         {k.primitive_task for k in kept.estimates.tallies} | {task for task, _ in kept.selectors}
     )
 
 
-def _refuse_unknown(kept: Kept, options: argparse.Namespace) -> None:
+def _refuse_unknown(kept: FileContents, options: argparse.Namespace) -> None:
     for task in options.more:
         if task not in _tasks(kept):
             raise CommandError(
@@ -225,7 +225,7 @@ def _refuse_unknown(kept: Kept, options: argparse.Namespace) -> None:
             )
 
 
-def _freeze(file: EstimatesFile, kept: Kept, options: argparse.Namespace) -> None:
+def _freeze(file: EstimatesFile, kept: FileContents, options: argparse.Namespace) -> None:
     for (task, _), state in kept.selectors.items():
         if not options.more or task in options.more:
             file.put_selectors({task: {**state, "frozen": options.verb == "freeze"}})

@@ -15,14 +15,14 @@ from petrobot.coordinator.cli.loading import write_json
 
 if TYPE_CHECKING:
     from petrobot.coordinator.learning.estimate import Tally
-    from petrobot.coordinator.learning.estimates_file import Kept
+    from petrobot.coordinator.learning.estimates_file import FileContents
     from petrobot.coordinator.learning.objective import Comparison, Figures, Question
 
 Tallies = Mapping[str, "Mapping[str, Tally]"]
 """By action, then by context."""
 
 
-def show(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> int:
+def show(kept: FileContents, tasks: Sequence[str], options: argparse.Namespace) -> int:
     """Print what is known of the primitive tasks' actions, and write it as JSON."""
     from petrobot.coordinator.learning.objective import compare
 
@@ -44,7 +44,7 @@ def show(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> int:
     return 0
 
 
-def _question(kept: Kept, task: str, options: argparse.Namespace) -> Question:
+def _question(kept: FileContents, task: str, options: argparse.Namespace) -> Question:
     """As given; else by what the file says that the actions were judged (its target counts over
     contexts, not in one)."""
     asked = kept.question(task)
@@ -57,7 +57,9 @@ def _question(kept: Kept, task: str, options: argparse.Namespace) -> Question:
     )
 
 
-def refuse_unknown_context(kept: Kept, tasks: Sequence[str], options: argparse.Namespace) -> None:
+def refuse_unknown_context(
+    kept: FileContents, tasks: Sequence[str], options: argparse.Namespace
+) -> None:
     """Raise CommandError for a context in which no action of these primitive tasks was run."""
     if options.context is None:
         return
@@ -97,7 +99,7 @@ def _refuse_unknown_cost(known: Mapping[str, Tallies], options: argparse.Namespa
 
 
 def _plain(
-    kept: Kept,
+    kept: FileContents,
     task: str,
     tallies: Tallies,
     asked: Question,
@@ -133,9 +135,9 @@ def _plain(
 
 
 def _row(by_context: Mapping[str, Tally], asked: Question, f: Figures) -> dict[str, Any]:
-    from petrobot.coordinator.learning.estimate import Tally, merge
+    from petrobot.coordinator.learning.estimate import Tally, merge_tallies
 
-    whole = reduce(merge, by_context.values(), Tally())
+    whole = reduce(merge_tallies, by_context.values(), Tally())
     cost = whole.cost(asked.measure)
     return {
         "action": f.action,
@@ -201,7 +203,7 @@ def _by_context(tallies: Tallies, asked: Question) -> list[dict[str, Any]]:
     return out
 
 
-def _selectors(kept: Kept, task: str) -> dict[str, Any]:
+def _selectors(kept: FileContents, task: str) -> dict[str, Any]:
     return {
         name: {
             "frozen": state["frozen"],

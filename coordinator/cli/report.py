@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from petrobot.coordinator.cli.recorded_runs import Recorded
     from petrobot.coordinator.run.recording import Step
-    from petrobot.coordinator.studies.campaign.plan import Plan
-    from petrobot.coordinator.studies.campaign.rows import Row
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan
+    from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.report.run_page import ObservedRun
     from petrobot.coordinator.task import Task
 
@@ -147,7 +147,7 @@ def _names(one: Path, other: Path) -> tuple[str, str]:
     return names if names[0] != names[1] else (str(one), str(other))
 
 
-def opened(folder: Path) -> tuple[Plan, Task, list[Row]]:
+def opened(folder: Path) -> tuple[CampaignPlan, Task, list[TrialRow]]:
     """Plan, task and rows of a campaign. Raises CampaignError, and CommandError without rows."""
     from petrobot.coordinator.studies.campaign.plan import read_manifest
     from petrobot.coordinator.studies.campaign.table import TABLE, read_table

@@ -1,2 +1,1 @@
-"""Estimates of actions and selectors that learn among them (docs/learning.md); pure: no clock,
-files or randomness of its own."""
+"""Estimates of actions, and selectors that learn which action to choose (docs/learning.md)."""

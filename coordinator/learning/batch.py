@@ -1,8 +1,8 @@
-"""State of many learners side by side, one a row, and the order of their actions by J.
+"""State of many learners side by side (one per row), and the order of their actions by J.
 
-The simulations of docs/learning.md play a thousand rows, the selector of a mission run has one:
-both run the same rules on the same arrays, so what is measured is what is shipped. All sums are
-kept as sums, and every J is computed from them afresh with the one rho of its row.
+The simulations of docs/learning.md run a thousand rows; the selector of a mission run has one. Both
+use the same rules on the same arrays, so what is measured there is what runs here. Only sums are
+stored. Each J is computed from the sums when it is needed, with one rho per row.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ SUMS = ("tries", "runs", "successes", "cost", "squares", "costed", "missing")
 
 @dataclass
 class Response:
-    """One trial of each row: arrays of shape (rows,)."""
+    """One trial of each row. All arrays have shape (rows,)."""
 
     action: Index
     success: Array
     """1 or 0."""
     cost: Array
-    """In the measure's unit; nan where it was not measured."""
+    """Cost in the unit of the measure; nan if it was not measured."""
     executed: Mask
-    """False: it never began; it lowers the availability alone."""
+    """False if the run never began; such a trial only lowers the availability."""
 
 
 @dataclass
@@ -41,45 +41,46 @@ class Batch:
     p: Array
     """Learned choice probabilities; each row sums to 1."""
     k: Array
-    """Trials learned from, by row (shape (rows,))."""
+    """Number of trials that each row has learned from, shape (rows,)."""
     tries: Array
-    """Times that each action was chosen."""
+    """How often each action was chosen."""
     runs: Array
-    """Counted runs: executed, not censored."""
+    """Runs that count: executed and not censored."""
     successes: Array
     cost: Array
-    """Sum of the costs of the runs that have one."""
+    """Sum of the measured costs."""
     squares: Array
-    """Sum of their squares."""
+    """Sum of the squared costs."""
     costed: Array
-    """Runs that have a cost."""
+    """Number of runs that have a measured cost."""
     missing: Array
-    """Runs that never began."""
+    """Number of runs that never began."""
     rho: float | None = None
-    """Declared weight; None: 1 / max C of the row."""
+    """Declared weight of the cost; None: 1 / max C of the row."""
     own: dict[str, Array] = field(default_factory=dict)
-    """What a rule keeps beside, by name; the first axis is the row."""
+    """Further arrays that a rule needs, by name; their first axis is the row."""
 
     @classmethod
     def fresh(cls, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Nothing known, all actions equally likely."""
+        """Create learners without any experience: all actions are equally likely. Raises ValueError
+        for fewer than one row or action."""
         if n < 1 or rows < 1:
-            raise ValueError(f"{rows} learners over {n} actions: at least one of each is needed")
+            raise ValueError(f"expected at least one learner and one action, got {rows} and {n}")
         tries, runs, successes, cost, squares, costed, missing = (np.zeros((rows, n)) for _ in SUMS)
         p = np.full((rows, n), 1.0 / n)
         return cls(p, np.zeros(rows), tries, runs, successes, cost, squares, costed, missing, rho)
 
     @property
     def n(self) -> int:
-        """Actions."""
+        """Number of actions."""
         return int(self.p.shape[1])
 
     def choosing(self, action: Index) -> None:
-        """Count a choice of each row."""
+        """Count one choice of each row."""
         self.tries[np.arange(len(self.k)), action] += 1
 
     def counting(self, trial: Response) -> None:
-        """Add a trial of each row to the sums."""
+        """Add one trial of each row to the sums."""
         rows = np.arange(len(self.k))
         executed = trial.executed.astype(float)
         known = executed * ~np.isnan(trial.cost)
@@ -95,20 +96,21 @@ class Batch:
     # --- figures from the sums ----------------------------------------------------------------
 
     def reliability(self) -> Array:
-        """R; 0 where nothing is known."""
+        """R of each action; 0 where nothing is known."""
+        # 1e-300 stands for "no runs": 0 / 1e-300 is 0, without a warning of numpy
         return self.successes / np.maximum(self.runs, 1e-300)
 
     def availability(self) -> Array:
-        """A; 1 where nothing is known."""
+        """A of each action; 1 where nothing is known."""
         started = self.runs + self.missing
         return np.where(started > 0, self.runs / np.maximum(started, 1e-300), 1.0)
 
     def mean_cost(self) -> Array:
-        """C; 0 where nothing is known."""
+        """C of each action; 0 where nothing is known."""
         return self.cost / np.maximum(self.costed, 1e-300)
 
     def weight(self) -> Array:
-        """rho of each row, shape (rows, 1); 0 where no cost above 0 is known."""
+        """Return rho of each row, shape (rows, 1); 0 where no cost above 0 is known."""
         if self.rho is not None:
             return np.full((len(self.k), 1), self.rho)
         largest = self.mean_cost().max(axis=1, keepdims=True)
@@ -120,8 +122,8 @@ class Batch:
         return np.where(self.runs + self.missing > 0, j, np.inf)
 
     def spread(self) -> Array:
-        """Standard error of J: of R with one success and one failure added, so that it is never 0,
-        and of rho C."""
+        """Standard error of J: the error of R and the error of rho C combined. R is estimated with
+        one success and one failure added, so its error is never 0."""
         n = np.maximum(self.runs, 1.0)
         share = (self.successes + 1.0) / (self.runs + 2.0)
         costed = np.maximum(self.costed, 1.0)
@@ -130,8 +132,8 @@ class Batch:
         return error
 
     def best(self, eligible: Mask | None = None) -> Index:
-        """The action with the lowest J in each row, of the eligible ones if any is; the first of
-        equals."""
+        """Return the action with the lowest J in each row (the first of equals), among the eligible
+        actions if any of them was tried."""
         j = self.objective()
         if eligible is not None:
             some = np.any(eligible & (j < np.inf), axis=1, keepdims=True)
@@ -140,8 +142,8 @@ class Batch:
         return best
 
     def payoff(self, trial: Response) -> Array:
-        """A trial's gain in [0, 1], affine in its share of J: success, and cost where costs count;
-        shape (rows,)."""
+        """Return the payoff of each trial in [0, 1], shape (rows,): the mean of success and saved
+        cost where cost counts, otherwise the success alone."""
         rows = np.arange(len(self.k))
         weight = self.weight()[:, 0]
         mean = self.mean_cost()[rows, trial.action]
@@ -153,36 +155,38 @@ class Batch:
     # --- plain data ---------------------------------------------------------------------------
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data of a batch of one row."""
+        """Return the first row as plain data."""
         data: dict[str, Any] = {"p": self.p[0].tolist(), "k": float(self.k[0])}
         data |= {name: getattr(self, name)[0].tolist() for name in SUMS}
         return data | {"own": {name: array[0].tolist() for name, array in self.own.items()}}
 
     def take_plain(self, data: Mapping[str, Any]) -> None:
-        """Take over what `to_plain` gave. Raises ValueError or KeyError if it does not fit."""
+        """Load what `to_plain` returned into the first row. Raises ValueError or KeyError if it
+        does not fit."""
         for name in ("p", *SUMS):
             values = np.asarray(data[name], dtype=float)
             if values.shape != (self.n,) or not np.all(np.isfinite(values)) or np.any(values < 0):
-                raise ValueError(f"{name} needs {self.n} numbers that are not negative")
+                raise ValueError(f"{name}: expected {self.n} numbers that are not negative")
             getattr(self, name)[0] = values
-        self.successes[0] = np.minimum(
-            self.successes[0], self.runs[0]
-        )  # states written before corrections were bounded
+        # In states of older versions a correction could leave more successes than runs.
+        self.successes[0] = np.minimum(self.successes[0], self.runs[0])
         if abs(self.p[0].sum() - 1) > 1e-6:
-            raise ValueError("probabilities that do not sum to 1")
+            raise ValueError(
+                f"p: expected probabilities that sum to 1, got a sum of {self.p[0].sum():g}"
+            )
         self.k[0] = float(data["k"])
         if not 0 <= self.k[0] < np.inf:
-            raise ValueError(f"{data['k']!r} trials")
+            raise ValueError(f"k: expected a number of trials, got {data['k']!r}")
         for name, array in self.own.items():
             values = np.asarray(data["own"][name], dtype=float)
             if values.shape != array.shape[1:]:
-                raise ValueError(f"{name} has another shape")
+                raise ValueError(f"{name}: expected shape {array.shape[1:]}, got {values.shape}")
             array[0] = values
 
 
 def drawn(probabilities: Array, u: Array) -> Index:
-    """The action of each row at a uniform number u in [0, 1), shape (rows,), by the inverse of the
-    distribution."""
+    """Draw an action of each row by inverse transform sampling. `u`: uniform numbers in [0, 1),
+    shape (rows,)."""
     bounds = np.cumsum(probabilities, axis=1)
     bounds /= bounds[:, -1:]
     chosen: Index = np.minimum((bounds <= u[:, None]).sum(axis=1), probabilities.shape[1] - 1)
@@ -190,7 +194,8 @@ def drawn(probabilities: Array, u: Array) -> Index:
 
 
 def restricted(probabilities: Array, offered: Mask) -> Array:
-    """Probabilities of the offered actions alone; equal ones where they had none."""
+    """Return the probabilities over the offered actions only, scaled to sum to 1; equal shares if
+    all of them had probability 0."""
     left = np.where(offered, probabilities, 0.0)
     whole = left.sum(axis=1, keepdims=True)
     return np.where(

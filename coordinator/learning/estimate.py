@@ -1,11 +1,11 @@
-"""What is known of one primitive action in one context: counts by status and cause, durations, CPU
-time, costs, availability.
+"""What is known of one primitive action in one context, and of the firings of one transition.
 
-A `Tally` is immutable and merges: the tally of two sets of runs is the merge of their tallies, so
-several machines' runs add up. Reliability R is the relative frequency of SUCCESS among the runs
-that were executed and not censored (paper, section 3); an ERROR counts as a failure, `executed =
-unknown` too; an ERROR that never executed lowers the availability A alone. A preempted run that
-counts `none` is censored: it says only that it had lasted so long.
+A `Tally` holds counts by status and cause, durations, CPU time, costs and availability. It is
+immutable and can be merged: the tally of two sets of runs is the merge of their tallies, so runs of
+several machines add up. Reliability R is the relative frequency of SUCCESS among the runs that were
+executed and not censored (paper, section 3). An ERROR counts as not successful, also with `executed
+= unknown`. An ERROR of a run that never executed lowers only the availability A. A preempted run
+that counts `none` is censored: it tells only that the run lasted at least so long.
 """
 
 from __future__ import annotations
@@ -26,33 +26,34 @@ from petrobot.coordinator.learning.statistics import (
 )
 from petrobot.coordinator.task import Executed, Status
 
-# A bounded uniform sample of runs that merges: the entries with the smallest priorities are kept (bottom-k sampling).
-
 SIZE = 512
-"""Runs kept of each action and context: a 90 % quantile is then known to about +-1.3 points of
-probability."""
+"""Runs kept of each action and context. A 90 % quantile is then known to about +-1.3 points of
+probability (standard error sqrt(0.9 * 0.1 / 512))."""
 
 
-class Kept(NamedTuple):
+class SampledRun(NamedTuple):
     """One run in the sample."""
 
     priority: int
     seconds: float
     cpu_seconds: float
-    """-1 where it was not measured."""
+    """-1 if it was not measured."""
     exit: str
-    """How it ended; see `coordinator.learning.estimate`."""
+    """How the run ended; see `Observation.exit`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """At most `SIZE` runs, in order of their priorities."""
+    """A uniform sample of at most `SIZE` runs, sorted by priority. It can be merged: the entries
+    with the smallest priorities are kept (bottom-k sampling, E. Cohen and H. Kaplan, PODC 2007)."""
 
-    kept: tuple[Kept, ...] = ()
+    kept: tuple[SampledRun, ...] = ()
 
     def adding(self, name: str, seconds: float, cpu_seconds: float | None, exit_: str) -> Sample:
-        """With one more run. `name` must not have been used before."""
-        entry = Kept(_priority(name), seconds, -1.0 if cpu_seconds is None else cpu_seconds, exit_)
+        """Return the sample with one more run. `name` must be unique among all runs."""
+        entry = SampledRun(
+            _priority(name), seconds, -1.0 if cpu_seconds is None else cpu_seconds, exit_
+        )
         if len(self.kept) == SIZE and entry >= self.kept[-1]:
             return self
         grown = list(self.kept)
@@ -60,47 +61,48 @@ class Sample:
         return Sample(tuple(grown[:SIZE]))
 
     def merged(self, other: Sample) -> Sample:
-        """Of both together; a run that is in both is kept once."""
+        """Return the sample of both sets of runs; a run that is in both is kept once."""
         return Sample(tuple(sorted({*self.kept, *other.kept})[:SIZE]))
 
     def corrected(self, seconds: float, was: str, now: str) -> Sample:
-        """With the exit of one run of that length changed, if the sample holds it."""
+        """Return the sample with the exit of one run of that duration changed, if the sample holds
+        it."""
         for i, entry in enumerate(self.kept):
             if entry.exit == was and entry.seconds == seconds:
                 return Sample((*self.kept[:i], entry._replace(exit=now), *self.kept[i + 1 :]))
         return self
 
     def seconds(self, exits: Iterable[str] | None = None) -> list[float]:
-        """Durations (s) of the kept runs that ended so (None: of all)."""
+        """Durations (s) of the sampled runs that ended with one of these exits (None: of all)."""
         wanted = None if exits is None else set(exits)
         return [k.seconds for k in self.kept if wanted is None or k.exit in wanted]
 
     def cpu_seconds(self) -> list[float]:
-        """CPU times (s) of the kept runs that have one."""
+        """CPU times (s) of the sampled runs for which it was measured."""
         return [k.cpu_seconds for k in self.kept if k.cpu_seconds >= 0]
 
     def to_plain(self) -> list[list[Any]]:
-        """Plain data."""
+        """Return the sample as plain data."""
         return [list(k) for k in self.kept]
 
     @classmethod
     def of_plain(cls, rows: Sequence[Sequence[Any]]) -> Sample:
-        """What `to_plain` gave. Raises ValueError."""
+        """Read what `to_plain` returned. Raises ValueError."""
         kept = []
         for row in rows:
             priority, seconds, cpu, exit_ = row
-            kept.append(Kept(int(priority), float(seconds), float(cpu), str(exit_)))
+            kept.append(SampledRun(int(priority), float(seconds), float(cpu), str(exit_)))
         return cls(tuple(sorted(kept)[:SIZE]))
 
 
 def _priority(name: str) -> int:
-    """63 bits that look random and depend on the name alone (SQLite and JSON readers hold them
-    exactly)."""
+    """Return 63 pseudo-random bits that depend only on the name. SQLite and JSON readers hold 63
+    bits exactly."""
     return int.from_bytes(blake2b(name.encode(), digest_size=8).digest(), "big") >> 1
 
 
 def quantile(numbers: Sequence[float], q: float) -> float:
-    """The q-quantile by linear interpolation; nan of an empty sequence."""
+    """Return the q-quantile by linear interpolation; nan for an empty sequence."""
     if not numbers:
         return float("nan")
     ordered = sorted(numbers)
@@ -112,13 +114,13 @@ def quantile(numbers: Sequence[float], q: float) -> float:
 
 CENSORED = "none"
 COUNT = "count"
-"""The measure, and the value of a result in which a run reports it."""
+"""Name of a cost measure, and of the number in a result that reports it."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Key:
-    """Whose tally: an action as translation of a primitive task, in a context ("" where contexts
-    are not told apart)."""
+class TallyKey:
+    """Identifies a tally: primitive task, action, and context ("" if contexts are not
+    distinguished)."""
 
     primitive_task: str
     action: str
@@ -127,7 +129,7 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """How one run ended, as the estimates see it."""
+    """How one run ended, as the estimates need it."""
 
     status: Status | None
     """None: censored."""
@@ -136,101 +138,103 @@ class Observation:
     executed: Executed = Executed.YES
     cpu_seconds: float | None = None
     values: Mapping[str, float] = field(default_factory=dict)
-    """Numbers of the run's result, any of which may be a cost measure of its own (images averaged,
-    ...)."""
+    """Numbers of the run's result. Each of them can be a cost measure (images averaged, ...)."""
     preempted_by: str | None = None
-    """The transition that cancelled it ("" for an abort); None: it ended by itself."""
+    """The transition that preempted the run ("" for an abort); None: it ended by itself."""
     waited: float | None = None
-    """Seconds that its token was in its place beyond `seconds`: choosing, waiting for the device,
-    messages under way."""
+    """Seconds that its token was in the place beyond `seconds`: choosing the action, waiting for
+    the device, messages on their way."""
 
     @property
     def exit(self) -> str:
-        """`success`, `failure`, `error`; with `:transition` behind it, or `none:transition`, for a
-        preempted run."""
+        """`success`, `failure` or `error`; for a preempted run followed by `:transition`, or
+        `none:transition` if it counts none."""
         counted = CENSORED if self.status is None else self.status.value
         return counted if self.preempted_by is None else f"{counted}:{self.preempted_by}"
 
 
 def is_counted(exit_: str) -> bool:
-    """Whether runs with this exit count in R."""
+    """Return whether runs with this exit count in R."""
     return not exit_.startswith(CENSORED)
 
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Sums over runs. All mappings are in sorted order, so equal tallies have equal plain data."""
+    """Sums over runs. All mappings are sorted by key, so equal tallies have equal plain data."""
 
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    """Runs that count, by (status, cause)."""
+    """Counted runs, by (status, cause)."""
     durations: Mapping[str, Moments] = field(default_factory=dict)
-    """Seconds of every run that was executed, by exit: censored runs too."""
+    """Seconds of every executed run, by exit; includes censored runs."""
     cpu: Moments = EMPTY
-    """CPU seconds of the runs that count, where they were measured."""
+    """CPU seconds of the counted runs for which it was measured."""
     values: Mapping[str, Moments] = field(default_factory=dict)
-    """Numbers of the results of the runs that count."""
+    """Numbers in the results of the counted runs."""
     waited: Moments = EMPTY
-    """Seconds that tokens spent in the place beyond their runs' own."""
+    """Seconds that tokens were in the place beyond the duration of their runs."""
     not_executed: Mapping[str, int] = field(default_factory=dict)
     """Runs that never began, by cause."""
     unknown: int = 0
-    """Of the counted ones, those that may or may not have been executed."""
+    """Counted runs of which it is unknown whether they were executed."""
     corrected: int = 0
-    """Deferred verdicts that changed a status."""
+    """Number of deferred verdicts that changed a status."""
     changes: int = 0
-    """How often it was added to or corrected: the later of two versions has more."""
+    """How often runs were added or corrected. Of two versions of a tally, the later one has
+    more."""
     sample: Sample = field(default_factory=Sample)
 
     # --- reading ------------------------------------------------------------------------------
 
     @property
     def runs(self) -> int:
-        """Runs that count in R."""
+        """Number of runs that count in R."""
         return sum(self.counts.values())
 
     def count(self, status: Status) -> int:
-        """Counted runs with this status."""
+        """Return the number of counted runs with this status."""
         return sum(n for (s, _), n in self.counts.items() if s == status)
 
     @property
     def censored(self) -> int:
-        """Preempted runs that count none."""
+        """Number of preempted runs that count none."""
         return sum(m.n for exit_, m in self.durations.items() if not is_counted(exit_))
 
     @property
     def exposure(self) -> float:
-        """Seconds that runs went on, censored ones too."""
+        """Total seconds of all executed runs, including censored ones."""
         return sum(m.total for m in self.durations.values())
 
     @property
     def reliability(self) -> float:
-        """R; nan without counted runs."""
+        """R; nan if no run counts."""
         return self.count(Status.SUCCESS) / self.runs if self.runs else float("nan")
 
     def interval(self, level: float = 0.95, *, exact: bool = False) -> tuple[float, float]:
-        """Confidence interval of R: Wilson's, or the exact one of Clopper and Pearson."""
+        """Return the confidence interval of R: Wilson's, or the exact one of Clopper and
+        Pearson."""
         made = clopper_pearson if exact else wilson
         return made(self.count(Status.SUCCESS), self.runs, level)
 
     @property
     def availability(self) -> float:
-        """A: the share of started runs that were executed at all; 1 without any."""
+        """A: the share of started runs that were executed; 1 if none was started."""
         executed, missing = self.runs + self.censored, sum(self.not_executed.values())
         return executed / (executed + missing) if executed + missing else 1.0
 
     @property
     def wall(self) -> Moments:
-        """Seconds of the counted runs, whatever their exit."""
+        """Seconds of the counted runs, over all exits."""
         out = EMPTY
         for exit_, moments in self.durations.items():
             out = out.merged(moments) if is_counted(exit_) else out
         return out
 
     def cost(self, measure: str = "wall") -> Moments:
-        """The cost by a measure, over the counted runs: `wall`, `cpu` (s), `count` or `value:NAME`.
+        """Return the cost over the counted runs by a measure: `wall`, `cpu` (s), `count` or
+        `value:NAME`. Raises ValueError for any other measure.
 
-        `count` is how many things a run used, as it reports in its value `count` (images averaged,
-        tries); one that reports none counts as 1.
+        `count` is how many things a run used (images averaged, tries), as its result reports it in
+        the number `count`; a run that does not report it counts as 1.
         """
         if measure == "wall":
             return self.wall
@@ -243,26 +247,26 @@ class Tally:
         kind, _, name = measure.partition(":")
         if kind != "value" or not name:
             raise ValueError(
-                f"{measure!r} is no cost measure: write wall, cpu, count or value:NAME"
+                f"{measure!r} is not a cost measure; give wall, cpu, count or value:NAME"
             )
         return self.values.get(name, EMPTY)
 
     def quantile(self, q: float, measure: str = "wall") -> float:
-        """The q-quantile of durations or CPU times (s) over the kept sample of counted runs; nan
-        where there is none."""
+        """Return the q-quantile of durations or CPU times (s) over the sampled counted runs; nan
+        without any. Raises ValueError for a measure other than `wall` or `cpu`."""
         if measure == "cpu":
             return quantile(self.sample.cpu_seconds(), q)
         if measure != "wall":
-            raise ValueError(f"quantiles are kept of wall and cpu, not of {measure!r}")
+            raise ValueError(f"{measure!r} has no quantiles; give wall or cpu")
         return quantile(self.sample.seconds(e for e in self.durations if is_counted(e)), q)
 
     # --- changing -----------------------------------------------------------------------------
 
     def adding(self, seen: Observation, salt: str = "") -> Tally:
-        """With one more run. `salt` names whoever counts, so that samples of several counters do
-        not coincide.
+        """Return the tally with one more run. `salt` names the session that counts, so that the
+        samples of several sessions differ.
 
-        A run that was cancelled before it began says nothing and changes nothing.
+        A run that was cancelled before it began tells nothing and changes nothing.
         """
         if seen.executed is Executed.NO:
             if seen.status is None or seen.preempted_by is not None:
@@ -294,8 +298,8 @@ class Tally:
         )
 
     def correcting(self, was: Observation, status: Status, cause: str = "") -> Tally:
-        """With the deferred verdict on a run that was added before: its status is replaced. Raises
-        KeyError if none is there."""
+        """Return the tally with the status of one run replaced by its deferred verdict. Raises
+        KeyError if it holds no such run."""
         if was.status is None:
             raise KeyError("a censored run has no status to correct")
         before, after = was.exit, replace(was, status=status).exit
@@ -314,7 +318,7 @@ class Tally:
     # --- plain data ---------------------------------------------------------------------------
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data for JSON and msgpack."""
+        """Return the tally as plain data for JSON and msgpack."""
         return {
             "counts": [[status, cause, n] for (status, cause), n in self.counts.items()],
             "durations": {exit_: m.to_plain() for exit_, m in self.durations.items()},
@@ -330,10 +334,11 @@ class Tally:
 
     @classmethod
     def of_plain(cls, data: Mapping[str, Any]) -> Tally:
-        """What `to_plain` gave. Raises ValueError, KeyError or TypeError for anything else.
+        """Read what `to_plain` returned. Raises ValueError, KeyError or TypeError for anything
+        else.
 
-        Numbers that no sequence of runs could have left (negative ones, more times than runs, ...)
-        are refused: merged, they would spoil every figure.
+        Numbers that no sequence of runs can produce (negative counts, more durations than runs,
+        ...) are refused: after a merge they would spoil every figure.
         """
         counts = {
             (str(Status(status)), str(cause)): whole(n, "runs")
@@ -362,7 +367,7 @@ class Tally:
         return read
 
     def _check(self) -> None:
-        """Raise ValueError where the parts do not belong together."""
+        """Raise ValueError if the parts contradict each other."""
         for status in Status:
             timed = sum(
                 m.n for exit_, m in self.durations.items() if exit_.partition(":")[0] == status
@@ -374,20 +379,20 @@ class Tally:
                 )
         executed = self.runs + self.censored
         if sum(m.n for m in self.durations.values()) != executed:
-            raise ValueError(f"runs that ended as none of {', '.join(Status)}, nor censored")
+            raise ValueError(f"some exits are neither one of {', '.join(Status)} nor censored")
         for name, moments in (("cpu", self.cpu), *self.values.items()):
             whole(moments.n, f"numbers called {name}", self.runs)
         whole(self.waited.n, "waits", executed)
         whole(len(self.sample.kept), "runs in the sample", executed)
         least = executed + sum(self.not_executed.values())
         if self.changes < least:
-            raise ValueError(f"{self.changes} changes made it, but {least} runs stand in it")
+            raise ValueError(f"{self.changes} changes cannot have counted {least} runs")
         if any(m.low < 0 for m in (*self.durations.values(), self.cpu, self.waited) if m.n):
-            raise ValueError("seconds below 0")
+            raise ValueError("expected seconds from 0, got negative ones")
 
 
-def merge(one: Tally, other: Tally) -> Tally:
-    """The tally of both sets of runs."""
+def merge_tallies(one: Tally, other: Tally) -> Tally:
+    """Return the tally of both sets of runs."""
     if not one.changes or not other.changes:
         return one if one.changes else other
     return Tally(
@@ -405,7 +410,8 @@ def merge(one: Tally, other: Tally) -> Tally:
 
 
 def _more(counts: Mapping[Any, int], key: Any, by: int = 1) -> dict[Any, int]:
-    """Counts with one of them changed; one that comes to 0 is gone."""
+    """Return the counts with one of them changed; a count of 0 is removed. Raises KeyError below
+    0."""
     n = counts.get(key, 0) + by
     if n < 0:
         raise KeyError(f"no run was counted as {key}")
@@ -417,8 +423,8 @@ def _without(counts: Mapping[Any, int], key: Any) -> dict[Any, int]:
 
 
 def _put(entries: Mapping[Any, Any], key: Any, value: Any) -> dict[Any, Any]:
-    """Entries with one of them replaced or put where sorting wants it; moments without numbers are
-    left out."""
+    """Return the entries with one of them replaced or inserted in sorted order; moments without
+    numbers are removed."""
     out = {**entries, key: value}
     if isinstance(value, Moments) and not value.n:
         del out[key]
@@ -427,3 +433,45 @@ def _put(entries: Mapping[Any, Any], key: Any, value: Any) -> dict[Any, Any]:
 
 def _summed(one: Mapping[Any, int], other: Mapping[Any, int]) -> dict[Any, int]:
     return {key: one.get(key, 0) + other.get(key, 0) for key in sorted({*one, *other})}
+
+
+# --- firings ---
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class FiringsKey:
+    """Identifies the firings of a transition of a task in a context."""
+
+    task: str
+    transition: str
+    context: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Firings:
+    """Number of firings and waiting times of one transition. Immutable; can be merged."""
+
+    fired: int = 0
+    waits: Moments = EMPTY
+    """Seconds from the marking that enabled the transition to each firing. A wait belongs to the
+    place that waits, not to the event."""
+
+    def to_plain(self) -> list[Any]:
+        """Return the firings as plain data."""
+        return [self.fired, self.waits.to_plain()]
+
+    @classmethod
+    def of_plain(cls, data: Sequence[Any]) -> Firings:
+        """Read what `to_plain` returned. Raises ValueError or TypeError."""
+        fired, waits = whole(data[0], "firings"), Moments.of_plain(data[1])
+        whole(waits.n, "waits", fired)
+        return cls(fired, waits)
+
+    def adding(self, waited: float | None = None) -> Firings:
+        """Return the firings with one more."""
+        return Firings(self.fired + 1, self.waits if waited is None else self.waits.adding(waited))
+
+
+def merge_firings(one: Firings, other: Firings) -> Firings:
+    """Return the firings of both sets of runs."""
+    return Firings(one.fired + other.fired, one.waits.merged(other.waits))

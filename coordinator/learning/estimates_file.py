@@ -1,13 +1,13 @@
-"""The estimates file: what was learned, kept across mission runs in SQLite, and merged between
-machines.
+"""The estimates file: keeps in SQLite what was learned, across mission runs, and merges files of
+several machines.
 
-Every file has an origin of its own, and keeps the sums of each origin apart. A merge takes the
-later version of each origin's sums, so merging is idempotent, commutative and associative: no run
-counts twice, however often and in whatever order files travel. What was reset stays forgotten: its
-origins are remembered as such. A copy of a file becomes an origin of its own as soon as something
-is added to it, so two copies that both went on lose nothing when they meet. A campaign's runs stand
-under an origin that is closed: it is the same in whatever file the campaign is counted, so nothing
-else is ever added to it.
+Each file has its own origin (a random name) and stores the sums of each origin separately. A merge
+takes the later version of each origin's sums, so merging is idempotent, commutative and
+associative: no run counts twice, however often and in whatever order files travel. What was reset
+stays forgotten, because the file remembers the reset origins. A copy of a file gets a new origin as
+soon as something is added to it, so two copies that both grow lose nothing when they are merged.
+The runs of a campaign have a closed origin: it is the same in every file that counts the campaign,
+so nothing else is ever added under it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key
-from petrobot.coordinator.learning.estimate import merge as merge_tallies
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    TallyKey,
+    merge_firings,
+    merge_tallies,
+)
 from petrobot.coordinator.learning.estimates_tables import (
     APPLICATION,
     CHOICE,
@@ -54,78 +59,77 @@ from petrobot.coordinator.learning.estimates_tables import (
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
-from petrobot.coordinator.learning.waits import Flow, PassageKey
-from petrobot.coordinator.learning.waits import merge as merge_flows
 from petrobot.services.host.whole_file import make_folder
 
 BUSY = 20.0
-"""Seconds that a command waits for another one that is writing the file."""
+"""Seconds that a command waits while another one writes the file."""
 MACHINE_ID = Path("/etc/machine-id")
-"""Tells machines apart (machine-id(5)); where there is none, the file's inode alone tells copies
+"""Distinguishes machines (machine-id(5)). Without it, only the inode of the file tells copies
 apart."""
 
 
 class EstimatesError(Exception):
-    """The estimates file cannot be used: file, what is wrong, remedy."""
+    """The estimates file cannot be used; the text names the file, what is wrong and what to do."""
 
 
 @dataclass
-class Kept:
-    """What a file holds: all origins' estimates together, selectors' states by (primitive task,
-    selector)."""
+class FileContents:
+    """Contents of a file: estimates of all origins together, and states of selectors by (primitive
+    task, selector)."""
 
     origin: str = ""
     generation: int = 0
-    """Mission runs learned from so far."""
+    """Number of mission runs learned from so far."""
     estimates: Estimates = field(default_factory=Estimates)
     selectors: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
     asked: dict[str, tuple[Question, ...]] = field(default_factory=dict)
-    """By primitive task: cost measure, target and rho by which its actions were judged where they
-    were run; several where origins differ, the first one this file's own or else the one that was
-    asked most often."""
+    """By primitive task: the questions (cost measure, target, rho) by which its actions were judged
+    when they ran. Several if origins differ; the first one is this file's own, otherwise the one of
+    the most sessions."""
 
     def question(self, primitive_task: str) -> Question:
-        """By what the actions of a primitive task are judged if nothing else is asked."""
+        """Return by what the actions of a primitive task are judged unless the user asks
+        otherwise."""
         if self.asked.get(primitive_task):
             return self.asked[primitive_task][0]
         states = (state for (task, _), state in self.selectors.items() if task == primitive_task)
         return Question(next((str(state["cost"]) for state in states if state.get("cost")), "wall"))
 
     def states(self, selector: str) -> dict[str, dict[str, Any]]:
-        """States of one kind of selector by primitive task."""
+        """Return the states of one kind of selector by primitive task."""
         return {task: state for (task, name), state in self.selectors.items() if name == selector}
 
 
 class EstimatesFile:
-    """One estimates file. A file that is not there is made at the first writing; reading one that
-    is not there gives nothing."""
+    """One estimates file. It is created at the first writing; reading a file that does not exist
+    gives empty contents."""
 
     def __init__(self, path: Path, origin: str | None = None) -> None:
-        """`origin`: the name of a new file's origin; None: a random one."""
+        """`origin`: name of the origin of a new file; None: a random one."""
         self.path = path
         self._origin = origin
 
     # --- reading ------------------------------------------------------------------------------
 
-    def read(self) -> Kept:
-        """All that the file holds. Raises EstimatesError."""
+    def read(self) -> FileContents:
+        """Read the whole file. Raises EstimatesError."""
         if not self.path.exists():
-            return Kept()
+            return FileContents()
         with self._open() as db:
             return self._kept(db)
 
-    def _kept(self, db: sqlite3.Connection) -> Kept:
-        if is_empty(db):  # made, but killed before anything was written
-            return Kept()
+    def _kept(self, db: sqlite3.Connection) -> FileContents:
+        if is_empty(db):  # created, but killed before anything was written
+            return FileContents()
         about = dict(db.execute("SELECT name, value FROM about"))
-        kept = Kept(about["origin"], int(about["generation"]))
+        kept = FileContents(about["origin"], int(about["generation"]))
         for row in db.execute("SELECT * FROM tally"):
-            key = Key(*row[1:4])
+            key = TallyKey(*row[1:4])
             kept.estimates.tallies[key] = merge_tallies(kept.estimates.tally(key), tally_of(row))
         for row in db.execute("SELECT * FROM flow"):
-            where = PassageKey(*row[1:4])
-            kept.estimates.flows[where] = merge_flows(
-                kept.estimates.flows.get(where, Flow()), flow_of(row)
+            where = FiringsKey(*row[1:4])
+            kept.estimates.flows[where] = merge_firings(
+                kept.estimates.flows.get(where, Firings()), flow_of(row)
             )
         for task, name, state in db.execute("SELECT primitive_task, name, state FROM selector"):
             kept.selectors[task, name] = json.loads(state)
@@ -138,7 +142,7 @@ class EstimatesFile:
         return kept
 
     def records_of(self, mission: str) -> int:
-        """How many records of a mission run have been counted already."""
+        """Return how many records of a mission run the file has counted already."""
         if not self.path.exists():
             return 0
         with self._open() as db:
@@ -158,14 +162,14 @@ class EstimatesFile:
         late: Iterable[Correction] = (),
         asked: Mapping[str, Question] | None = None,
     ) -> None:
-        """Add what a session gained to this file's own origin, and keep its selectors' states
-        (primitive task -> state).
+        """Add what a session gained to this file's own origin, and store the states of its
+        selectors (primitive task -> state).
 
         `mission`, `records`: remember that so many records of a mission run are counted, so that
-        none counts twice when it is resumed (None: it has ended, nothing need be remembered).
-        `late`: verdicts on runs that this file counted before; what was reset meanwhile, or came
-        along with a copied file, stays as it is. `asked`: by what actions were judged (primitive
-        task -> question).
+        none counts twice when it is resumed; None: the run finished, nothing to remember. `late`:
+        verdicts on runs that this file counted before; sums that were reset since then, or came
+        from a copied file, stay as they are. `asked`: by what actions were judged (primitive task
+        -> question).
         """
         with self._writing() as db:
             if fact(db, "origin") == fact(db, "closed"):
@@ -200,11 +204,11 @@ class EstimatesFile:
         selectors: Mapping[str, Mapping[str, Any]],
         asked: Mapping[str, Question],
     ) -> None:
-        """Write the whole of what was counted under an origin of its own that nobody adds to (a
+        """Write all that was counted under a closed origin, to which nothing is ever added (a
         campaign's).
 
-        A second time nothing changes; what others have added to the file, or what was reset, stays
-        so.
+        Writing it a second time changes nothing. What others have added to the file stays, and what
+        was reset stays forgotten.
         """
         with self._writing() as db:
             db.execute("INSERT OR IGNORE INTO about VALUES ('closed', ?)", (origin,))
@@ -234,13 +238,13 @@ class EstimatesFile:
                     put_question(db, origin, task, question, 1)
 
     def put_selectors(self, selectors: Mapping[str, Mapping[str, Any]]) -> None:
-        """Replace selectors' states (freezing, overriding by hand)."""
+        """Replace states of selectors (freezing, overriding by the user)."""
         with self._writing() as db:
             for task, state in selectors.items():
                 put_selector(db, task, state)
 
     def reset(self, primitive_task: str | None = None, *, selectors_only: bool = False) -> None:
-        """Forget a primitive task (None: everything): selectors' states, and estimates unless
+        """Forget a primitive task (None: everything): states of selectors, and estimates unless
         `selectors_only`."""
         with self._writing() as db:
             which, given = (
@@ -266,14 +270,14 @@ class EstimatesFile:
                 db.execute("DELETE FROM flow")
 
     def merge(self, other: Path) -> None:
-        """Take in another file. Raises EstimatesError.
+        """Merge another file into this one. Raises EstimatesError.
 
-        Estimates of each origin: the later version. Selectors: the state that has learned from more
+        Estimates: the later version of each origin. Selectors: the state that has learned from more
         trials.
         """
         if not other.exists():
             raise EstimatesError(
-                f"{other}: no such file; give an estimates file that `run --learn` has made"
+                f"{other}: no such file; give an estimates file that `run --learn` has written"
             )
         with EstimatesFile(other)._open() as db:
             if is_empty(db):
@@ -304,13 +308,13 @@ class EstimatesFile:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        """One transaction that sees nobody else's half-written work and makes the file if need
-        be."""
+        """Run one transaction, which sees no half-written work of other processes; creates the file
+        if necessary."""
         try:
             make_folder(self.path.parent)
         except OSError as fault:
             raise EstimatesError(
-                f"{self.path}: {fault.strerror}; give a folder that can be made"
+                f"{self.path}: cannot create its folder: {fault.strerror}; give another path"
             ) from fault
         existed = self.path.exists()
         try:
@@ -325,7 +329,7 @@ class EstimatesFile:
                 db.execute("COMMIT")
         except EstimatesError:
             if not existed and self.path.is_file() and not self.path.stat().st_size:
-                self.path.unlink()  # made by this very try, on a disk that is full
+                self.path.unlink()  # created by this attempt, on a disk that is full
             raise
 
     def _make(self, db: sqlite3.Connection) -> None:
@@ -340,8 +344,7 @@ class EstimatesFile:
         db.execute("INSERT INTO about VALUES ('generation', '0')")
 
     def _settle(self, db: sqlite3.Connection) -> None:
-        """A file that was copied here is an origin of its own from now on; the sums that came along
-        stay the old one's."""
+        """Give a copied file a new origin; the sums that it contains stay those of the old one."""
         here = _home(self.path)
         known = db.execute("SELECT value FROM about WHERE name = 'home'").fetchone()
         if known is not None and known[0] != here:
@@ -350,7 +353,7 @@ class EstimatesFile:
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
-        """The database, checked. Every fault of the file becomes an EstimatesError."""
+        """Open and check the database. Every fault of the file becomes an EstimatesError."""
         try:
             with closing(sqlite3.connect(self.path, timeout=BUSY, isolation_level=None)) as db:
                 self._check(db)
@@ -374,18 +377,19 @@ class EstimatesFile:
             return
         if application != APPLICATION:
             raise EstimatesError(
-                f"{self.path}: a database, but no estimates file; give --learn another file"
+                f"{self.path}: not an estimates file, but another database; give --learn "
+                "another file"
             )
         if not 1 <= version <= SCHEMA:
             raise EstimatesError(
-                f"{self.path}: written with schema {version}, this petrobot reads {SCHEMA}; "
+                f"{self.path}: expected schema {SCHEMA} or older, got {version}; "
                 f"{'upgrade petrobot' if version > SCHEMA else 'start a new file'} or give "
                 "another one"
             )
 
 
 def _home(path: Path) -> str:
-    """Which file on which machine this is: another one after copying, the same after renaming."""
+    """Identify the file and its machine: different after copying, the same after renaming."""
     machine = (
         MACHINE_ID.read_text(encoding="ascii", errors="replace").strip()
         if MACHINE_ID.is_file()

@@ -1,5 +1,4 @@
-"""The tables of an estimates file: what is in them, and the statements that read and change
-them."""
+"""The tables of an estimates file: their contents, and the statements that read and change them."""
 
 from __future__ import annotations
 
@@ -11,31 +10,34 @@ from contextlib import suppress
 from math import inf
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key, Tally
-from petrobot.coordinator.learning.estimate import merge as merge_tallies
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    Tally,
+    TallyKey,
+    merge_firings,
+    merge_tallies,
+)
 from petrobot.coordinator.learning.learning import corrected
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.records import Correction
-from petrobot.coordinator.learning.waits import Flow, PassageKey
-from petrobot.coordinator.learning.waits import merge as merge_flows
-
-# Two states of one selector, learned apart (on two machines, or in a file and its copy), as one: context by context.
 
 State = Mapping[str, Any]
 
 
 def trials(state: State) -> float:
-    """Trials that a state has learned from, in all contexts. Raises KeyError, TypeError or
-    ValueError if it is no state."""
+    """Return the number of trials that a state has learned from, in all contexts. Raises KeyError,
+    TypeError or ValueError for anything that is not a state."""
     return sum(float(learner["k"]) for learner in state["learners"].values())
 
 
 def joined(mine: State, other: State) -> dict[str, Any]:
-    """Of each context the learner with more trials; `frozen` as in `mine`.
+    """Join two states of one selector that learned separately: take the learner with more trials in
+    each context, and `frozen` from `mine`.
 
-    States over other actions do not mix: the one with more trials is kept whole. Contexts come out
-    sorted, ties are settled by the learners' text, so that files which met agree whoever took in
-    whom.
+    States over different actions do not mix: the one with more trials is taken as a whole. Contexts
+    are sorted and ties are decided by the text of the learners, so that merged files agree,
+    whichever of them merged the other.
     """
     if list(mine["actions"]) != list(other["actions"]):
         return {**(other if _rank(other) > _rank(mine) else mine), "frozen": mine["frozen"]}
@@ -55,50 +57,53 @@ def _weight(learner: Mapping[str, Any]) -> tuple[float, str]:
 
 
 SCHEMA = 2
-"""1 had no table `question`. Files of schema 1 are read as they are, and become 2 when something is
-written to them."""
+"""Schema 1 had no table `question`. Files of schema 1 are still read; they become schema 2 when
+something is written to them."""
 APPLICATION = 0x70657472
 """"petr": SQLite's application_id of these files."""
 CHOICE = "choice of "
-"""Before a primitive task's name in the table `forgotten`: its selectors' states are forgotten, not
-its estimates."""
+"""Prefix of a primitive task's name in the table `forgotten`: only the states of its selectors are
+forgotten, not its estimates."""
 COUNTED = "counted "
-"""Before a mission run's id in the table `about`: the origin under which its runs were counted when
-it was interrupted."""
+"""Prefix of a mission run's id in the table `about`: the origin under which its runs were counted
+when it was interrupted."""
 CAMPAIGN = "campaign/"
-"""Begins the names of campaigns' origins."""
+"""Prefix of the origins of campaigns."""
 
 QUESTION = """
-CREATE TABLE question(origin TEXT, primitive_task TEXT, version INTEGER NOT NULL, cost TEXT NOT NULL, target REAL, rho REAL,
-  PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID
+CREATE TABLE question(origin TEXT, primitive_task TEXT, version INTEGER NOT NULL,
+  cost TEXT NOT NULL, target REAL, rho REAL, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID
 """
 TABLES = f"""
 CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+CREATE TABLE tally(origin TEXT, primitive_task TEXT, action TEXT, context TEXT,
+  version INTEGER NOT NULL, body TEXT NOT NULL,
   PRIMARY KEY(origin, primitive_task, action, context)) WITHOUT ROWID;
-CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT, version INTEGER NOT NULL, body TEXT NOT NULL,
+CREATE TABLE flow(origin TEXT, task TEXT, transition_name TEXT, context TEXT,
+  version INTEGER NOT NULL, body TEXT NOT NULL,
   PRIMARY KEY(origin, task, transition_name, context)) WITHOUT ROWID;
 CREATE TABLE selector(primitive_task TEXT, name TEXT, trials REAL NOT NULL, state TEXT NOT NULL,
   PRIMARY KEY(primitive_task, name)) WITHOUT ROWID;
-CREATE TABLE forgotten(origin TEXT, primitive_task TEXT, PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
+CREATE TABLE forgotten(origin TEXT, primitive_task TEXT,
+  PRIMARY KEY(origin, primitive_task)) WITHOUT ROWID;
 CREATE TABLE mission(id TEXT PRIMARY KEY, records INTEGER NOT NULL) WITHOUT ROWID;
 {QUESTION};
 """
 
 
 def is_empty(db: sqlite3.Connection) -> bool:
-    """Whether nothing was ever written: a kill can leave such a file."""
+    """Return whether nothing was ever written: a kill can leave such a file."""
     return int(db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]) == 0
 
 
 def schema(db: sqlite3.Connection) -> int:
-    """The version of its tables; 0 if it says none."""
+    """Return the schema version; 0 if the file does not say."""
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
 def migrate(db: sqlite3.Connection) -> None:
-    """From schema 1. A campaign's own origin is closed from now on; what had been added to it
-    before cannot be told apart."""
+    """Migrate from schema 1. A campaign's own origin is closed from now on; what was added to it
+    before cannot be separated."""
     db.execute(QUESTION)
     origin = fact(db, "origin")
     if origin.startswith(CAMPAIGN):
@@ -107,35 +112,35 @@ def migrate(db: sqlite3.Connection) -> None:
 
 
 def count_session(db: sqlite3.Connection) -> None:
-    """One more session was learned from: the draws of the next one are others."""
+    """Count one more session, so that the next one draws other actions."""
     db.execute("UPDATE about SET value = CAST(value AS INTEGER) + 1 WHERE name = 'generation'")
 
 
 def renew_origin(db: sqlite3.Connection) -> None:
-    """What is added from now on stands under another name than what was added before."""
+    """Start a new origin: what is added from now on is stored separately from what was added
+    before."""
     db.execute("UPDATE about SET value = ? WHERE name = 'origin'", (secrets.token_hex(8),))
 
 
 def fact(db: sqlite3.Connection, name: str) -> str:
-    """A line of the table `about`; empty if it is not there."""
+    """Return a value of the table `about`; "" if it is not there."""
     row = db.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
     return str(row[0]) if row else ""
 
 
-def add_tally(db: sqlite3.Connection, origin: str, key: Key, gained: Tally) -> None:
-    """Add to an origin's sums."""
+def add_tally(db: sqlite3.Connection, origin: str, key: TallyKey, gained: Tally) -> None:
+    """Add runs to the sums of an origin."""
     _put_tally(db, origin, key, merge_tallies(_own_tally(db, origin, key), gained))
 
 
 def correct_tally(db: sqlite3.Connection, origin: str, correction: Correction) -> None:
-    """A verdict on a run that an origin's sums have counted already; left alone if they have
-    not."""
-    key = Key(correction.primitive_task, correction.action, correction.context)
-    with suppress(KeyError):  # the run is not among this origin's any more
+    """Apply a verdict to a run that an origin's sums have counted; do nothing if they have not."""
+    key = TallyKey(correction.primitive_task, correction.action, correction.context)
+    with suppress(KeyError):  # the origin no longer contains the run
         _put_tally(db, origin, key, corrected(_own_tally(db, origin, key), correction))
 
 
-def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
+def _own_tally(db: sqlite3.Connection, origin: str, key: TallyKey) -> Tally:
     where = (origin, key.primitive_task, key.action, key.context)
     row = db.execute(
         "SELECT * FROM tally WHERE origin = ? AND primitive_task = ? AND action = ? AND "
@@ -145,60 +150,60 @@ def _own_tally(db: sqlite3.Connection, origin: str, key: Key) -> Tally:
     return tally_of(row) if row else Tally()
 
 
-def _put_tally(db: sqlite3.Connection, origin: str, key: Key, tally: Tally) -> None:
+def _put_tally(db: sqlite3.Connection, origin: str, key: TallyKey, tally: Tally) -> None:
     db.execute(
         "INSERT OR REPLACE INTO tally VALUES (?, ?, ?, ?, ?, ?)", tally_row(origin, key, tally)
     )
 
 
-def tally_row(origin: str, key: Key, tally: Tally) -> tuple[Any, ...]:
-    """A row of the table `tally`."""
+def tally_row(origin: str, key: TallyKey, tally: Tally) -> tuple[Any, ...]:
+    """Return a row of the table `tally`."""
     body = json.dumps(tally.to_plain(), separators=(",", ":"))
     return origin, key.primitive_task, key.action, key.context, tally.changes, body
 
 
-def add_flow(db: sqlite3.Connection, origin: str, key: PassageKey, gained: Flow) -> None:
-    """Add to an origin's firings."""
+def add_flow(db: sqlite3.Connection, origin: str, key: FiringsKey, gained: Firings) -> None:
+    """Add firings to the sums of an origin."""
     where = (origin, key.task, key.transition, key.context)
     row = db.execute(
         "SELECT * FROM flow WHERE origin = ? AND task = ? AND transition_name = ? AND context = ?",
         where,
     ).fetchone()
-    flow = merge_flows(flow_of(row) if row else Flow(), gained)
+    flow = merge_firings(flow_of(row) if row else Firings(), gained)
     db.execute("INSERT OR REPLACE INTO flow VALUES (?, ?, ?, ?, ?, ?)", flow_row(origin, key, flow))
 
 
-def flow_row(origin: str, key: PassageKey, flow: Flow) -> tuple[Any, ...]:
-    """A row of the table `flow`."""
+def flow_row(origin: str, key: FiringsKey, flow: Firings) -> tuple[Any, ...]:
+    """Return a row of the table `flow`."""
     return origin, key.task, key.transition, key.context, flow.fired, json.dumps(flow.to_plain())
 
 
 def put_question(
     db: sqlite3.Connection, origin: str, task: str, asked: Question, version: int
 ) -> None:
-    """Keep by what an origin judges the actions of a primitive task."""
+    """Store by what an origin judges the actions of a primitive task."""
     row = (origin, task, version, asked.measure, asked.target, asked.rho)
     db.execute("INSERT OR REPLACE INTO question VALUES (?, ?, ?, ?, ?, ?)", row)
 
 
 def questions(db: sqlite3.Connection) -> list[tuple[Any, ...]]:
-    """Rows of the table `question`; none in a file of schema 1."""
+    """Return the rows of the table `question`; none in a file of schema 1."""
     return db.execute("SELECT * FROM question").fetchall() if schema(db) > 1 else []
 
 
 def question_of(row: Sequence[Any]) -> Question:
-    """Of cost, target and rho. Raises ValueError."""
+    """Read cost, target and rho. Raises ValueError."""
     cost, target, rho = row
     Tally().cost(cost)
     if target is not None and not 0 < target <= 1:
-        raise ValueError(f"{target!r} is no target reliability")
+        raise ValueError(f"target: expected a reliability above 0 and up to 1, got {target!r}")
     if rho is not None and not 0 <= rho < inf:
-        raise ValueError(f"{rho!r} is no weight of cost")
+        raise ValueError(f"rho: expected a number from 0, got {rho!r}")
     return Question(cost, target, rho)
 
 
 def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) -> None:
-    """Replace a selector's state."""
+    """Replace the state of a selector."""
     body = json.dumps(state, separators=(",", ":"))
     db.execute(
         "INSERT OR REPLACE INTO selector VALUES (?, ?, ?, ?)",
@@ -209,7 +214,7 @@ def put_selector(db: sqlite3.Connection, task: str, state: Mapping[str, Any]) ->
 def take_selector(
     db: sqlite3.Connection, task: str, name: str, state: Mapping[str, Any], origin: str
 ) -> None:
-    """Another file's state, unless what was learned there under that origin was reset here."""
+    """Merge the state of another file, unless what was learned under that origin was reset here."""
     if db.execute(
         "SELECT 1 FROM forgotten WHERE origin = ? AND primitive_task = ?", (origin, CHOICE + task)
     ).fetchone():
@@ -221,8 +226,8 @@ def take_selector(
 
 
 def forget(db: sqlite3.Connection) -> None:
-    """Drop what some file has reset; if that was this file's own, what it learns from now on is
-    another origin's."""
+    """Delete what any of the merged files has reset. If that includes this file's own origin, start
+    a new one."""
     db.execute(
         "DELETE FROM tally WHERE EXISTS (SELECT 1 FROM forgotten f WHERE f.origin = tally.origin "
         "AND f.primitive_task = tally.primitive_task)"
@@ -249,7 +254,7 @@ KEYS = {
 
 
 def take_later(db: sqlite3.Connection, table: str, rows: Sequence[Sequence[Any]]) -> None:
-    """Rows that are not there yet, or of a later version than those that are."""
+    """Insert rows that are not there yet or that have a later version than those that are."""
     names = [name for _, name, *_ in db.execute(f"PRAGMA table_info({table})")]
     body = ", ".join(
         f"{name} = excluded.{name}" for name in names if name not in KEYS[table].split(", ")
@@ -263,7 +268,7 @@ def take_later(db: sqlite3.Connection, table: str, rows: Sequence[Sequence[Any]]
 
 
 def tally_of(row: Sequence[Any]) -> Tally:
-    """Of a row of the table `tally`. Raises ValueError naming the row."""
+    """Read a row of the table `tally`. Raises ValueError naming the row."""
     _, task, action, context, version, body = row
     try:
         tally = Tally.of_plain(json.loads(body))
@@ -274,9 +279,10 @@ def tally_of(row: Sequence[Any]) -> Tally:
 
 
 def _agree(changes: int, version: int) -> None:
-    """A higher version would win every merge, whatever stands behind it."""
+    """Check the version: a version that is too high would win every merge, whatever it stands
+    for."""
     if changes != version:
-        raise ValueError(f"version {version} of what was changed {changes} times")
+        raise ValueError(f"expected version {changes}, the number of changes, got {version}")
 
 
 def _in(context: str) -> str:
@@ -288,18 +294,18 @@ def _said(fault: Exception) -> str:
 
 
 def state_of(body: str) -> dict[str, Any]:
-    """A selector's state. Raises KeyError, TypeError or ValueError if it is none."""
+    """Read the state of a selector. Raises KeyError, TypeError or ValueError for anything else."""
     state: dict[str, Any] = json.loads(body)
-    if not 0 <= trials(state) < inf:  # it would win, or lose, every merge
-        raise ValueError(f"a selector that has learned from {trials(state):g} trials")
+    if not 0 <= trials(state) < inf:  # otherwise it would win, or lose, every merge
+        raise ValueError(f"selector: expected a number of trials from 0, got {trials(state):g}")
     return state
 
 
-def flow_of(row: Sequence[Any]) -> Flow:
-    """Of a row of the table `flow`. Raises ValueError naming the row."""
+def flow_of(row: Sequence[Any]) -> Firings:
+    """Read a row of the table `flow`. Raises ValueError naming the row."""
     _, _, transition, context, version, body = row
     try:
-        flow = Flow.of_plain(json.loads(body))
+        flow = Firings.of_plain(json.loads(body))
         _agree(flow.fired, version)
     except (ValueError, KeyError, TypeError, IndexError) as fault:
         raise ValueError(f"transition {transition}{_in(context)}: {_said(fault)}") from fault

@@ -1,10 +1,10 @@
-"""The executor's selector that learns: it turns the executor's records into records of learning,
-and chooses by them.
+"""The learning selector of a mission run: it turns what the executor records into records of
+learning, and chooses actions by them.
 
-It stands on two sides of the executor: as its `Selector` it is asked for actions, as an `Observer`
-it sees everything that happens. Its state changes by what it observes alone, never by being asked,
-and times are kept to the microsecond, as journals keep them; so a resumed run, whose recorded steps
-are shown to it again, has the same state as one that was never interrupted.
+It has two roles for the executor: as its `Selector` it chooses actions, as an `Observer` it sees
+everything that happens. Its state changes only by what it observes, never by a request for a
+choice, and times are rounded to the microsecond, as journals store them. A resumed run replays the
+recorded steps and so reaches the same state as a run that was never interrupted.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from petrobot.coordinator.engine.state import Phase
 from petrobot.coordinator.engine.stimuli import Chosen, RunEnded, Stimulus
 from petrobot.coordinator.learning.estimate import Observation
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.conditions import ConditionError, ConditionFault, Expression
@@ -36,17 +36,17 @@ from petrobot.coordinator.task.conditions import parse as parse_condition
 from petrobot.services.comm.calls.notices import Progress
 
 LARGEST = 1e150
-"""Numbers of results from here on are no costs: their squares could not be summed."""
+"""Numbers of results from this magnitude on are not used as costs: the sum of their squares would
+overflow."""
 
 
 class ContextError(ValueError):
-    """A context is not one that the task can tell apart."""
+    """The task cannot distinguish this context."""
 
 
 @dataclass(frozen=True)
 class Contexts:
-    """What contexts are told apart by: names of parameters and variables, and conditions on
-    them."""
+    """What distinguishes contexts: names of parameters and variables, and conditions on them."""
 
     parts: tuple[str, ...] = ()
 
@@ -60,7 +60,7 @@ class Contexts:
 
     @property
     def conditions(self) -> tuple[Expression, ...]:
-        """The parts, parsed."""
+        """The parsed parts."""
         parsed: tuple[Expression, ...] = self._conditions  # type: ignore[attr-defined]
         return parsed
 
@@ -76,13 +76,14 @@ class Contexts:
                 )
 
     def of(self, values: Mapping[str, Any]) -> str:
-        """The context now, as text: `regime=B`, `light < 0.3=true`; several parts are joined by a
-        comma."""
+        """Return the current context as text, for example `regime=B` or `light < 0.3=true`; several
+        parts are joined by a comma."""
         return ", ".join(f"{c.text}={_judged(c, values)}" for c in self.conditions)
 
 
 def usual_contexts(task: Task) -> Contexts:
-    """The regime, if the task has a parameter of that name; else no contexts are told apart."""
+    """Return the default: the regime if the task has a parameter of that name, otherwise a single
+    context."""
     return Contexts(("regime",) if "regime" in task.parameters else ())
 
 
@@ -97,8 +98,8 @@ def _judged(condition: Expression, values: Mapping[str, Any]) -> str:
 
 
 @dataclass
-class _Going:
-    """A run whose token was seen."""
+class _ActiveRun:
+    """A run whose token is in its place."""
 
     entered: float
     context: str | None = None
@@ -108,14 +109,14 @@ class _Going:
 
 
 class LearningSelector(FirstAlternative):
-    """Implements `Selector` and `Observer` over a `Learning`.
+    """Implements `Selector` and `Observer` with a `Learning`.
 
-    `chosen`: actions that the user fixed; what is learned of them counts nevertheless. `live`:
-    records are applied as they come; False for a worker of a campaign, whose records are applied
-    later, in order, to the one state of all. `generation`: how many mission runs were learned from
-    before, so that the draws of a second run with the same seed are others. `declared`: in lock
-    step the compute time (s) of each action as services.toml declares it, so that measured CPU time
-    never steers there.
+    `chosen`: actions that the user fixed; their runs are learned from, too. `live`: apply each
+    record at once; False for a worker of a campaign, whose records are applied later, in order, to
+    one common state. `generation`: number of mission runs that were learned from before, so that a
+    second run with the same seed draws other actions. `declared`: in lock step, the compute time
+    (s) of each action as services.toml declares it, so that measured CPU time never influences a
+    choice there.
     """
 
     def __init__(
@@ -134,21 +135,21 @@ class LearningSelector(FirstAlternative):
         self.contexts = usual_contexts(learning.task) if contexts is None else contexts
         self.contexts.check(learning.task)
         self.records: list[Record] = []
-        """Everything that was learned from, in order."""
+        """All records of this run, in order."""
         self._seed, self._generation, self._live = seed, generation, live
         self._declared = declared
         self._values: Mapping[str, Any] = {}
-        self._going: dict[str, _Going] = {}
-        self._deferred: dict[str, tuple[End, int]] = {}
-        """Runs whose verdict may still come, each with the trials of its primitive task and context
-        up to then."""
+        self._active: dict[str, _ActiveRun] = {}
+        self._deferred: dict[str, tuple[RunEnd, int]] = {}
+        """Runs whose verdict may still arrive, each with the number of trials of its primitive task
+        and context up to its end."""
         self._trials: Counter[tuple[str, str]] = Counter()
         self._waiting: dict[str, float] = {}
         self._watched = _waits_for_events(learning.task)
 
     @property
     def context(self) -> str:
-        """The context now."""
+        """The current context."""
         return self.contexts.of(self._values)
 
     # --- selector -----------------------------------------------------------------------------
@@ -160,8 +161,8 @@ class LearningSelector(FirstAlternative):
         alternatives: tuple[str, ...],
         variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
-        """The user's choice, else the selector's. (The operator's own is the executor's: it stands
-        in the engine's state.)"""
+        """Choose as the user fixed it, otherwise as the selector says. (A choice of the operator is
+        in the engine's state; the executor applies it.)"""
         if task in self._chosen or task not in self.learning.selectors:
             return super().choose(task, run, alternatives, variables)
         context = self.contexts.of(self._values if variables is None else variables)
@@ -169,8 +170,8 @@ class LearningSelector(FirstAlternative):
         return self.learning.choose(task, context, alternatives, rng)
 
     def figures(self, task: str) -> Mapping[str, Mapping[str, float]]:
-        """Probability of each alternative in the context now, and its R, C and J where they are
-        known."""
+        """Return the probability of each alternative in the current context, and its R, C and J
+        where they are known."""
         selector = self.learning.selectors.get(task)
         if selector is None:
             return {}
@@ -190,7 +191,7 @@ class LearningSelector(FirstAlternative):
     # --- observer -----------------------------------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Keep what a choice was made on, and what a run's result says beside its status."""
+        """Remember the context of a choice, and what a run's result contains beside its status."""
         if isinstance(stimulus, Chosen):
             self._choice(now, stimulus)
         elif isinstance(stimulus, RunEnded):
@@ -208,17 +209,17 @@ class LearningSelector(FirstAlternative):
             self._corrected(instruction)
 
     def progress(self, now: float, run: str, notice: Progress) -> None:
-        """Nothing to learn."""
+        """Ignore progress: nothing is learned from it."""
 
     def settled(self, now: float, state: State) -> None:
-        """Keep the variables, the runs that go on, and since when transitions wait."""
+        """Remember the variables, the active runs, and since when transitions wait."""
         self._values = state.variables
         for run in state.runs():
             if run.phase is Phase.DONE:
                 continue
-            going = self._run(now, run.id)
-            if going.context is None and run.action:
-                going.context = self.contexts.of(state.variables)
+            active = self._run(now, run.id)
+            if active.context is None and run.action:
+                active.context = self.contexts.of(state.variables)
         net = self.learning.task.net
         for name in self._watched:
             if net.has_concession(state.marking, net.transition_index[name]):
@@ -228,8 +229,8 @@ class LearningSelector(FirstAlternative):
 
     # --- records ------------------------------------------------------------------------------
 
-    def _run(self, now: float, run: str) -> _Going:
-        return self._going.setdefault(run, _Going(now))
+    def _run(self, now: float, run: str) -> _ActiveRun:
+        return self._active.setdefault(run, _ActiveRun(now))
 
     def _note(self, record: Record) -> None:
         self.records.append(record)
@@ -240,29 +241,31 @@ class LearningSelector(FirstAlternative):
         place = self.learning.task.flat.places.get(chosen.key.rpartition("#")[0])
         if place is None or not place.task:
             return
-        going = self._run(now, chosen.key)
-        going.context = self.context
-        self._note(Choice(place.task, chosen.alternative, going.context))
+        active = self._run(now, chosen.key)
+        active.context = self.context
+        self._note(Choice(place.task, chosen.alternative, active.context))
 
     def _fired(self, now: float, fired: Fired) -> None:
         for run in fired.runs:
-            if run in self._going:
-                self._going[run].taken_by, self._going[run].taken_at = fired.transition, now
+            if run in self._active:
+                self._active[run].taken_by, self._active[run].taken_at = fired.transition, now
         since = self._waiting.pop(fired.transition, None)
         waited = None if since is None else round(now - since, 6)
         self._note(Passage(fired.transition, self.context, waited))
 
     def _ended(self, now: float, record: RunRecorded) -> None:
-        going = self._going.pop(record.run, _Going(now))
-        context = self.context if going.context is None else going.context
-        preempted = (going.taken_by or "") if record.cancelled else None
-        until = going.taken_at if preempted else now
+        active = self._active.pop(record.run, _ActiveRun(now))
+        context = self.context if active.context is None else active.context
+        # A preempted run lasted until the transition took its token; its node may report the
+        # cancelled run later. Any other run lasted as long as its node says.
+        preempted = (active.taken_by or "") if record.cancelled else None
+        until = active.taken_at if preempted else now
         seconds = (
             max(0.0, record.seconds)
             if preempted is None
-            else round(max(0.0, until - going.entered), 6)
+            else round(max(0.0, until - active.entered), 6)
         )
-        result = going.ended
+        result = active.ended
         outcome = Observation(
             record.status,
             seconds,
@@ -271,9 +274,9 @@ class LearningSelector(FirstAlternative):
             self._cpu(record, result),
             _numbers(result.values) if result is not None and preempted is None else {},
             preempted,
-            round(max(0.0, now - going.entered - seconds), 6) if preempted is None else None,
+            round(max(0.0, now - active.entered - seconds), 6) if preempted is None else None,
         )
-        end = End(record.primitive_task, record.action, context, outcome)
+        end = RunEnd(record.primitive_task, record.action, context, outcome)
         selector, where = (
             self.learning.selectors.get(end.primitive_task),
             (end.primitive_task, context),
@@ -285,8 +288,8 @@ class LearningSelector(FirstAlternative):
         self._note(end)
 
     def _cpu(self, record: RunRecorded, result: RunEnded | None) -> float | None:
-        """CPU seconds as measured; as declared where they are the cost and the run must come out
-        the same again."""
+        """Return the measured CPU seconds; the declared ones in lock step where they are the cost,
+        because such a run must be reproducible."""
         if (
             self._declared is not None
             and self.learning.question(record.primitive_task).measure == "cpu"
@@ -303,8 +306,8 @@ class LearningSelector(FirstAlternative):
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers of a result; anything else is no cost. What is not finite would spoil every sum
-    that it came into."""
+    """Return the numbers of a result that can be costs. A number that is not finite would spoil
+    every sum."""
     return {
         name: float(value)
         for name, value in sorted(values.items())
@@ -313,7 +316,7 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _waits_for_events(task: Task) -> Sequence[str]:
-    """Transitions that wait for events alone, not for a run."""
+    """Return the transitions that wait only for events, not for a run."""
     return [
         t.name
         for t in task.flat.transitions.values()

@@ -1,9 +1,9 @@
-"""All that a task has learned: tallies by action and context, how transitions wait, and a selector
-for each primitive task.
+"""Everything that a task has learned: tallies by action and context, waits of transitions, and one
+selector for each primitive task.
 
-It changes by records alone (`Choice`, `End`, `Correction`, `Passage`), all of them plain data:
-whoever keeps the records, in a journal or in the table of a campaign, derives the same state again
-by `apply` in the same order.
+The state changes only by records (`Choice`, `RunEnd`, `Correction`, `Passage`), all of them plain
+data. A journal or a campaign table that stores the records yields the same state again when they
+are applied in the same order.
 """
 
 from __future__ import annotations
@@ -15,46 +15,58 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.learning.estimate import Key, Tally, merge
+from petrobot.coordinator.learning.estimate import (
+    Firings,
+    FiringsKey,
+    Tally,
+    TallyKey,
+    merge_firings,
+    merge_tallies,
+)
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
-from petrobot.coordinator.learning.records import Choice, Correction, End, Passage, Record
+from petrobot.coordinator.learning.records import Choice, Correction, Passage, Record, RunEnd
 from petrobot.coordinator.learning.selectors import DEFAULT, RuleSelector, make
-from petrobot.coordinator.learning.waits import Flow, PassageKey
-from petrobot.coordinator.learning.waits import merge as merge_flows
 from petrobot.coordinator.task import Task
 
 NOTHING = Tally()
 
 
 def corrected(tally: Tally, record: Correction) -> Tally:
-    """A tally after a verdict on one of its runs. Raises KeyError if it holds no such run."""
+    """Return the tally after a verdict on one of its runs. Raises KeyError if it holds no such
+    run."""
     return tally.correcting(record.was, record.status, record.cause)
 
 
 @dataclass
 class Estimates:
-    """Tallies and flows of one counter: a machine's file, or what one session has gained."""
+    """Tallies and firings from one source: the file of a machine, or what one session has
+    gained."""
 
-    tallies: dict[Key, Tally] = field(default_factory=dict)
-    flows: dict[PassageKey, Flow] = field(default_factory=dict)
+    tallies: dict[TallyKey, Tally] = field(default_factory=dict)
+    flows: dict[FiringsKey, Firings] = field(default_factory=dict)
 
     def merged(self, other: Estimates) -> Estimates:
-        """Of both sets of runs."""
+        """Return the estimates of both sets of runs."""
         tallies = {
-            k: merge(self.tally(k), other.tally(k)) for k in sorted({*self.tallies, *other.tallies})
+            k: merge_tallies(self.tally(k), other.tally(k))
+            for k in sorted({*self.tallies, *other.tallies})
         }
         keys = sorted({*self.flows, *other.flows})
         return Estimates(
             tallies,
-            {k: merge_flows(self.flows.get(k, Flow()), other.flows.get(k, Flow())) for k in keys},
+            {
+                k: merge_firings(self.flows.get(k, Firings()), other.flows.get(k, Firings()))
+                for k in keys
+            },
         )
 
-    def tally(self, key: Key) -> Tally:
-        """What is known of an action in a context; an empty tally if nothing is."""
+    def tally(self, key: TallyKey) -> Tally:
+        """Return what is known of an action in a context; an empty tally if nothing is."""
         return self.tallies.get(key, NOTHING)
 
     def of(self, primitive_task: str, context: str | None = None) -> dict[str, dict[str, Tally]]:
-        """Tallies of a primitive task: by action, then by context (only the given one if any)."""
+        """Return the tallies of a primitive task by action, then by context (only the given
+        context, if any)."""
         out: dict[str, dict[str, Tally]] = {}
         for key, tally in sorted(self.tallies.items()):
             if key.primitive_task == primitive_task and context in (None, key.context):
@@ -62,27 +74,27 @@ class Estimates:
         return out
 
     def contexts(self, primitive_task: str) -> tuple[str, ...]:
-        """Contexts in which actions of a primitive task were seen."""
+        """Return the contexts in which actions of a primitive task were observed."""
         return tuple(
             sorted({k.context for k in self.tallies if k.primitive_task == primitive_task})
         )
 
     def apply(self, record: Record, task: str, salt: str) -> None:
-        """Count a record."""
-        if isinstance(record, End):
-            key = Key(record.primitive_task, record.action, record.context)
+        """Count one record."""
+        if isinstance(record, RunEnd):
+            key = TallyKey(record.primitive_task, record.action, record.context)
             self.tallies[key] = self.tally(key).adding(record.outcome, salt)
         elif isinstance(record, Correction):
-            key = Key(record.primitive_task, record.action, record.context)
+            key = TallyKey(record.primitive_task, record.action, record.context)
             self.tallies[key] = corrected(self.tally(key), record)
         elif isinstance(record, Passage):
-            where = PassageKey(task, record.transition, record.context)
-            self.flows[where] = self.flows.get(where, Flow()).adding(record.waited)
+            where = FiringsKey(task, record.transition, record.context)
+            self.flows[where] = self.flows.get(where, Firings()).adding(record.waited)
 
 
 class Learning:
-    """The learning of one task. `known` are the estimates that it starts with; `gained` those of
-    this session alone."""
+    """The learning state of one task. `known`: estimates from before; `gained`: those of this
+    session alone."""
 
     def __init__(
         self,
@@ -95,7 +107,7 @@ class Learning:
         self.task, self.salt = task, salt
         self.known, self.gained = known or Estimates(), Estimates()
         self.applied = 0
-        """Records taken in this session."""
+        """Number of records applied in this session."""
         self.given = question
         self.selectors: dict[str, RuleSelector] = {}
         for p in task.primitive_tasks.values():
@@ -103,8 +115,8 @@ class Learning:
                 self.selectors[p.name] = make(selector, p.alternatives, self.question(p.name))
 
     def question(self, primitive_task: str) -> Question:
-        """Measure, target and rho for a primitive task: as given, the cost measure as the task file
-        declares it."""
+        """Return measure, target and rho for a primitive task: as given, with the cost measure that
+        the task file declares."""
         given = self.given or Question()
         return Question(
             self.task.primitive_tasks[primitive_task].cost, given.target, given.rho, given.level
@@ -119,11 +131,11 @@ class Learning:
         alternatives: Sequence[str],
         rng: np.random.Generator,
     ) -> tuple[str, str]:
-        """One of the alternatives, and why. Changes nothing."""
+        """Choose one of the alternatives and say why. Changes nothing."""
         return self.selectors[primitive_task].choose(context, alternatives, rng)
 
     def apply(self, record: Record) -> None:
-        """Take a record in: estimates and selectors change."""
+        """Apply a record to the estimates and the selectors."""
         self.applied += 1
         self.gained.apply(record, self.task.name, self.salt)
         self._select(record)
@@ -136,7 +148,7 @@ class Learning:
             return
         if isinstance(record, Choice):
             selector.chosen(record.context, record.action)
-        elif isinstance(record, End):
+        elif isinstance(record, RunEnd):
             selector.update(record.context, record.action, record.outcome)
         elif record.was.status is not None:
             selector.correct(
@@ -147,15 +159,15 @@ class Learning:
 
     @property
     def estimates(self) -> Estimates:
-        """All that is known, this session's runs included."""
+        """Everything that is known, including the runs of this session."""
         return self.known.merged(self.gained)
 
     def comparison(self, primitive_task: str, context: str | None = None) -> Comparison:
-        """The alternatives of a primitive task judged: in one context, or over all of them as
+        """Compare the alternatives of a primitive task: in one context, or over all of them as
         scenarios (None).
 
-        Over scenarios the target reliability is the one that was given, else the one that the task
-        file declares.
+        Over scenarios the target reliability is the given one, otherwise the one that the task file
+        declares.
         """
         tallies, primitive = (
             self.estimates.of(primitive_task, context),
@@ -167,8 +179,8 @@ class Learning:
         return compare({a: tallies.get(a, {}) for a in primitive.alternatives}, question)
 
     def asked(self) -> dict[str, Question]:
-        """By what the actions of each primitive task are judged over scenarios: the target given,
-        else the declared one."""
+        """Return by what the actions of each primitive task are judged over scenarios: with the
+        given target, otherwise the declared one."""
         found = {}
         for name, primitive in self.task.primitive_tasks.items():
             question = self.question(name)
@@ -177,13 +189,13 @@ class Learning:
         return found
 
     def uncosted(self) -> list[tuple[str, str, str]]:
-        """(primitive task, action, measure) of what was run in this session without ever having a
-        cost by that measure."""
+        """Return (primitive task, action, measure) for each action that ran in this session but
+        never reported a cost by that measure."""
         found = []
         for name in self.task.primitive_tasks:
             measure = self.question(name).measure
             for action, by_context in self.gained.of(name).items():
-                whole = reduce(merge, by_context.values(), NOTHING)
+                whole = reduce(merge_tallies, by_context.values(), NOTHING)
                 if whole.runs and not whole.cost(measure).n:
                     found.append((name, action, measure))
         return found
@@ -191,20 +203,20 @@ class Learning:
     # --- state --------------------------------------------------------------------------------
 
     def prime(self) -> None:
-        """Have the selectors take their sums from the known estimates: other machines' runs may
-        have come in."""
+        """Let the selectors take their sums from the known estimates, which may contain runs of
+        other machines."""
         for name, selector in self.selectors.items():
             for context in self.known.contexts(name):
                 by_action = self.known.of(name, context)
                 selector.prime(context, {a: t[context] for a, t in by_action.items()})
 
     def state(self) -> dict[str, Any]:
-        """The selectors' states by primitive task, as plain data."""
+        """Return the state of each selector by primitive task, as plain data."""
         return {name: selector.state() for name, selector in self.selectors.items()}
 
     def restore(self, states: Mapping[str, Mapping[str, Any]]) -> None:
-        """Go on from states of the same kind of selector. Raises ValueError naming the primitive
-        task that does not fit."""
+        """Load states of the same kind of selector. Raises ValueError naming the primitive task
+        whose state does not fit."""
         for name, state in states.items():
             if name not in self.selectors:
                 continue
@@ -214,7 +226,7 @@ class Learning:
                 raise ValueError(f"{name}: {fault}") from fault
 
     def freeze(self, frozen: bool = True, primitive_tasks: Iterable[str] | None = None) -> None:
-        """Stop (or go on) learning: a frozen selector chooses what it has learned to be best.
-        Estimates count on."""
+        """Stop (or continue) learning. A frozen selector chooses the action that it has learned to
+        be best. Estimates still count."""
         for name in self.selectors if primitive_tasks is None else primitive_tasks:
             self.selectors[name].frozen = frozen

@@ -1,13 +1,13 @@
-"""The cost function J = 1 - A R + rho C of primitive actions, and the questions that can be asked
-of it (paper, section 3).
+"""The cost function J = 1 - A R + rho C of primitive actions, and questions about it (paper,
+section 3).
 
 Over several scenarios an action is judged by its worst case. R is its reliability in the scenario
 that is hardest for it, never the share over all its runs: actions that were run in unequal shares
 of easy and hard scenarios would be put in the wrong order (E. H. Simpson, J. Royal Statistical
 Society B 13 (1951) 238). C is its mean cost in the hardest scenario whose reliability is not below
-the target R_d; which those are is decided by the lower confidence bound, with hysteresis. rho = 1 /
-max C over the actions of the one primitive task, or declared. All J of a comparison are computed
-from sums with one rho; J made under different rho are never averaged.
+the target R_d; the lower confidence bound decides which scenarios these are, with hysteresis. rho
+is 1 / max C over the actions of the one primitive task, or declared. All J of a comparison are
+computed from sums with one rho; J values made with different rho are never averaged.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from math import inf, isnan, nan
 
-from petrobot.coordinator.learning.estimate import Tally, merge
+from petrobot.coordinator.learning.estimate import Tally, merge_tallies
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked: the cost measure, the target reliability R_d, rho (None: 1 / max C) and the
-    confidence level."""
+    """What is asked: cost measure, target reliability R_d, rho (None: 1 / max C) and confidence
+    level."""
 
     measure: str = "wall"
     target: float | None = None
@@ -33,30 +33,31 @@ class Question:
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """One action in one comparison. Costs are in the measure's unit."""
+    """Figures of one action in one comparison. Costs are in the unit of the measure."""
 
     action: str
     runs: int
-    """In all scenarios."""
+    """Number of runs in all scenarios."""
     reliability: float
-    """R in the scenario that is hardest for it; nan without any run."""
+    """R in the scenario that is hardest for the action; nan without any run."""
     lower: float
     upper: float
-    """Confidence bounds of R there."""
+    """Bounds of the confidence interval of that R."""
     worst: str | None
-    """That scenario; None without any run."""
+    """The scenario that is hardest for the action; None without any run."""
     availability: float
-    """Over all scenarios: whether a node is there does not depend on the scenario."""
+    """A over all scenarios: whether a node is available does not depend on the scenario."""
     cost: float
-    """C; nan where nothing is known, inf where no scenario meets the target that others meet."""
+    """C; nan if nothing is known, inf if no scenario meets the target although some other action
+    meets it."""
     scenario: str | None
-    """The hardest scenario that still meets the target (s*); None: none meets it."""
+    """The hardest scenario that still meets the target (s*); None if none does."""
     scenarios: tuple[str, ...]
     """All scenarios that meet the target."""
     largest_cost: float
-    """The largest mean cost over those scenarios, beside the one in the hardest."""
+    """The largest mean cost over the scenarios that meet the target."""
     j: float
-    """J with the comparison's common rho; inf for an inadmissible action, nan where nothing is
+    """J with the common rho of the comparison; inf for an inadmissible action, nan if nothing is
     known."""
 
     @property
@@ -72,30 +73,31 @@ class Figures:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The alternatives of one primitive task judged together, in the order given."""
+    """The alternatives of one primitive task compared with each other, in the given order."""
 
     rho: float
     figures: tuple[Figures, ...]
     scenarios: tuple[str, ...]
-    """Scenarios in which every action that was run was run, over which all are judged; empty: there
-    is none, so each was judged over its own, and the order means little."""
+    """The scenarios in which every action with runs was run; the comparison is over these. If it is
+    empty, each action was judged over its own scenarios, and the order means little."""
     unmet: bool
-    """No action meets the target in any scenario, so J was made without it."""
+    """True if no action meets the target in any scenario; J was then computed without the
+    target."""
 
     @property
     def uncosted(self) -> tuple[str, ...]:
-        """Actions that were run, but of which no run has a cost: J takes it as 0."""
+        """Actions with runs of which none reported a cost: J takes their cost as 0."""
         return tuple(f.action for f in self.figures if f.runs and isnan(f.cost))
 
     @property
     def best(self) -> str | None:
-        """The action with the lowest J, of the admissible ones if there is any; None while nothing
-        is known of any."""
+        """The action with the lowest J, among the admissible ones if there are any; None while
+        nothing is known."""
         known = [f for f in self.figures if not isnan(f.j) and f.j < inf]
         return min(known, key=lambda f: f.j).action if known else None
 
     def of(self, action: str) -> Figures:
-        """The figures of one action. Raises KeyError."""
+        """Return the figures of one action. Raises KeyError."""
         for figures in self.figures:
             if figures.action == action:
                 return figures
@@ -103,14 +105,14 @@ class Comparison:
 
 
 def cost_weight(costs: Iterable[float]) -> float:
-    """The paper's typical rho: 1 / max C over the actions of which a cost is known; 0 if there is
-    none above 0."""
+    """Return the paper's typical rho: 1 / max C over the actions with a known cost; 0 if none is
+    above 0."""
     largest = max((c for c in costs if not isnan(c) and c < inf), default=0.0)
     return 1.0 / largest if largest > 0 else 0.0
 
 
 def objective(reliability: float, cost: float, rho: float, availability: float = 1.0) -> float:
-    """J = 1 - A R + rho C."""
+    """Return J = 1 - A R + rho C."""
     return 1.0 - availability * reliability + rho * cost
 
 
@@ -123,12 +125,12 @@ def admitted(
     before: Iterable[str] = (),
     level: float = 0.95,
 ) -> tuple[str, ...]:
-    """Scenarios in which an action meets the target reliability, given those in which it did
-    `before`.
+    """Return the scenarios in which an action meets the target reliability, given those in which it
+    did `before`.
 
-    One comes in when the lower confidence bound of R reaches the target, and goes out when R itself
-    falls below it: between the two it stays what it was, so the set does not flicker. Without a
-    target all scenarios with runs are in.
+    A scenario enters when the lower confidence bound of R reaches the target, and leaves when R
+    itself falls below it. In between it keeps its state, so the set does not flicker. Without a
+    target, all scenarios with runs are in.
     """
     inside = set(before)
     out = []
@@ -142,7 +144,7 @@ def admitted(
 
 
 def hardest(by_scenario: Mapping[str, Tally], inside: Sequence[str]) -> str | None:
-    """The scenario with the lowest reliability among those inside; None if there is none."""
+    """Return the scenario with the lowest reliability among those given; None if there is none."""
     return min(inside, key=lambda s: (by_scenario[s].reliability, s), default=None)
 
 
@@ -151,12 +153,12 @@ def compare(
     question: Question,
     before: Mapping[str, Sequence[str]] | None = None,
 ) -> Comparison:
-    """Judge the alternatives of a primitive task. `actions` are each action's tallies by scenario.
+    """Compare the alternatives of a primitive task. `actions`: the tallies of each action by
+    scenario.
 
-    `before` is the set of admitted scenarios by action of the last comparison (hysteresis). All
-    actions are judged over the scenarios in which all of them were run, R in the worst of these, C
-    in the hardest admitted one. While no action meets the target in any scenario, none is ruled
-    out.
+    `before`: the admitted scenarios by action of the last comparison (hysteresis). All actions are
+    judged over the scenarios in which all of them were run: R in the worst of these, C in the
+    hardest admitted one. While no action meets the target in any scenario, none is ruled out.
     """
     was, common = before or {}, shared(actions)
     over = {
@@ -168,7 +170,7 @@ def compare(
     unmet = not any(inside.values())
     rows = []
     for action, by_scenario in over.items():
-        whole = reduce(merge, actions[action].values(), Tally())
+        whole = reduce(merge_tallies, actions[action].values(), Tally())
         rows.append(_row(action, whole, by_scenario, inside[action], question, unmet))
     rho = cost_weight(f.cost for f in rows) if question.rho is None else question.rho
     known = any(f.runs for f in rows)
@@ -176,7 +178,7 @@ def compare(
 
 
 def shared(actions: Mapping[str, Mapping[str, Tally]]) -> tuple[str, ...]:
-    """The scenarios in which every action was run that was run at all, in order of their names."""
+    """Return the sorted scenarios in which every action that has runs was run."""
     run = [{s for s, t in by.items() if t.runs} for by in actions.values()]
     return tuple(sorted(set.intersection(*known))) if (known := [s for s in run if s]) else ()
 
@@ -189,7 +191,7 @@ def _row(
     question: Question,
     unmet: bool,
 ) -> Figures:
-    """J is left open."""
+    """Return the figures of one action; J is filled in later, when the common rho is known."""
     known = {s: t for s, t in by_scenario.items() if t.runs}
     worst = hardest(known, tuple(known))
     there = known[worst] if worst is not None else Tally()
@@ -230,8 +232,8 @@ def _judged(figures: Figures, rho: float) -> Figures:
 
 
 def break_even(one: Figures, other: Figures) -> float | None:
-    """The rho above 0 at which two actions have the same J: below it the more reliable one is
-    better; None if there is none.
+    """Return the rho above 0 at which two actions have the same J; None if there is none. Below it
+    the more reliable action is better.
 
     `one` beats `other` iff A R_one - A R_other > rho (C_one - C_other).
     """
@@ -243,7 +245,8 @@ def break_even(one: Figures, other: Figures) -> float | None:
 
 
 def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
-    """The actions that no other one beats in both reliability and cost, cheapest first."""
+    """Return the actions that no other action beats in both reliability and cost, cheapest
+    first."""
     known = sorted(
         (f for f in figures if not isnan(f.effective) and f.cost < inf),
         key=lambda f: (f.cost, -f.effective, f.action),
@@ -258,8 +261,8 @@ def pareto(figures: Iterable[Figures]) -> tuple[Figures, ...]:
 def cost_to_reach(
     figures: Iterable[Figures], target: float, *, surely: bool = False
 ) -> Figures | None:
-    """The cheapest action whose reliability (`surely`: its lower confidence bound) reaches the
-    target; None: none does."""
+    """Return the cheapest action whose reliability (`surely`: its lower confidence bound) reaches
+    the target; None if none does."""
     enough = [
         f
         for f in figures
@@ -269,6 +272,6 @@ def cost_to_reach(
 
 
 def reliability_for(figures: Iterable[Figures], budget: float) -> Figures | None:
-    """The most reliable action whose cost is within the budget; None: none is."""
+    """Return the most reliable action whose cost is within the budget; None if none is."""
     payable = [f for f in figures if f.cost <= budget and not isnan(f.effective)]
     return max(payable, key=lambda f: (f.effective, -f.cost), default=None)

@@ -1,9 +1,9 @@
-"""From actions to primitive tasks to the task: measured estimates into the stochastic view, and R,
-C and J back out of it.
+"""From actions to primitive tasks to the task: put measured estimates into the stochastic view, and
+read R, C and J of the task from its solution.
 
-The net decides how numbers compose: branches, loops, races and recoveries are the stochastic view's
-(docs/analysis.md). Where the net is a mere series, all must come to the conjunctive product R = R_1
-R_2 ..., C = C_1 + C_2 + ..., which is kept as a cross-check.
+The net decides how numbers compose: branches, loops, races and recoveries are handled by the
+stochastic view (docs/analysis.md). If the net is a mere series, the results must equal the
+conjunctive product R = R_1 R_2 ..., C = C_1 + C_2 + ..., which is computed as a cross-check.
 """
 
 from __future__ import annotations
@@ -21,17 +21,21 @@ from petrobot.coordinator.analysis.net.space import Limits
 from petrobot.coordinator.analysis.time.stochastic import Measured, is_cause, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
-from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge
+from petrobot.coordinator.learning.estimate import CENSORED, Tally, merge_tallies
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import cost_weight, objective
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
 
-# Competing risks: how runs end and when, where some were cut off (O. O. Aalen and S. Johansen, Scand. J. Statistics 5 (1978)).
+# --- competing risks ---
+
+# How runs end and when, although some were cut off: O. O. Aalen and S. Johansen, Scandinavian
+# Journal of Statistics 5 (1978) 141-150.
 
 
 @dataclass(frozen=True)
 class Incidence:
-    """One cause: at `times` (s, increasing) its cumulative incidence has grown to `reached`."""
+    """Cumulative incidence of one cause: by time `times[i]` (s, increasing) the probability of
+    having ended by this cause has reached `reached[i]`."""
 
     times: Array
     reached: Array
@@ -48,7 +52,7 @@ class Incidence:
 
     @property
     def cv(self) -> float:
-        """Standard deviation over mean, given this cause."""
+        """Standard deviation over mean of that time."""
         mean = self.mean
         return sqrt(max(0.0, float(self.times**2 @ self._mass()) - mean**2)) / mean if mean else 0.0
 
@@ -57,44 +61,49 @@ class Incidence:
 
 
 def incidences(times: Sequence[float], causes: Sequence[str | None]) -> dict[str, Incidence]:
-    """Cumulative incidence of each cause; None: cut off. `times` in s.
+    """Estimate the cumulative incidence of each cause by the method of Aalen and Johansen. `times`
+    in s; cause None: the run was cut off (censored).
 
-    What is left of S behind the last time (it was cut off) goes to the causes in proportion to what
-    they have: more is not known of it.
+    If the longest runs were cut off, some probability is left after the last end. It is given to
+    the causes in proportion to what they have: nothing more is known about it.
     """
     at = np.sort(np.asarray(times, dtype=float))
     of = [cause for _, cause in sorted(zip(times, causes, strict=True), key=lambda pair: pair[0])]
     moments, first = np.unique(at, return_index=True)
-    going = len(at) - first
+    active = len(at) - first
     known = sorted({c for c in of if c is not None})
     ended = {c: np.zeros(len(moments)) for c in known}
     for i, cause in zip(np.searchsorted(moments, at).tolist(), of, strict=True):
         if cause is not None:
             ended[cause][i] += 1
-    hazard: Array = np.add.reduce([np.zeros(len(moments)), *ended.values()]) / going
+    # Hazard of ending at each time by any cause, and the probability of still running before it
+    # (Kaplan-Meier); a cause gains that probability times its own hazard.
+    hazard: Array = np.add.reduce([np.zeros(len(moments)), *ended.values()]) / active
     before = np.concatenate([[1.0], np.cumprod(1.0 - hazard)[:-1]]) if len(moments) else np.zeros(0)
-    curves = {c: np.cumsum(before * d / going) for c, d in ended.items()}
+    curves = {c: np.cumsum(before * d / active) for c, d in ended.items()}
     whole = sum(float(curve[-1]) for curve in curves.values())
     return {c: Incidence(moments, curve / whole) for c, curve in curves.items()}
 
 
-Choice = Mapping[str, Mapping[str, float]]
+ChoiceShares = Mapping[str, Mapping[str, float]]
 SHORTEST = 1e-3
-"""Seconds that an end takes at least in the stochastic view, which knows no duration 0."""
+"""Shortest duration (s) in the stochastic view, which does not allow a duration of 0."""
 
 
-# --- in ---------------------------------------------------------------------------------------
+# --- estimates into the stochastic view ---
 
 
 def measured_from(
-    task: Task, estimates: Estimates, context: str | None = None, choice: Choice | None = None
+    task: Task, estimates: Estimates, context: str | None = None, choice: ChoiceShares | None = None
 ) -> Measured:
-    """What the stochastic view needs, from estimates of one context (None: of all together).
+    """Return the input of the stochastic view from estimates of one context (None: of all contexts
+    together).
 
-    `choice` are the selector's probabilities by primitive task; None: the alternatives were chosen
-    as often as they ran. Runs of a preempted place are competing risks of their own ends and the
-    events or timers that preempt them. What preempts as soon as the marking allows it (another run
-    has ended) is no such risk but a mere cut-off, as an abort is: the net says when.
+    `choice`: the selector's probabilities by primitive task; None: each alternative is chosen as
+    often as it ran. For a place whose runs can be preempted, the ends of its runs and the events or
+    timers that preempt them are competing risks. A transition that preempts as soon as the marking
+    allows it (another run ended) is not a risk; it only cuts the run off, as an abort does, and the
+    net says when.
     """
     runs: dict[tuple[str, str], dict[Status, Estimate]] = {}
     preempted: dict[tuple[str, str], dict[str, Estimate]] = {}
@@ -104,7 +113,7 @@ def measured_from(
             continue
         takers = _preempting(task, place.name)
         for action, by_context in estimates.of(place.task, context).items():
-            tally = reduce(merge, by_context.values(), Tally())
+            tally = reduce(merge_tallies, by_context.values(), Tally())
             started = tally.runs + tally.censored + sum(tally.not_executed.values())
             if not tally.runs and not tally.censored:
                 continue
@@ -123,7 +132,7 @@ def measured_from(
 
 
 def _preempting(task: Task, place: str) -> set[str]:
-    """Transitions by which a run in a place may end at a time of their own."""
+    """Return the transitions that can end a run in a place at a time of their own."""
     return {
         t.name
         for t in task.flat.transitions.values()
@@ -132,30 +141,31 @@ def _preempting(task: Task, place: str) -> set[str]:
 
 
 def _ends(tally: Tally, takers: set[str]) -> tuple[dict[Status, Estimate], dict[str, Estimate]]:
-    """Laws of a run's own ends by status, and of its preemptions by transition."""
+    """Return the duration distributions of a run's own ends by status, and of its preemptions by
+    transition."""
     causes = {exit_: _cause(exit_, takers) for exit_ in tally.durations}
     extra = tally.waited.mean if tally.waited.n else 0.0
-    laws = _exact(tally, causes) if None not in causes.values() else _incident(tally, causes)
+    ends = _exact(tally, causes) if None not in causes.values() else _incident(tally, causes)
     own = {
         Status(c): Estimate(
-            law.share,
-            max(law.mean + extra, SHORTEST),
-            law.cv * law.mean / max(law.mean + extra, SHORTEST),
+            end.share,
+            max(end.mean + extra, SHORTEST),
+            end.cv * end.mean / max(end.mean + extra, SHORTEST),
         )
-        for c, law in laws.items()
+        for c, end in ends.items()
         if not c.startswith("by:")
     }
     by = {
-        c.removeprefix("by:"): Estimate(law.share, max(law.mean, SHORTEST), law.cv)
-        for c, law in laws.items()
+        c.removeprefix("by:"): Estimate(end.share, max(end.mean, SHORTEST), end.cv)
+        for c, end in ends.items()
         if c.startswith("by:")
     }
     return _with_missing(own, by, tally, extra)
 
 
 def _cause(exit_: str, takers: set[str]) -> str | None:
-    """By what a run ended: a status, `by:` a transition; None: it was cut off, and would have ended
-    otherwise."""
+    """Return what ended a run: a status, or `by:` and a transition; None if it was cut off and
+    would have ended otherwise."""
     status, _, transition = exit_.partition(":")
     if not transition:
         return None if status == CENSORED else status
@@ -163,60 +173,62 @@ def _cause(exit_: str, takers: set[str]) -> str | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Law:
+class _EndShare:
     share: float
     mean: float
     cv: float
 
 
-def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | Incidence]:
-    """Nothing was cut off: relative frequencies and the moments as they were summed."""
+def _exact(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndShare | Incidence]:
+    """Estimate from relative frequencies and exact moments: no run was cut off."""
     whole = sum(m.n for m in tally.durations.values())
     out: dict[str, Any] = {}
     for cause in sorted({c for c in causes.values() if c is not None}):
         parts = [tally.durations[e] for e, c in causes.items() if c == cause]
         moments = reduce(lambda a, b: a.merged(b), parts)
-        out[cause] = _Law(moments.n / whole, moments.mean, moments.cv)
+        out[cause] = _EndShare(moments.n / whole, moments.mean, moments.cv)
     return out
 
 
-def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _Law | Incidence]:
-    """Some runs were cut off: Aalen-Johansen over the kept sample, at a constant rate beyond its
-    longest run."""
+def _incident(tally: Tally, causes: Mapping[str, str | None]) -> dict[str, _EndShare | Incidence]:
+    """Estimate by Aalen-Johansen over the sampled runs, with a constant rate beyond the longest
+    one: some runs were cut off."""
     kept = tally.sample.kept
     times, ends = [k.seconds for k in kept], [causes.get(k.exit) for k in kept]
     left, longest = unended(times, ends)
     found = incidences(times, ends)
+    # -log(left) / longest is the mean hazard up to the longest run; it continues beyond it
+    # (B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974).
     if not 0.0 < left < 1.0 or longest <= 0.0:
         return dict(found)
-    return {c: _with_tail(law, left, longest, longest / -log(left)) for c, law in found.items()}
+    return {c: _with_tail(end, left, longest, longest / -log(left)) for c, end in found.items()}
 
 
 def unended(times: Sequence[float], causes: Sequence[str | None]) -> tuple[float, float]:
-    """Probability that a run has not ended by the longest time seen (Kaplan and Meier's estimate),
-    and that time (s)."""
-    left, going = 1.0, len(times)
+    """Return the probability that a run has not ended by the longest observed time (Kaplan-Meier
+    estimate), and that time (s)."""
+    left, active = 1.0, len(times)
     for _, cause in sorted(
         zip(times, causes, strict=True), key=lambda pair: (pair[0], pair[1] is None)
     ):
-        left *= 1.0 if cause is None else 1.0 - 1.0 / going
-        going -= 1
+        left *= 1.0 if cause is None else 1.0 - 1.0 / active
+        active -= 1
     return left, max(times, default=0.0)
 
 
-def _with_tail(law: Incidence, left: float, longest: float, mean: float) -> _Law:
-    """A law whose part `left` ends after `longest` s, by an exponential time of this mean (s)
-    later."""
-    first = (1 - left) * law.mean + left * (longest + mean)
-    own = (law.cv**2 + 1) * law.mean**2
+def _with_tail(end: Incidence, left: float, longest: float, mean: float) -> _EndShare:
+    """Return a distribution of which the part `left` ends after `longest` s, by an exponential time
+    of this mean (s) later."""
+    first = (1 - left) * end.mean + left * (longest + mean)
+    own = (end.cv**2 + 1) * end.mean**2
     second = (1 - left) * own + left * (longest**2 + 2 * longest * mean + 2 * mean**2)
-    return _Law(law.share, first, sqrt(max(0.0, second - first**2)) / first)
+    return _EndShare(end.share, first, sqrt(max(0.0, second - first**2)) / first)
 
 
 def _with_missing(
     own: dict[Status, Estimate], by: dict[str, Estimate], tally: Tally, extra: float
 ) -> tuple[dict[Status, Estimate], dict[str, Estimate]]:
-    """Runs that never began take the error branch, though they do not count in R."""
+    """Send runs that never began to the error branch, although they do not count in R."""
     available = tally.availability
     if available == 1.0:
         return own, by
@@ -240,7 +252,7 @@ def _shares(often: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, flo
 
 
 def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """Mean wait (s) for each event of a transition that only waits: waited seconds over
+    """Return the mean wait (s) for each event of a transition that only waits: waited seconds over
     occurrences."""
     waited: dict[str, list[float]] = {}
     for key, flow in estimates.flows.items():
@@ -258,8 +270,8 @@ def _waits(task: Task, estimates: Estimates, context: str | None) -> dict[str, f
 
 
 def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str, float]:
-    """How often each transition with a condition fired: relative frequencies among those that
-    compete."""
+    """Return how often each transition with a condition fired: relative frequencies among those
+    that compete."""
     fired: dict[str, float] = {}
     for key, flow in estimates.flows.items():
         transition = task.flat.transitions.get(key.transition)
@@ -269,13 +281,13 @@ def _switches(task: Task, estimates: Estimates, context: str | None) -> dict[str
     return fired
 
 
-# --- out --------------------------------------------------------------------------------------
+# --- figures of the task out of it ---
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
-    """A primitive task, its alternatives mixed as they are chosen: R, mean C, J, and expected runs
-    in one mission run."""
+class PrimitiveFigures:
+    """Figures of a primitive task, with its alternatives mixed as they are chosen: R, mean C, J,
+    and the expected number of runs in one mission run."""
 
     primitive_task: str
     reliability: float
@@ -286,21 +298,21 @@ class Part:
 
 @dataclass(frozen=True)
 class Propagated:
-    """R and C of the task. R_conj, R_goal and P_complete are three numbers, not one
+    """R and C of the task. R_conj, R_goal and P_complete are three different numbers
     (docs/analysis.md)."""
 
-    parts: Mapping[str, Part]
+    parts: Mapping[str, PrimitiveFigures]
     forecast: Forecast
     cost: float
-    """Expected cost of a mission run: it adds over runs, parallel branches included. Time is the
-    forecast's, not this."""
+    """Expected cost of a mission run: the sum over its runs, including those of parallel branches.
+    The expected time is in `forecast`."""
     product: float
-    """The conjunctive product over the primitive tasks that a mission run always has: equal to
-    R_conj in a mere series."""
+    """Product of R over the primitive tasks that every mission run contains; equal to R_conj if the
+    net is a mere series."""
 
     @property
     def conjunctive(self) -> float:
-        """R_conj: completed, and every run a SUCCESS."""
+        """R_conj: the task completed and every run was a SUCCESS."""
         return self.forecast.conjunctive_reliability
 
     @property
@@ -318,26 +330,27 @@ def propagate(
     task: Task,
     estimates: Estimates,
     context: str | None = None,
-    choice: Choice | None = None,
+    choice: ChoiceShares | None = None,
     *,
     measure: str | None = None,
     limits: Limits | None = None,
 ) -> Propagated:
-    """R, C and J of primitive tasks and of the whole task, from actions' estimates through the net.
+    """Compute R, C and J of the primitive tasks and of the whole task from estimates of actions,
+    through the net.
 
-    `measure` is the cost to add up (None: what each primitive task declares, so its unit may differ
-    by part and the task's sum is only meaningful if it does not). Raises NoEstimate and ValueError
-    as the stochastic view does.
+    `measure`: the cost to add up; None: what each primitive task declares, so units may differ
+    between primitive tasks, and the sum over the task means something only if they do not. Raises
+    NoEstimate and ValueError as the stochastic view does.
     """
     measured = measured_from(task, estimates, context, choice)
     solved = forecast(stochastic_view(task, measured), limits=limits)
     visits = _visits(solved)
-    parts: dict[str, Part] = {}
+    parts: dict[str, PrimitiveFigures] = {}
     for name, primitive in task.primitive_tasks.items():
         places = [p.name for p in task.flat.places.values() if p.task == name]
         runs = sum(n for (place, _), n in visits.items() if place in places)
         by_context = estimates.of(name, context)
-        tallies = {a: reduce(merge, by_context[a].values(), Tally()) for a in by_context}
+        tallies = {a: reduce(merge_tallies, by_context[a].values(), Tally()) for a in by_context}
         part = _part(name, tallies, measured.choice.get(name, {}), measure or primitive.cost, runs)
         if part is not None:
             parts[name] = part
@@ -348,8 +361,9 @@ def propagate(
 
 def _part(
     name: str, tallies: Mapping[str, Tally], shares: Mapping[str, float], measure: str, runs: float
-) -> Part | None:
-    """The alternatives of a primitive task mixed; None where none that is chosen was measured."""
+) -> PrimitiveFigures | None:
+    """Return the figures of a primitive task; None if no alternative that is chosen was
+    measured."""
     used = [a for a, share in shares.items() if share > 0 and a in tallies and tallies[a].runs]
     if not used:
         return None
@@ -357,7 +371,7 @@ def _part(
     costed = [a for a in used if a in costs]
     r = _mixed(shares, {a: tallies[a].availability * tallies[a].reliability for a in used})
     c = _mixed(shares, {a: costs[a] for a in costed}) if costed else nan
-    return Part(name, r, c, objective(r, c, cost_weight(costs.values())), runs)
+    return PrimitiveFigures(name, r, c, objective(r, c, cost_weight(costs.values())), runs)
 
 
 def _mixed(shares: Mapping[str, float], values: Mapping[str, float]) -> float:
@@ -366,7 +380,7 @@ def _mixed(shares: Mapping[str, float], values: Mapping[str, float]) -> float:
 
 
 def _visits(solved: Forecast) -> dict[tuple[str, str], float]:
-    """Expected runs of each (place, action) in one mission run."""
+    """Return the expected number of runs of each (place, action) in one mission run."""
     net = solved.chain.gspn.net
     count = sum_by(solved.chain.label, solved.flow, len(net.transitions))
     actions = {(p, a) for p, a, _ in solved.view.statuses.values()}

@@ -1,4 +1,4 @@
-"""What learning learns from: records of choices, ends of runs, corrected verdicts and passages, as
+"""The records that a task learns from: choices, ends of runs, corrected verdicts and firings; as
 plain data and back."""
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ class Choice:
 
 
 @dataclass(frozen=True, slots=True)
-class End:
-    """A run has ended."""
+class RunEnd:
+    """A run ended."""
 
     primitive_task: str
     action: str
@@ -32,7 +32,7 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A deferred verdict replaces the status of a run that had ended."""
+    """A deferred verdict replaces the status of a run that ended before."""
 
     primitive_task: str
     action: str
@@ -41,8 +41,8 @@ class Correction:
     status: Status
     cause: str = ""
     age: int = 0
-    """Trials of the primitive task in this context since that run ended: of what fades, so much
-    less is corrected."""
+    """Trials of the primitive task in this context since that run ended. A rule whose sums fade
+    corrects less of an old trial."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +52,15 @@ class Passage:
     transition: str
     context: str
     waited: float | None = None
-    """Seconds from the marking that enabled it to its firing, for transitions that only wait for
+    """Seconds from the marking that enabled it to its firing, for transitions that wait only for
     events."""
 
 
-Record = Choice | End | Correction | Passage
+Record = Choice | RunEnd | Correction | Passage
 
 
 def to_plain(record: Record) -> dict[str, Any]:
-    """Plain data for journals and tables."""
+    """Return a record as plain data for journals and tables."""
     if isinstance(record, Passage):
         return {
             "kind": "Passage",
@@ -73,7 +73,7 @@ def to_plain(record: Record) -> dict[str, Any]:
         "action": record.action,
         "context": record.context,
     }
-    if isinstance(record, End):
+    if isinstance(record, RunEnd):
         return {"kind": "End", **about, "outcome": _observation(record.outcome)}
     if isinstance(record, Correction):
         verdict = {"status": record.status.value, "cause": record.cause, "age": record.age}
@@ -82,7 +82,7 @@ def to_plain(record: Record) -> dict[str, Any]:
 
 
 def of_plain(data: Mapping[str, Any]) -> Record:
-    """What `to_plain` gave. Raises ValueError or KeyError."""
+    """Read what `to_plain` returned. Raises ValueError or KeyError."""
     kind = data["kind"]
     if kind == "Passage":
         return Passage(str(data["transition"]), str(data["context"]), data["waited"])
@@ -90,11 +90,11 @@ def of_plain(data: Mapping[str, Any]) -> Record:
     if kind == "Choice":
         return Choice(*about)
     if kind == "End":
-        return End(*about, _observed(data["outcome"]))
+        return RunEnd(*about, _observed(data["outcome"]))
     if kind == "Correction":
         verdict = (Status(data["status"]), str(data["cause"]), int(data.get("age", 0)))
         return Correction(*about, _observed(data["was"]), *verdict)
-    raise ValueError(f"{kind!r} is no record of learning")
+    raise ValueError(f"kind: expected Choice, End, Correction or Passage, got {kind!r}")
 
 
 def _observation(seen: Observation) -> dict[str, Any]:

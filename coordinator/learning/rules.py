@@ -1,4 +1,21 @@
-"""What a learning rule is: how it chooses and how it moves, for many learners at once."""
+"""Learning rules for many learners at once: fixed choices, bandit rules and learning automata.
+
+Sources:
+
+- Nikolic and Fu: Z. J. Nikolic and K. S. Fu, "An algorithm for learning without external
+  supervision and its application to learning control systems", IEEE Trans. Automatic Control AC-11
+  (1966) 414-422; used for robotic tasks by P. U. Lima and G. N. Saridis, Design of Intelligent
+  Control Systems Based on Hierarchical Stochastic Automata, World Scientific 1996.
+- Linear reward-inaction: K. S. Narendra and M. A. L. Thathachar, Learning Automata, Prentice Hall
+  1989 (S-model: payoffs in [0, 1]).
+- Discretised pursuit: B. J. Oommen and J. K. Lanctot, "Discretized pursuit learning automata", IEEE
+  Trans. Systems, Man and Cybernetics 20 (1990) 931-938 (reward-inaction).
+- UCB1: P. Auer, N. Cesa-Bianchi and P. Fischer, "Finite-time analysis of the multiarmed bandit
+  problem", Machine Learning 47 (2002) 235-256.
+- Thompson sampling: W. R. Thompson, Biometrika 25 (1933) 285-294.
+- Change detection in `Tracking`: E. S. Page, "Continuous inspection schemes", Biometrika 41 (1954)
+  100-115 (CUSUM).
+"""
 
 from __future__ import annotations
 
@@ -8,123 +25,132 @@ from typing import Protocol
 import numpy as np
 from scipy.special import betaincinv
 
-from petrobot.coordinator.learning.batch import Array, Batch, Index, Mask, Response
+from petrobot.coordinator.learning.batch import (
+    SUMS,
+    Array,
+    Batch,
+    Index,
+    Mask,
+    Response,
+    drawn,
+    restricted,
+)
 
 
 class Rule(Protocol):
-    """A rule has parameters and no state: all state is in the batch, and all chance in the uniform
-    numbers passed in."""
+    """A learning rule has parameters but no state: all state is in the batch, and all randomness is
+    in the uniform numbers that the caller passes in."""
 
     @property
     def name(self) -> str:
-        """How users call it."""
+        """Name of the rule on the command line."""
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Learners that know nothing."""
+        """Create learners without any experience."""
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
-        """With which each action is chosen next, shape (rows, n)."""
+        """Return the probability of each action for the next choice, shape (rows, n)."""
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """The next action of each row. `u` are uniform numbers in [0, 1) of shape (rows, n);
-        nothing changes."""
+        """Choose the next action of each row. `u`: uniform numbers in [0, 1), shape (rows, n).
+        Changes nothing."""
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Learn from a trial of each row. Only eligible actions (None: all) may be taken for the
-        best."""
+        """Learn from one trial of each row. Only eligible actions (None: all) may count as best."""
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Why the first row would choose this action: a few words and numbers."""
+        """Explain in a few words why the first row would choose this action."""
 
 
 def forced(batch: Batch, offered: Mask, least: float) -> tuple[Mask, Index]:
-    """Rows in which some offered action has been chosen fewer than `least` times, and the least
-    chosen one of each row."""
+    """Find the rows in which some offered action was chosen fewer than `least` times. Also returns
+    the least chosen offered action of each row."""
     tries = np.where(offered, batch.tries, np.inf)
     return tries.min(axis=1) < least, np.argmin(tries, axis=1)
 
 
 def one_hot(action: Index, n: int) -> Array:
-    """1 at the action of each row, else 0."""
+    """Return an array (rows, n) with 1 at the action of each row and 0 elsewhere."""
     out = np.zeros((len(action), n))
     out[np.arange(len(action)), action] = 1.0
     return out
 
 
-# Rules that count but do not learn: a fixed choice, and each alternative in turn.
+# --- rules that count but do not learn ---
 
 
 @dataclass(frozen=True)
 class Fixed:
-    """Always the first alternative that is offered."""
+    """Always choose the first offered alternative."""
 
     name: str = "fixed"
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Nothing known, and no need to."""
+        """Create learners; the rule needs no experience."""
         return Batch.fresh(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
-        """Certain."""
+        """Return 1 for the first offered action."""
         return one_hot(np.argmax(offered, axis=1), batch.n)
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """The first."""
+        """Choose the first offered action."""
         first: Index = np.argmax(offered, axis=1)
         return first
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Count only."""
+        """Only count the trial."""
         batch.counting(trial)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """No reason."""
+        """Give no numbers: the choice does not depend on any."""
         return "the first alternative"
 
 
 @dataclass(frozen=True)
 class RoundRobin:
-    """The offered alternative that was chosen least often; the first of equals."""
+    """Choose the offered alternative that was chosen least often; the first of equals."""
 
     name: str = "round_robin"
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Nothing chosen yet."""
+        """Create learners without any choice counted."""
         return Batch.fresh(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
-        """In the long run: equal shares."""
+        """Return the long-run shares, which are equal."""
         shares: Array = offered / offered.sum(axis=1, keepdims=True)
         return shares
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """The next one in turn."""
+        """Choose the next action in turn."""
         return forced(batch, offered, np.inf)[1]
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Count only."""
+        """Only count the trial."""
         batch.counting(trial)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """How often it was chosen."""
+        """Say how often the action was chosen."""
         return f"chosen least often so far, {batch.tries[0, action]:g} times"
 
 
-# Bandit rules: they choose by what is known and how well, and keep no probabilities of their own.
+# --- bandit rules: they choose by estimates and their uncertainty, not by learned probabilities ---
 
 POINTS = 512
-"""Fixed points at which Thompson's choice probabilities are worked out for people and forecasts."""
+"""Number of fixed points at which Thompson's choice probabilities are evaluated for displays and
+forecasts."""
 
 
 def _follow(batch: Batch, eligible: Mask | None) -> None:
-    """p of a bandit rule: all on what it would recommend now, for people and for a frozen
-    selector."""
+    """Put all of p on the action that a bandit rule recommends now; displays and frozen selectors
+    read it."""
     batch.p[:] = one_hot(batch.best(eligible), batch.n)
 
 
 def _allowed(batch: Batch, offered: Mask) -> Mask:
-    """Offered actions, without those that a target reliability rules out unless that leaves
-    none."""
+    """Return the offered actions that a target reliability does not rule out; all offered ones if
+    it rules out every one of them."""
     ruled_out = batch.own["ruled_out"] > 0
     left: Mask = offered & ~ruled_out
     return np.where(left.any(axis=1, keepdims=True), left, offered)
@@ -145,19 +171,20 @@ def _learn(batch: Batch, trial: Response, eligible: Mask | None) -> None:
 
 @dataclass(frozen=True)
 class UCB1:
-    """The action with the largest mean payoff + sqrt(width * 2 ln k / n_a); the payoff is affine in
-    J, within [0, 1]."""
+    """Choose the action with the largest mean payoff + sqrt(width * 2 ln k / n_a). The payoff is an
+    affine function of J in [0, 1]."""
 
     name: str = "ucb1"
     width: float = 1.0
-    """1 is Auer's bound for payoffs anywhere in [0, 1]."""
+    """Scale of the bonus; 1 is Auer's bound for arbitrary payoffs in [0, 1]."""
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Nothing known."""
+        """Create learners without any experience."""
         return _begin(rows, n, rho)
 
     def index(self, batch: Batch) -> Array:
-        """Upper confidence bound of each action's mean payoff; inf where it was never tried."""
+        """Return the upper confidence bound of the mean payoff of each action; inf where it was
+        never tried."""
         weight = batch.weight()
         gain = batch.availability() * batch.reliability()
         mean = np.where(
@@ -170,11 +197,11 @@ class UCB1:
         return np.where(n > 0, mean + bonus, np.inf)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
-        """Certain."""
+        """Return 1 for the action that will be chosen: the rule is deterministic."""
         return one_hot(self._next(batch, offered), batch.n)
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """The largest index; an untried action first."""
+        """Choose an untried action first, then the one with the largest upper bound."""
         return self._next(batch, offered)
 
     def _next(self, batch: Batch, offered: Mask) -> Index:
@@ -183,11 +210,11 @@ class UCB1:
         return np.where(owed, least, np.argmax(bound, axis=1))
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Count."""
+        """Count the trial and update the recommendation."""
         _learn(batch, trial, eligible)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Its bound."""
+        """Give the upper bound."""
         bound = float(self.index(batch)[0, action])
         return (
             "never tried" if bound == np.inf else f"largest upper bound {bound:.3f} of the payoff"
@@ -196,17 +223,18 @@ class UCB1:
 
 @dataclass(frozen=True)
 class Thompson:
-    """The lowest J after drawing each R from its posterior Beta(1 + successes, 1 + others); costs
-    are taken as their means."""
+    """Draw R of each action from its posterior Beta(1 + successes, 1 + other runs) and choose the
+    lowest J. Costs enter as their means."""
 
     name: str = "thompson"
 
     def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
-        """Nothing known: a uniform prior of each R."""
+        """Create learners with a uniform prior for each R."""
         return _begin(rows, n, rho)
 
     def probabilities(self, batch: Batch, offered: Mask) -> Array:
-        """Shares of the choices over fixed points of a low-discrepancy sequence."""
+        """Estimate the choice probabilities at fixed points of a low-discrepancy sequence, so that
+        the same state always shows the same numbers."""
         ratio = 1.0 / _plastic(batch.n) ** np.arange(1, batch.n + 1)
         share = np.zeros_like(batch.p)
         for i in range(POINTS):
@@ -215,8 +243,9 @@ class Thompson:
         return share / POINTS
 
     def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
-        """Draw each R by the inverse of its posterior, and compare J. Untried actions are taken to
-        cost what the cheapest does."""
+        """Draw each R by the inverse of its posterior distribution and compare J. An untried action
+        is assumed to cost as much as the cheapest known one."""
+        # betaincinv(a, b, u) is the u-quantile of Beta(a, b)
         r = betaincinv(1 + batch.successes, 1 + batch.runs - batch.successes, u)
         known = np.where(batch.costed > 0, batch.mean_cost(), np.inf)
         cheapest = known.min(axis=1, keepdims=True)
@@ -226,19 +255,312 @@ class Thompson:
         return lowest
 
     def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
-        """Count."""
+        """Count the trial and update the recommendation."""
         _learn(batch, trial, eligible)
 
     def says(self, batch: Batch, offered: Mask, action: int) -> str:
-        """Its posterior."""
+        """Give the posterior distribution."""
         good, runs = batch.successes[0, action], batch.runs[0, action]
         return f"lowest J with R drawn from Beta({1 + good:g}, {1 + runs - good:g})"
 
 
 def _plastic(n: int) -> float:
-    """The root above 1 of x^(n+1) = x + 1: generator of an even additive sequence in n dimensions
-    (M. Roberts, 2018)."""
-    x = 2.0
+    """Return the root above 1 of x^(n+1) = x + 1, which generates an evenly spread additive
+    sequence in n dimensions (M. Roberts, "The unreasonable effectiveness of quasirandom sequences",
+    2018)."""
+    x = 2.0  # fixed-point iteration; it converges for every n >= 1, 64 steps are plenty
     for _ in range(64):
         x = (1.0 + x) ** (1.0 / (n + 1))
     return x
+
+
+# --- learning automata ---
+
+
+@dataclass(frozen=True)
+class NikolicFu:
+    """The scheme of the paper: estimate R and C of the chosen action, order all actions by J, and
+    move p towards the best one: p_i += gamma_k (lambda_i - p_i), where lambda is 1 at the lowest J
+    and 0 elsewhere, and gamma_k = min(1, c / (k + k0)^exponent), k = 1, 2, ...
+
+    Each action is first chosen `trials` times. With `mixing` m > 0, actions are drawn from (1 -
+    eps_k) p + eps_k e with eps_k = min(1, m n / k). The distribution e explores: a share `even` is
+    spread evenly over all actions, the rest over the contenders, that is, actions whose J minus
+    `focus` standard errors is not above the smallest J plus `focus` standard errors. The textbook
+    gain has exponent 1, 0 < c <= 1 and no mixing; docs/learning.md says which parameters converge
+    with probability 1.
+    """
+
+    name: str = "nikolic_fu"
+    c: float = 1.0
+    k0: float = 1.0
+    exponent: float = 1.0
+    mixing: float = 0.0
+    trials: int = 5
+    even: float = 1.0
+    focus: float = 2.0
+
+    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
+        """Create learners with all actions equally likely."""
+        return Batch.fresh(rows, n, rho)
+
+    def gain(self, k: Array) -> Array:
+        """Return gamma at trial k."""
+        gamma: Array = np.minimum(1.0, self.c / (k + self.k0) ** self.exponent)
+        return gamma
+
+    def exploration(self, batch: Batch) -> Array:
+        """Return eps of the next trial, shape (rows, 1)."""
+        if not self.mixing:
+            return np.zeros((len(batch.k), 1))
+        eps: Array = np.minimum(1.0, self.mixing * batch.n / (batch.k + 1.0))[:, None]
+        return eps
+
+    def explored(self, batch: Batch) -> Array:
+        """Return the shares e of the actions in exploration, shape (rows, n)."""
+        if self.even >= 1.0:
+            return np.full_like(batch.p, 1.0 / batch.n)
+        # Samples are spent where the order is in doubt: an action contends while its confidence
+        # interval of J reaches below the smallest upper bound. An untried action contends, too.
+        j, error = batch.objective(), self.focus * batch.spread()
+        contends = j - error <= np.min(j + error, axis=1, keepdims=True)
+        contends |= np.isinf(j)
+        shares: Array = contends / contends.sum(axis=1, keepdims=True)
+        return self.even / batch.n + (1.0 - self.even) * shares
+
+    def probabilities(self, batch: Batch, offered: Mask) -> Array:
+        """Return p mixed with exploration; 1 for the action that still needs one of its first
+        trials."""
+        mixed = batch.p
+        if self.mixing:
+            eps = self.exploration(batch)
+            mixed = (1 - eps) * batch.p + eps * self.explored(batch)
+        mixed = restricted(mixed, offered)
+        if not self.trials:
+            return mixed
+        owed, least = forced(batch, offered, self.trials)
+        return np.where(owed[:, None], one_hot(least, batch.n), mixed)
+
+    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
+        """Draw an action from `probabilities`."""
+        return drawn(self.probabilities(batch, offered), u[:, 0])
+
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
+        """Update the estimates, order the actions by J, move p towards the best one."""
+        batch.counting(trial)
+        target = one_hot(batch.best(eligible), batch.n)
+        batch.p += self.gain(batch.k)[:, None] * (target - batch.p)
+
+    def says(self, batch: Batch, offered: Mask, action: int) -> str:
+        """Say which of its first trials this is, or with which probability it was drawn."""
+        owed, _ = forced(batch, offered, self.trials)
+        if owed[0]:
+            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}"
+        share = self.probabilities(batch, offered)[0, action]
+        eps = float(self.exploration(batch)[0, 0])
+        return f"drawn with {share:.3f}" + (f", exploring {eps:.2f}" if eps else "")
+
+
+@dataclass(frozen=True)
+class RewardInaction:
+    """L_R-I: p of the chosen action grows by step * payoff * (1 - p) and the others shrink; without
+    payoff nothing changes.
+
+    It chooses without estimates. It ends at some action with probability 1, and at the best one
+    with a probability that approaches 1 as the step approaches 0 (epsilon-optimal).
+    """
+
+    name: str = "reward_inaction"
+    step: float = 0.02
+
+    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
+        """Create learners with all actions equally likely."""
+        return Batch.fresh(rows, n, rho)
+
+    def probabilities(self, batch: Batch, offered: Mask) -> Array:
+        """Return p over the offered actions."""
+        return restricted(batch.p, offered)
+
+    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
+        """Draw an action from `probabilities`."""
+        return drawn(self.probabilities(batch, offered), u[:, 0])
+
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
+        """Move p towards the chosen action in proportion to its payoff, unless that action is not
+        eligible."""
+        batch.counting(trial)
+        pay = batch.payoff(trial)
+        if eligible is not None:
+            allowed = eligible[np.arange(len(pay)), trial.action] | ~eligible.any(axis=1)
+            pay = pay * allowed
+        batch.p += (self.step * pay)[:, None] * (one_hot(trial.action, batch.n) - batch.p)
+
+    def says(self, batch: Batch, offered: Mask, action: int) -> str:
+        """Give the probability with which the action was drawn."""
+        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}"
+
+
+@dataclass(frozen=True)
+class DiscretisedPursuit:
+    """DP_R-I: after each success, move p in steps of 1 / (n * resolution) towards the action with
+    the lowest J.
+
+    Each action is first tried `trials` times, so that the estimates mean something.
+    """
+
+    name: str = "discretised_pursuit"
+    resolution: int = 20
+    trials: int = 10
+
+    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
+        """Create learners with all actions equally likely."""
+        return Batch.fresh(rows, n, rho)
+
+    def probabilities(self, batch: Batch, offered: Mask) -> Array:
+        """Return p over the offered actions; 1 for the action that still needs one of its first
+        trials."""
+        owed, least = forced(batch, offered, self.trials)
+        return np.where(owed[:, None], one_hot(least, batch.n), restricted(batch.p, offered))
+
+    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
+        """Draw an action from `probabilities`."""
+        return drawn(self.probabilities(batch, offered), u[:, 0])
+
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
+        """Move p towards the best estimate if the trial succeeded and all first trials are done."""
+        batch.counting(trial)
+        # All other actions give up one step; the best one gets what they gave up.
+        best = batch.best(eligible)
+        step = 1.0 / (batch.n * self.resolution)
+        moved = np.maximum(batch.p - step, 0.0)
+        rows = np.arange(len(best))
+        moved[rows, best] = 0.0
+        moved[rows, best] = 1.0 - moved.sum(axis=1)
+        over = batch.tries.min(axis=1) >= self.trials
+        rewarded = (trial.success > 0) & trial.executed & over
+        batch.p = np.where(rewarded[:, None], moved, batch.p)
+
+    def says(self, batch: Batch, offered: Mask, action: int) -> str:
+        """Say which of its first trials this is, or with which probability it was drawn."""
+        owed, _ = forced(batch, offered, self.trials)
+        if owed[0]:
+            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}"
+        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}"
+
+
+# CUSUM sums of the change test: one for each direction of each observed quantity.
+TESTS = ("success_up", "success_down", "cost_up", "cost_down")
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """The scheme of Nikolic and Fu for a changing world. It follows changes, and therefore does not
+    converge with probability 1.
+
+    The sums fade by 1 - 1 / `memory` at each trial; gain and probabilities have floors. A CUSUM
+    test on success and cost of each action ignores changes below `slack`, adds up what exceeds it
+    and raises an alarm at `threshold`; it starts after `settle` runs. An alarm restarts the
+    estimates.
+    """
+
+    name: str = "tracking"
+    memory: float = 300.0
+    exponent: float = 0.7
+    gain_floor: float = 0.04
+    probability_floor: float = 0.02
+    trials: int = 5
+    slack: float = 0.15
+    threshold: float = 8.0
+    settle: int = 15
+
+    def begin(self, rows: int, n: int, rho: float | None = None) -> Batch:
+        """Create learners without any experience, and the state of the change test."""
+        batch = Batch.fresh(rows, n, rho)
+        for name in (*TESTS, "seen", "seen_success", "seen_cost"):
+            batch.own[name] = np.zeros((rows, n))
+        batch.own["restarts"] = np.zeros((rows, 1))
+        return batch
+
+    def probabilities(self, batch: Batch, offered: Mask) -> Array:
+        """Return p raised to its floor; 1 for the action that still needs one of its first trials
+        since the last restart."""
+        floor = min(self.probability_floor, 1.0 / batch.n)
+        mixed = restricted((1 - floor * batch.n) * batch.p + floor, offered)
+        owed, least = forced(batch, offered, self.trials)
+        return np.where(owed[:, None], one_hot(least, batch.n), mixed)
+
+    def choose(self, batch: Batch, offered: Mask, u: Array) -> Index:
+        """Draw an action from `probabilities`."""
+        return drawn(self.probabilities(batch, offered), u[:, 0])
+
+    def learn(self, batch: Batch, trial: Response, eligible: Mask | None = None) -> None:
+        """Fade the sums, update the estimates, test for a change, order the actions by J, move
+        p."""
+        keep = 1.0 - 1.0 / self.memory
+        for name in SUMS[1:]:
+            getattr(batch, name)[:] *= keep
+        batch.counting(trial)
+        self._restart(batch, self._alarm(batch, trial))
+        gain = np.maximum(self.gain_floor, np.minimum(1.0, 1.0 / batch.k**self.exponent))
+        batch.p += gain[:, None] * (one_hot(batch.best(eligible), batch.n) - batch.p)
+
+    def correcting(self, batch: Batch, action: int, change: float, age: int) -> float:
+        """Return how much of a corrected success is still in the faded sums, for the trial `age`
+        trials ago; one row only.
+
+        It is 0 for a trial before the last restart. The mean that the change test keeps since the
+        restart does not fade, so it is corrected in full.
+        """
+        # A restart sets k to 1, so after one the number of trials since then is k - 1.
+        since = batch.k[0] - (batch.own["restarts"][0, 0] > 0)
+        if age >= since:
+            return 0.0
+        seen, met = (batch.own[name][0] for name in ("seen", "seen_success"))
+        met[action] = min(max(0.0, met[action] + change), seen[action])
+        left: float = change * (1.0 - 1.0 / self.memory) ** age
+        return left
+
+    def _alarm(self, batch: Batch, trial: Response) -> Mask:
+        """Return the rows in which success or cost of the chosen action has left its mean since the
+        restart."""
+        at = (np.arange(len(batch.k)), trial.action)
+        own, executed = batch.own, trial.executed
+        scale = np.maximum(batch.mean_cost().max(axis=1), 1e-300)
+        cost = np.where(np.isnan(trial.cost), 0.0, trial.cost)
+        own["seen"][at] += executed
+        own["seen_success"][at] += executed * trial.success
+        own["seen_cost"][at] += executed * cost
+        seen = np.maximum(own["seen"][at], 1.0)
+        # Costs have any unit, so their test is on costs divided by the largest mean cost.
+        moves = (
+            trial.success - own["seen_success"][at] / seen,
+            (cost - own["seen_cost"][at] / seen) / scale,
+        )
+        ready = executed & (own["seen"][at] > self.settle)
+        alarm = np.zeros(len(batch.k), dtype=bool)
+        for name, move in zip(TESTS, (moves[0], -moves[0], moves[1], -moves[1]), strict=True):
+            grown = np.maximum(0.0, own[name][at] + np.where(ready, move - self.slack, 0.0))
+            own[name][at] = grown
+            alarm |= grown > self.threshold
+        return alarm
+
+    def _restart(self, batch: Batch, alarm: Mask) -> None:
+        """Forget the sums of the rows with an alarm. The probabilities stay: they are the best
+        guess until something better is known."""
+        if not alarm.any():
+            return
+        for name in SUMS:
+            getattr(batch, name)[alarm] = 0.0
+        for name in (*TESTS, "seen", "seen_success", "seen_cost"):
+            batch.own[name][alarm] = 0.0
+        batch.own["restarts"][alarm] += 1
+        batch.k[alarm] = 1.0
+
+    def says(self, batch: Batch, offered: Mask, action: int) -> str:
+        """Say which of its first trials since the restart this is, or with which probability it was
+        drawn."""
+        restarts = batch.own["restarts"][0, 0]
+        since = f", {restarts:g} changes of the world noticed" if restarts else ""
+        if forced(batch, offered, self.trials)[0][0]:
+            return f"trial {batch.tries[0, action] + 1:.0f} of its first {self.trials}{since}"
+        return f"drawn with {self.probabilities(batch, offered)[0, action]:.3f}{since}"

@@ -1,38 +1,41 @@
-"""Selectors of one primitive task: a rule, its learners by context, the target reliability, and
-what people may do to them.
+"""Selectors of one primitive task: a rule, one learner for each context, the target reliability,
+and the controls of the user.
 
-A selector chooses one of the alternatives and says why with its numbers. It learns from `update`
-alone, so whoever keeps the choices and the ends of runs can derive its state again.
+A selector chooses one of the alternatives and explains the choice with its numbers. It learns only
+from `chosen`, `update` and `correct`, so its state can be derived again from stored choices and
+ends of runs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
-from petrobot.coordinator.learning.automata import (
-    DiscretisedPursuit,
-    NikolicFu,
-    RewardInaction,
-    Tracking,
-)
 from petrobot.coordinator.learning.batch import SUMS, Batch, Mask, Response
 from petrobot.coordinator.learning.estimate import COUNT, Observation, Tally
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.rules import UCB1, Fixed, RoundRobin, Rule, Thompson
+from petrobot.coordinator.learning.rules import (
+    UCB1,
+    DiscretisedPursuit,
+    Fixed,
+    NikolicFu,
+    RewardInaction,
+    RoundRobin,
+    Rule,
+    Thompson,
+    Tracking,
+)
 from petrobot.coordinator.task import Executed, Status
-
-# Which actions meet a target reliability, for many learners at once: the lower confidence bound decides, with hysteresis.
 
 
 def eligible(batch: Batch, target: float, before: Mask, level: float = 0.95) -> Mask:
-    """Actions that meet the target now, shape (rows, n), given those that did `before`.
+    """Return the actions that meet the target now, shape (rows, n), given those that did `before`.
 
-    An action comes in when Wilson's lower bound of its R reaches the target and goes out when R
-    itself falls below.
+    An action enters when Wilson's lower bound of its R reaches the target, and leaves when R itself
+    falls below it (hysteresis, as in `objective.admitted`, here for many learners at once).
     """
     z = float(ndtri(0.5 * (1 + level)))
     n = np.maximum(batch.runs, 1e-9)
@@ -56,38 +59,16 @@ RULES: Mapping[str, Callable[[], Rule]] = {
     "fixed": Fixed,
     "round_robin": RoundRobin,
 }
-"""Every selector by the name that users give."""
+"""All selectors by the name that users give."""
 DEFAULT = "nikolic_fu_fast"
 
 
-class Selector(Protocol):
-    """Chooses among the alternatives of one primitive task, and learns from how runs end."""
-
-    name: str
-
-    def choose(
-        self, context: str, alternatives: Sequence[str], rng: np.random.Generator
-    ) -> tuple[str, str]:
-        """One of the alternatives, and why. Changes nothing."""
-
-    def chosen(self, context: str, action: str) -> None:
-        """An action was chosen, by this selector or by somebody else."""
-
-    def update(self, context: str, action: str, outcome: Observation) -> None:
-        """A run has ended."""
-
-    def state(self) -> dict[str, Any]:
-        """All that it has learned, as plain data."""
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state()`. Raises ValueError if it does not fit."""
-
-
 class RuleSelector:
-    """Implements `Selector` with a rule: one learner for each context, all over the same actions.
+    """Chooses among the alternatives of one primitive task by a rule, and learns from how runs end:
+    one learner for each context, all over the same actions.
 
-    `question` gives cost measure, target reliability and rho. `frozen`: nothing is learned, and the
-    learned best is chosen.
+    `question` gives cost measure, target reliability and rho. `frozen`: learn nothing and choose
+    the learned best.
     """
 
     def __init__(
@@ -101,12 +82,12 @@ class RuleSelector:
         self.learners: dict[str, Batch] = {}
 
     def learner(self, context: str) -> Batch:
-        """The learner of a context; one that knows nothing if it has learned nothing yet (it is not
-        kept then)."""
+        """Return the learner of a context; a new one, which is not stored, if nothing was learned
+        there yet."""
         return self.learners[context] if context in self.learners else self._fresh(self.actions)
 
     def _kept(self, context: str) -> Batch:
-        """The learner of a context, to be taught."""
+        """Return the learner of a context, stored so that it can learn."""
         return self.learners.setdefault(context, self.learner(context))
 
     def _fresh(self, actions: Sequence[str]) -> Batch:
@@ -119,7 +100,8 @@ class RuleSelector:
     def choose(
         self, context: str, alternatives: Sequence[str], rng: np.random.Generator
     ) -> tuple[str, str]:
-        """One of the alternatives, and why."""
+        """Choose one of the alternatives and say why. Changes nothing. Raises ValueError if none of
+        them is known."""
         batch, offered = self.learner(context), self._offered(alternatives)
         if self.frozen:
             action = int(np.argmax(np.where(offered, self._learned(batch), -1.0)[0]))
@@ -132,7 +114,7 @@ class RuleSelector:
         ], f"{self.name}: {why}; {self._figures(batch, action)}{_of(context)}"
 
     def _learned(self, batch: Batch) -> np.ndarray:
-        """p; for rules that count only, all on the lowest J."""
+        """Return p; for rules that do not learn, 1 for the lowest J."""
         if isinstance(self.rule, Fixed | RoundRobin):
             return np.eye(batch.n)[batch.best()]
         return batch.p
@@ -141,12 +123,13 @@ class RuleSelector:
         offered = np.array([[name in alternatives for name in self.actions]])
         if not offered.any():
             raise ValueError(
-                f"none of {', '.join(alternatives)} is among {', '.join(self.actions)}"
+                f"none of {', '.join(alternatives)} is a known action; "
+                f"known: {', '.join(self.actions)}"
             )
         return offered
 
     def _figures(self, batch: Batch, action: int) -> str:
-        """J of the chosen action and the lowest J, from the sums."""
+        """Describe J of the chosen action and the lowest J, from the sums."""
         if not batch.k[0]:
             return "nothing known yet"
         j, best = batch.objective()[0], int(batch.best()[0])
@@ -160,7 +143,8 @@ class RuleSelector:
     def probabilities(
         self, context: str, alternatives: Sequence[str] | None = None
     ) -> dict[str, float]:
-        """With which each alternative (None: all) is chosen next in a context."""
+        """Return the probability of each alternative (None: of all) for the next choice in a
+        context."""
         batch = self.learner(context)
         offered = self._offered(self.actions if alternatives is None else alternatives)
         if self.frozen:
@@ -171,24 +155,24 @@ class RuleSelector:
         )
 
     def learned(self, context: str) -> dict[str, float]:
-        """The learned probabilities p, without exploration."""
+        """Return the learned probabilities p, without exploration."""
         return dict(
             zip(self.actions, self._learned(self.learner(context))[0].tolist(), strict=True)
         )
 
     def objective(self, context: str) -> dict[str, float]:
-        """J of each action from the learner's own sums; inf where it was never tried."""
+        """Return J of each action from the learner's own sums; inf where it was never tried."""
         return dict(zip(self.actions, self.learner(context).objective()[0].tolist(), strict=True))
 
     # --- learning -----------------------------------------------------------------------------
 
     def chosen(self, context: str, action: str) -> None:
-        """Count a choice."""
+        """Count a choice, by this selector or by anyone else."""
         if not self.frozen and action in self.actions:
             self._kept(context).choosing(np.array([self.actions.index(action)]))
 
     def update(self, context: str, action: str, outcome: Observation) -> None:
-        """Learn from a run; a censored one teaches nothing."""
+        """Learn from a run that ended; a censored one teaches nothing."""
         if self.frozen or not self.learns_from(action, outcome):
             return
         batch, missing = self._kept(context), _is_missing(outcome)
@@ -201,8 +185,8 @@ class RuleSelector:
         self.rule.learn(batch, trial, self._eligible(batch))
 
     def learns_from(self, action: str, outcome: Observation) -> bool:
-        """Whether a run is a trial: of one of the actions, and neither censored nor cancelled
-        before it began."""
+        """Return whether a run is a trial: of one of the actions, and neither censored nor
+        cancelled before it began."""
         if action not in self.actions:
             return False
         return _is_missing(outcome) or (
@@ -210,7 +194,7 @@ class RuleSelector:
         )
 
     def _eligible(self, batch: Batch) -> Mask | None:
-        """Actions that meet the target, judged on what was known before this trial."""
+        """Return the actions that meet the target, judged by what was known before this trial."""
         if self.question.target is None:
             return None
         before = batch.own["admitted"] > 0
@@ -219,11 +203,11 @@ class RuleSelector:
         return now
 
     def correct(self, context: str, action: str, was: Status, status: Status, age: int = 0) -> None:
-        """A deferred verdict on the run `age` trials ago: the sums change once; what was chosen
-        meanwhile stays chosen.
+        """Apply a deferred verdict on the run `age` trials ago: the sums change once, choices made
+        since then stay.
 
-        As much is corrected as the sums still hold of that run (a rule may fade or drop them), and
-        a success more or less never leaves 0 to all runs.
+        Only what the sums still contain of that run is corrected (a rule may fade or drop them),
+        and the number of successes stays between 0 and the number of runs.
         """
         if self.frozen or action not in self.actions:
             return
@@ -234,8 +218,8 @@ class RuleSelector:
         batch.successes[0, i] = min(max(0.0, batch.successes[0, i] + change), batch.runs[0, i])
 
     def prime(self, context: str, tallies: Mapping[str, Tally]) -> None:
-        """Take the sums over from estimates (other machines' runs came in); rules that fade their
-        sums keep their own."""
+        """Take the sums from estimates, which may contain runs of other machines; rules that fade
+        their sums keep their own."""
         if self.frozen or isinstance(self.rule, Tracking):
             return
         batch = self._kept(context)
@@ -256,7 +240,7 @@ class RuleSelector:
             self.learners.pop(known, None)
 
     def state(self) -> dict[str, Any]:
-        """All that it has learned, as plain data."""
+        """Return everything that was learned, as plain data."""
         return {
             "selector": self.name,
             "actions": list(self.actions),
@@ -268,10 +252,12 @@ class RuleSelector:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a `state()`. Actions that are new are unknown yet, those that are gone are
-        left out."""
+        """Load a `state()`. Actions that are new are unknown at first, those that no longer exist
+        are dropped. Raises ValueError if the state is of another selector or does not fit."""
         if state["selector"] != self.name:
-            raise ValueError(f"a state of {state['selector']}, not of {self.name}")
+            raise ValueError(
+                f"expected a state of selector {self.name}, got one of {state['selector']}"
+            )
         self.frozen = bool(state["frozen"])
         self.learners.clear()
         for context, data in state["learners"].items():
@@ -281,8 +267,8 @@ class RuleSelector:
                 self._take_moved(context, list(state["actions"]), data)
 
     def _take_moved(self, context: str, actions: list[str], data: Mapping[str, Any]) -> None:
-        """A state over other actions: sums go with their actions; a new action gets an equal share,
-        the rest is scaled."""
+        """Load a state over other actions: sums stay with their actions; a new action gets an equal
+        share of p, and the other shares are scaled."""
         batch, old = self._kept(context), self._fresh(actions)
         old.take_plain(data)
         pairs = [(i, actions.index(a)) for i, a in enumerate(self.actions) if a in actions]
@@ -293,17 +279,16 @@ class RuleSelector:
             if kept > 0:
                 batch.p[0, i] = old.p[0, j] / kept * len(pairs) / batch.n
         batch.p /= batch.p.sum()
-        # the gain starts again, so that a newcomer can still win; the sums of the others are not
-        # lost
+        # k stays 0: the gain starts again, so that a new action can still win.
 
 
 def _is_missing(outcome: Observation) -> bool:
-    """Whether a run never began although nobody cancelled it."""
+    """Return whether a run never began although nothing cancelled it."""
     return outcome.executed is Executed.NO and outcome.preempted_by is None
 
 
 def cost_of(outcome: Observation, measure: str) -> float:
-    """A run's cost by a measure; nan where it was not measured."""
+    """Return the cost of a run by a measure; nan if it was not measured."""
     if measure == "wall":
         return outcome.seconds
     if measure == COUNT:
@@ -314,9 +299,9 @@ def cost_of(outcome: Observation, measure: str) -> float:
 
 
 def make(name: str, actions: Iterable[str], question: Question | None = None) -> RuleSelector:
-    """A selector by its name. Raises ValueError for an unknown one."""
+    """Create a selector by its name. Raises ValueError for an unknown one."""
     if name not in RULES:
-        raise ValueError(f"no selector {name!r}; there are: {', '.join(RULES)}")
+        raise ValueError(f"unknown selector {name!r}; choose one of {', '.join(RULES)}")
     return RuleSelector(RULES[name](), actions, question)
 
 

@@ -1,5 +1,5 @@
-"""One mission run that learns: opened on an estimates file, written down for a resume, and saved
-once."""
+"""Learning of one mission run: opened on an estimates file, described in the journal for a resume,
+and saved once."""
 
 from __future__ import annotations
 
@@ -9,34 +9,35 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learner import Contexts, LearningSelector, usual_contexts
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.records import Correction, End
+from petrobot.coordinator.learning.records import Correction, RunEnd
 from petrobot.coordinator.learning.selectors import DEFAULT, RULES
 from petrobot.coordinator.task import Task
 
 
 @dataclass(frozen=True)
 class LearningSetting:
-    """How a mission run learns. `contexts`: what is told apart (None: the regime, if the task has
-    one)."""
+    """How a mission run learns. `contexts`: what distinguishes contexts (None: the regime, if the
+    task has one)."""
 
     path: Path
     selector: str = DEFAULT
     target: float | None = None
-    """Target reliability: among actions that meet it, the lowest J; None: the lowest J of all."""
+    """Target reliability: choose the lowest J among the actions that meet it; None: the lowest J of
+    all."""
     contexts: tuple[str, ...] | None = None
     chosen: Mapping[str, str] = field(default_factory=dict)
     """Actions that the user fixed, by primitive task."""
     frozen: bool = False
-    """Choose by what was learned, and write nothing."""
+    """Choose by what was learned and write nothing."""
     declared: Mapping[str, float] | None = None
-    """Lock step: declared compute time of each action (s)."""
+    """In lock step: declared compute time of each action (s)."""
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data for a journal's header."""
+        """Return plain data for a journal's header."""
         return {
             "path": str(self.path.resolve()),
             "selector": self.selector,
@@ -49,7 +50,7 @@ class LearningSetting:
 
     @classmethod
     def of_plain(cls, data: Mapping[str, Any]) -> LearningSetting:
-        """What `to_plain` gave."""
+        """Read what `to_plain` returned."""
         contexts = None if data["contexts"] is None else tuple(data["contexts"])
         given = (
             data["selector"],
@@ -63,11 +64,11 @@ class LearningSetting:
 
 
 class LearningSession:
-    """The learning of one mission run, between an estimates file and the executor.
+    """Learning of one mission run, between an estimates file and the executor.
 
-    `begun`: the selectors' states and the generation when the run began, as `beginning()` gave them
-    (for a resumed run; None: as the file has them). Raises EstimatesError, ContextError,
-    ValueError.
+    `begun`: for a resumed run, the selectors' states and the generation at the beginning of the
+    run, as `beginning()` returned them; None: as the file has them. Raises EstimatesError,
+    ContextError or ValueError.
     """
 
     def __init__(
@@ -78,12 +79,15 @@ class LearningSession:
         begun: Mapping[str, Any] | None = None,
     ) -> None:
         if setting.selector not in RULES:
-            raise ValueError(f"no selector {setting.selector!r}; there are: {', '.join(RULES)}")
+            raise ValueError(
+                f"unknown selector {setting.selector!r}; choose one of {', '.join(RULES)}"
+            )
         self.setting = setting
         self.file = EstimatesFile(setting.path)
         if setting.frozen and not setting.path.exists():
             raise EstimatesError(
-                f"{setting.path}: no such file, so nothing was learned to be frozen; learn first"
+                f"{setting.path}: no such file: nothing was learned that could be frozen; run with "
+                "--learn and without --frozen first"
             )
         kept = self.file.read()
         contexts = usual_contexts(task) if setting.contexts is None else Contexts(setting.contexts)
@@ -105,15 +109,15 @@ class LearningSession:
         )
 
     def beginning(self) -> dict[str, Any]:
-        """Plain data from which a resumed run derives the same choices again."""
+        """Return plain data from which a resumed run derives the same choices again."""
         begun = {"token": self._token, "generation": self._generation, "selectors": self._begun}
         return {**self.setting.to_plain(), **begun}
 
     def save(self, *, interrupted: bool = False) -> int:
-        """Add what was learned to the file; gives the number of runs that were counted.
+        """Add what was learned to the file and return the number of counted runs.
 
-        `interrupted`: the mission run may be resumed; what is saved of it now will not be counted
-        again then.
+        `interrupted`: the mission run may be resumed; what is saved now will not be counted a
+        second time then.
         """
         if self.setting.frozen:
             return 0
@@ -126,10 +130,12 @@ class LearningSession:
         return sum(t.runs + t.censored for t in gained.tallies.values())
 
     def _gained_after(self, done: int) -> tuple[Estimates, Sequence[Correction]]:
-        """What came after so many records, and the verdicts in it on runs that the file has counted
-        already."""
+        """Return what was learned after so many records, and the verdicts among them on runs that
+        the file has already counted."""
         counted = {
-            id(record.outcome) for record in self.selector.records[:done] if isinstance(record, End)
+            id(record.outcome)
+            for record in self.selector.records[:done]
+            if isinstance(record, RunEnd)
         }
         gained, late = Estimates(), []
         for record in self.selector.records[done:]:
@@ -143,12 +149,12 @@ class LearningSession:
 def _learning(
     task: Task,
     setting: LearningSetting,
-    kept: Kept,
+    kept: FileContents,
     states: Mapping[str, Mapping[str, Any]] | None,
     salt: str,
 ) -> Learning:
-    """`salt` names the session, so that its runs in the kept sample are told from any other's, a
-    copied file's included."""
+    """Create the learning state. `salt` names the session, so that its runs in the sample differ
+    from those of any other session, including one on a copied file."""
     question = Question(target=setting.target)
     learning = Learning(task, setting.selector, question, kept.estimates, salt)
     try:
@@ -166,20 +172,18 @@ def _learning(
 
 
 def session_of(task: Task, header: Mapping[str, Any]) -> LearningSession | None:
-    """The session of a recorded run, as it began; None if it did not learn. Raises EstimatesError,
-    ValueError."""
+    """Recreate the session of a recorded run as it began; None if the run did not learn. Raises
+    EstimatesError or ValueError."""
     begun = header.get("learning")
     if begun is None:
         return None
     try:
         return LearningSession(task, LearningSetting.of_plain(begun), header["seed"], begun)
     except (KeyError, TypeError) as fault:
-        raise ValueError(
-            f"the journal's header says in `learning` how the run learned, but not all: {fault}"
-        ) from fault
+        raise ValueError(f"the journal's header: `learning` is incomplete: {fault}") from fault
 
 
 def fixed_by_user(header: Mapping[str, Any]) -> Mapping[str, str]:
-    """The actions that the user of a recorded run had fixed."""
+    """Return the actions that the user of a recorded run had fixed."""
     chosen: Mapping[str, str] = header.get("chosen", {})
     return chosen

@@ -1,8 +1,8 @@
-"""Count, mean and spread of a stream of numbers, mergeable and correctable.
+"""Statistics of a stream of numbers that can be merged and corrected, and confidence intervals.
 
 Updating and merging follow T. F. Chan, G. H. Golub and R. J. LeVeque, "Algorithms for computing the
-sample variance", The American Statistician 37 (1983): no catastrophic cancellation, whatever the
-order of merges.
+sample variance", The American Statistician 37 (1983) 242-247: no catastrophic cancellation,
+whatever the order of merges.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.special import betaincinv, ndtri
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """`m2` is the sum of squared deviations from the mean. Immutable."""
+    """Count, mean, extremes and `m2`, the sum of squared deviations from the mean. Immutable."""
 
     n: int = 0
     mean: float = 0.0
@@ -27,7 +27,7 @@ class Moments:
 
     @property
     def total(self) -> float:
-        """The sum of all numbers."""
+        """Sum of all numbers."""
         return self.n * self.mean
 
     @property
@@ -42,18 +42,18 @@ class Moments:
 
     @property
     def cv(self) -> float:
-        """Standard deviation over mean; 0 where the mean is 0."""
+        """Coefficient of variation: standard deviation over mean; 0 if the mean is 0."""
         return self.deviation / self.mean if self.mean else 0.0
 
     def adding(self, x: float) -> Moments:
-        """With one more number."""
+        """Return the moments with one more number."""
         n = self.n + 1
         delta = x - self.mean
         mean = self.mean + delta / n
         return Moments(n, mean, self.m2 + delta * (x - mean), min(self.low, x), max(self.high, x))
 
     def without(self, x: float) -> Moments:
-        """Without one number that was added before; `low` and `high` stay."""
+        """Return the moments without one number that was added before; `low` and `high` stay."""
         if self.n <= 1:
             return Moments()
         n = self.n - 1
@@ -63,7 +63,7 @@ class Moments:
         )
 
     def merged(self, other: Moments) -> Moments:
-        """Of both streams together."""
+        """Return the moments of both streams together."""
         if not self.n or not other.n:
             return self if self.n else other
         n = self.n + other.n
@@ -73,20 +73,18 @@ class Moments:
         return Moments(n, mean, m2, min(self.low, other.low), max(self.high, other.high))
 
     def to_plain(self) -> list[float]:
-        """Plain data: [n, mean, m2, low, high]; empty for no numbers."""
+        """Return [n, mean, m2, low, high]; an empty list if there are no numbers."""
         return [self.n, self.mean, self.m2, self.low, self.high] if self.n else []
 
     @classmethod
     def of_plain(cls, data: list[float]) -> Moments:
-        """What `to_plain` gave. Raises ValueError or TypeError."""
+        """Read what `to_plain` returned. Raises ValueError or TypeError."""
         if not data:
             return cls()
         n, (mean, m2, low, high) = whole(data[0], "numbers"), (float(x) for x in data[1:])
-        slack = 1e-6 * max(abs(low), abs(high))  # means are rounded
+        slack = 1e-6 * max(abs(low), abs(high))  # a mean may be rounded past an extreme
         if n < 1 or not m2 >= 0 or not low - slack <= mean <= high + slack:
-            raise ValueError(
-                f"{data} are no moments: n >= 1, m2 >= 0 and low <= mean <= high are needed"
-            )
+            raise ValueError(f"{data}: expected n >= 1, m2 >= 0 and low <= mean <= high")
         return cls(n, mean, m2, low, high)
 
 
@@ -94,26 +92,27 @@ EMPTY = Moments()
 
 
 def whole(n: Any, what: str, most: float = inf) -> int:
-    """A count from plain data. Raises ValueError unless it is a whole number from 0 to `most`."""
+    """Check a count from plain data and return it. Raises ValueError unless it is a whole number
+    from 0 to `most`."""
     if isinstance(n, bool) or not isinstance(n, int) or not 0 <= n <= most:
         raise ValueError(
-            f"{n!r} {what}: a whole number from 0{'' if most == inf else f' to {most:g}'} is needed"
+            f"{n!r} {what}: expected a whole number from 0{'' if most == inf else f' to {most:g}'}"
         )
     return n
 
 
 def merged(one: Mapping[Any, Moments], other: Mapping[Any, Moments]) -> dict[Any, Moments]:
-    """Two families of moments merged by key, in sorted order of the keys."""
+    """Merge two families of moments by key; the keys of the result are sorted."""
     keys = sorted({*one, *other})
     return {key: one.get(key, EMPTY).merged(other.get(key, EMPTY)) for key in keys}
 
 
-# Confidence intervals of a probability that is estimated by a relative frequency.
+# --- confidence intervals of a probability estimated by a relative frequency ---
 
 
 def wilson(successes: float, n: float, level: float = 0.95) -> tuple[float, float]:
-    """The score interval of E. B. Wilson (1927): short, its mean coverage is close to `level`; (0,
-    1) for n = 0."""
+    """Score interval of a probability (E. B. Wilson, J. American Statistical Association 22 (1927)
+    209-212). Short; its mean coverage is close to `level`. (0, 1) for n = 0."""
     if n <= 0:
         return 0.0, 1.0
     z = _z(level)
@@ -126,8 +125,8 @@ def wilson(successes: float, n: float, level: float = 0.95) -> tuple[float, floa
 
 
 def clopper_pearson(successes: float, n: float, level: float = 0.95) -> tuple[float, float]:
-    """The exact interval of C. J. Clopper and E. S. Pearson (1934): covers with at least `level`
-    for every probability."""
+    """Exact interval of a probability (C. J. Clopper and E. S. Pearson, Biometrika 26 (1934)
+    404-413). Covers every probability with at least `level`; (0, 1) for n = 0."""
     if n <= 0:
         return 0.0, 1.0
     tail = 0.5 * (1 - level)
@@ -136,6 +135,8 @@ def clopper_pearson(successes: float, n: float, level: float = 0.95) -> tuple[fl
     return low, high
 
 
+# Quantiles of the normal distribution for the usual levels: wilson is called once per action and
+# trial, and a look-up is faster than ndtri.
 _QUANTILES: dict[float, float] = {
     0.95: 1.959963984540054,
     0.9: 1.6448536269514722,
@@ -145,6 +146,6 @@ _QUANTILES: dict[float, float] = {
 
 def _z(level: float) -> float:
     if not 0 < level < 1:
-        raise ValueError(f"a confidence level needs 0 < level < 1, not {level}")
+        raise ValueError(f"confidence level: expected 0 < level < 1, got {level}")
     known = _QUANTILES.get(level)
     return float(ndtri(0.5 * (1 + level))) if known is None else known

@@ -1,1 +1,1 @@
-"""Studies of many runs: campaigns, forecasts made from them, and reports."""
+"""Studies of many runs: campaigns, forecasts from measured runs, and reports."""

@@ -106,22 +106,22 @@ def petrobot(
         ),
         (
             "forecast --compare a b",
-            "a is no forecast: No such file or directory; give a file that `petrobot "
+            "a is not a forecast: No such file or directory; give a file that `petrobot "
             "forecast --out",
         ),
-        ("forecast --compare work.toml b", "work.toml is no forecast: it is no JSON"),
+        ("forecast --compare work.toml b", "work.toml is not a forecast: not JSON"),
         (
             "forecast --compare list.json b",
-            "list.json is no forecast: a table with schema and sha256 is missing",
+            "list.json is not a forecast: expected an object with schema and sha256",
         ),
         ("forecast work.toml --estimates .", "campaign.json: the key 'regimes' is missing"),
         (
             "campaign work.toml --learned nope",
-            "no finished campaign: No such file or directory; give the folder of",
+            "not the result of a finished campaign: No such file or directory; give the folder of",
         ),
         (
             "campaign work.toml --learned .",
-            "result.json: no result of a campaign: selector and policy are missing",
+            "result.json: not the result of a campaign: selector or policy is missing",
         ),
         (
             "campaign --resume work.toml",

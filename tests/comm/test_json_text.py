@@ -19,7 +19,6 @@ from petrobot.services.host.json_text import finite, json_text
 
 ROOT = Path(__file__).parents[2]
 BETWEEN_OWN_PROCESSES = {
-    "coordinator/studies/campaign/cluster.py",
     "coordinator/studies/campaign/pool.py",
     "coordinator/studies/campaign/worker.py",
     "coordinator/learning/estimates_tables.py",

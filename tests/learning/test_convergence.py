@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from petrobot.coordinator.learning.automata import NikolicFu, Tracking
 from petrobot.coordinator.learning.batch import Response
-from petrobot.coordinator.learning.rules import Rule
+from petrobot.coordinator.learning.rules import NikolicFu, Rule, Tracking
 from petrobot.coordinator.learning.selectors import RULES
 from tests.learning.worlds import Played, World, gapped, play
 

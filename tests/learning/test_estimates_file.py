@@ -15,31 +15,30 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.learning.estimate import Key, Observation
-from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, Kept
+from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, TallyKey
+from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile, FileContents
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
 from petrobot.coordinator.learning.selectors import make
-from petrobot.coordinator.learning.waits import Flow, PassageKey
 from petrobot.coordinator.task import Status
 from tests.learning.conftest import OBSERVATIONS, tally_of
 
-KEY = Key("pick", "pick_fast", "regime=A")
-OTHER = Key("place", "place_soft")
+KEY = TallyKey("pick", "pick_fast", "regime=A")
+OTHER = TallyKey("place", "place_soft")
 
 
-def gained(good: int, key: Key = KEY, salt: str = "") -> Estimates:
+def gained(good: int, key: TallyKey = KEY, salt: str = "") -> Estimates:
     """So many successes of one action, and as many firings."""
     tally = tally_of(
         [Observation(Status.SUCCESS, 0.1 * (i + 1), cpu_seconds=0.01) for i in range(good)], salt
     )
-    flow = Flow()
+    flow = Firings()
     for _ in range(good):
         flow = flow.adding(0.02)
-    return Estimates({key: tally}, {PassageKey("sorting", "begin", "regime=A"): flow})
+    return Estimates({key: tally}, {FiringsKey("sorting", "begin", "regime=A"): flow})
 
 
-def file_of(path: Path, good: int, key: Key = KEY) -> EstimatesFile:
+def file_of(path: Path, good: int, key: TallyKey = KEY) -> EstimatesFile:
     """A file with an origin of its own."""
     file = EstimatesFile(path)
     file.add(gained(good, key, path.name), {})
@@ -57,7 +56,7 @@ def test_what_was_added_is_there_again(tmp_path: Path) -> None:
     """Sums of several sessions, selectors' states, the generation; a file that is not there holds
     nothing."""
     path = tmp_path / "deep" / "learned.db"
-    assert EstimatesFile(path).read() == Kept()
+    assert EstimatesFile(path).read() == FileContents()
     selector = make("ucb1", ("pick_fast", "pick_slow"))
     selector.update("regime=A", "pick_fast", Observation(Status.SUCCESS, 1.0))
     for session in range(3):
@@ -66,7 +65,7 @@ def test_what_was_added_is_there_again(tmp_path: Path) -> None:
     assert kept.generation == 3
     assert kept.estimates.tally(KEY).runs == 12
     assert len(kept.estimates.tally(KEY).sample.kept) == 12
-    assert kept.estimates.flows[PassageKey("sorting", "begin", "regime=A")].waits.n == 12
+    assert kept.estimates.flows[FiringsKey("sorting", "begin", "regime=A")].waits.n == 12
     assert kept.states("ucb1") == {"pick": selector.state()}
     assert kept.states("thompson") == {}
 
@@ -196,7 +195,7 @@ def test_a_file_that_was_only_begun_holds_nothing(tmp_path: Path) -> None:
     path = tmp_path / "begun.db"
     path.touch()
     file = EstimatesFile(path)
-    assert file.read() == Kept()
+    assert file.read() == FileContents()
     assert file.records_of("m") == 0
     whole = file_of(tmp_path / "whole.db", 2)
     whole.merge(path)
@@ -330,18 +329,18 @@ def asked_of(path: Path, statement: str) -> Path:
             lambda p: p.write_bytes(b"no database at all, but long enough to be looked at" * 9),
             "not a database",
         ),
-        (lambda p: written(p, "CREATE TABLE songs(name)"), "no estimates file"),
-        (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 99"), "schema 99.*upgrade"),
-        (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 0"), "schema 0.*new file"),
+        (lambda p: written(p, "CREATE TABLE songs(name)"), "not an estimates file"),
+        (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 99"), "got 99.*upgrade"),
+        (lambda p: file_of(p, 2) and written(p, "PRAGMA user_version = 0"), "got 0.*new file"),
         (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = '{}'"), "do not fit"),
         (lambda p: file_of(p, 2) and written(p, "UPDATE tally SET body = 'x'"), "do not fit"),
         (lambda p: file_of(p, 2) and written(p, "DROP TABLE tally"), "no such table"),
         (
             lambda p: asked_of(p, "UPDATE question SET cost = 'pictures'"),
-            "'pictures' is no cost measure",
+            "'pictures' is not a cost measure",
         ),
-        (lambda p: asked_of(p, "UPDATE question SET target = 7"), "7.0 is no target"),
-        (lambda p: asked_of(p, "UPDATE question SET rho = -3"), "-3.0 is no weight"),
+        (lambda p: asked_of(p, "UPDATE question SET target = 7"), "target.*got 7.0"),
+        (lambda p: asked_of(p, "UPDATE question SET rho = -3"), "rho.*got -3.0"),
         (lambda p: p.mkdir(), "unable to open"),
     ],
     ids=[
@@ -381,10 +380,10 @@ def test_a_bad_file_gives_one_clear_error(tmp_path: Path, spoil: Any, said: str)
         ),
         ("tally", '"unknown":0', '"unknown":7', 2, "pick, pick_fast (regime=A): 7 runs of which"),
         ("tally", '"unknown"', '"unheard"', 2, "'unknown' is missing"),
-        ("tally", "{", "{", 999, "version 999 of what was changed 2 times"),
+        ("tally", "{", "{", 999, "expected version 2, the number of changes, got 999"),
         ("flow", "[2,", "[-2,", 999, "transition begin (regime=A): -2 firings"),
-        ("flow", "[2, [2,", "[1, [2,", 1, "2 waits: a whole number from 0 to 1"),
-        ("flow", "[2,", "[2,", 999, "version 999"),
+        ("flow", "[2, [2,", "[1, [2,", 1, "2 waits: expected a whole number from 0 to 1"),
+        ("flow", "[2,", "[2,", 999, "expected version 2"),
     ],
 )
 def test_a_corrupted_file_poisons_no_other(
@@ -454,7 +453,7 @@ def old_file(path: Path, good: int, origin: str) -> EstimatesFile:
         gained(good, salt=origin).tally(KEY),
         state_of("ucb1", {"A": 3}) | {"cost": "value:images"},
     )
-    flow = gained(good).flows[PassageKey("sorting", "begin", "regime=A")]
+    flow = gained(good).flows[FiringsKey("sorting", "begin", "regime=A")]
     with closing(sqlite3.connect(path)) as db, db:
         rows = [("origin", origin), ("generation", "1")]
         db.executemany("INSERT INTO about VALUES (?, ?)", rows)

@@ -13,7 +13,7 @@ import pytest
 
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
-from petrobot.coordinator.learning.records import Correction, End, Record, of_plain, to_plain
+from petrobot.coordinator.learning.records import Correction, Record, RunEnd, of_plain, to_plain
 from petrobot.coordinator.learning.session import LearningSession, LearningSetting, session_of
 from petrobot.coordinator.task import Task
 from tests.run.judged_parts import LEARNED, PARTS, directory, learned, sorting
@@ -142,5 +142,5 @@ def test_records_of_verdicts_are_plain_data_and_back(task: Task, tmp_path: Path)
     records = whole(task, tmp_path / "none.db").selector.records
     judged = [r for r in records if isinstance(r, Correction)]
     assert [of_plain(json.loads(json.dumps(to_plain(r)))) for r in judged] == judged
-    ends = [r for r in records if isinstance(r, End) and r.primitive_task == "pick"]
+    ends = [r for r in records if isinstance(r, RunEnd) and r.primitive_task == "pick"]
     assert {id(r.was) for r in judged} <= {id(r.outcome) for r in ends}

@@ -12,7 +12,7 @@ import pytest
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import Engine
 from petrobot.coordinator.launch import resumed_mission, with_runs
-from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
@@ -174,7 +174,7 @@ def test_without_learn_nothing_is_read_or_changed(cell: Path) -> None:
         (["--selector", "ucb1"], "--selector needs --learn"),
         (["--target", "0.9"], "--target needs --learn"),
         (["--frozen"], "--frozen needs --learn"),
-        (["--learn", "none.db", "--frozen"], "learn first"),
+        (["--learn", "none.db", "--frozen"], "without --frozen first"),
         (["--learn", "mock.toml"], "not a database"),
         (["--learn", "learned.db", "--context", "speed"], "no parameter or variable 'speed'"),
         (["--learn", "learned.db", "--selector", "greedy"], "invalid choice"),
@@ -236,8 +236,8 @@ def test_verbs_of_learned(cell: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["merge", "one.db"], "what?"),
         (["merge", "one.db", "none.db"], "no such file"),
         (["reset", "one.db", "fly"], "no primitive task 'fly'"),
-        (["show", "one.db", "--cost", "pictures"], "no cost measure"),
-        (["show", "one.db", "--cost", "value:"], "no cost measure"),
+        (["show", "one.db", "--cost", "pictures"], "not a cost measure"),
+        (["show", "one.db", "--cost", "value:"], "not a cost measure"),
         (
             ["show", "two.db", "--cost", "value:nosuch"],
             "the results have: value:tries, value:weight",
@@ -278,7 +278,9 @@ def shares(seconds: float, **by_context: tuple[int, int]) -> dict[str, Tally]:
 
 def file_of(path: Path, asked: Question | None = None, **actions: dict[str, Tally]) -> Path:
     """An estimates file of one primitive task."""
-    tallies = {Key("pick", a, c): tally for a, by in actions.items() for c, tally in by.items()}
+    tallies = {
+        TallyKey("pick", a, c): tally for a, by in actions.items() for c, tally in by.items()
+    }
     EstimatesFile(path).add(Estimates(tallies), {}, asked={"pick": asked} if asked else None)
     return path
 
@@ -450,7 +452,7 @@ def test_a_run_that_was_saved_and_resumed_counts_once(tmp_path: Path) -> None:
                 "learning": {k: v for k, v in header["learning"].items() if k != "declared"},
             },
         )
-    assert Key("pick", "pick_slow", "regime=A") in kept.estimates.tallies
+    assert TallyKey("pick", "pick_slow", "regime=A") in kept.estimates.tallies
 
 
 def test_a_resumed_mission_brings_its_selector_to_where_it_was(tmp_path: Path) -> None:

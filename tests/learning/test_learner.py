@@ -16,7 +16,7 @@ import pytest
 from petrobot.coordinator.engine import Engine, Override, State
 from petrobot.coordinator.engine.instructions import Corrected, RunRecorded, StartRun
 from petrobot.coordinator.launch import Setting, lockstep_cell, with_runs
-from petrobot.coordinator.learning.estimate import Key
+from petrobot.coordinator.learning.estimate import TallyKey
 from petrobot.coordinator.learning.learner import (
     ContextError,
     Contexts,
@@ -27,8 +27,8 @@ from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.records import (
     Choice,
     Correction,
-    End,
     Passage,
+    RunEnd,
     of_plain,
     to_plain,
 )
@@ -65,7 +65,7 @@ def test_every_end_and_choice_is_recorded(task: Task) -> None:
             assert tally.count(status) == recorded[key.primitive_task, key.action, status]
         assert tally.censored == recorded[key.primitive_task, key.action, None]
     choices = [r for r in selector.records if isinstance(r, Choice)]
-    assert len(choices) == len([r for r in selector.records if isinstance(r, End)])
+    assert len(choices) == len([r for r in selector.records if isinstance(r, RunEnd)])
     assert [
         of_plain(json.loads(json.dumps(to_plain(r)))) for r in selector.records
     ] == selector.records
@@ -77,11 +77,11 @@ def test_costs_durations_waits_and_values(task: Task) -> None:
     selector = learner(task, "round_robin", seed=1)
     run(task, selector, runs=12)
     known = selector.learning.estimates
-    slow = known.tally(Key("pick", "pick_slow", "regime=A"))
+    slow = known.tally(TallyKey("pick", "pick_slow", "regime=A"))
     assert 0.3 <= slow.wall.low <= slow.wall.high <= 0.41
     assert 0 < slow.waited.mean < 0.05
     assert slow.cpu.n == 0 or slow.cpu.mean >= 0
-    soft = known.tally(Key("place", "place_soft", "regime=A"))
+    soft = known.tally(TallyKey("place", "place_soft", "regime=A"))
     assert soft.cost("value:tries").mean == 2.0
     assert list(soft.values) == ["tries"]
     begin = next(flow for key, flow in known.flows.items() if key.transition == "begin")
@@ -213,7 +213,7 @@ def test_a_deferred_verdict_corrects_r_once(task: Task) -> None:
         deferred=True,
     )
     selector.instruction(0.4, ended)
-    key = Key("pick", "pick_slow", "regime=A")
+    key = TallyKey("pick", "pick_slow", "regime=A")
     assert selector.learning.estimates.tally(key).reliability == 1.0
     verdict = Corrected("pick#1", "pick", "pick_slow", Status.SUCCESS, Status.FAILURE, "crooked")
     for correction in (
@@ -300,7 +300,7 @@ def test_measured_cpu_time_never_steers_in_lock_step(
     )
     selector = LearningSelector(Learning(costly, "round_robin"), seed=1, declared=declared)
     run(costly, selector, runs=9)
-    cpu = selector.learning.estimates.tally(Key("pick", "pick_slow", "regime=A")).cost("cpu")
+    cpu = selector.learning.estimates.tally(TallyKey("pick", "pick_slow", "regime=A")).cost("cpu")
     cost = selector.learning.selectors["pick"].learner("regime=A").mean_cost()[0]
     if declared is None:
         assert 0 <= cpu.mean < 0.25

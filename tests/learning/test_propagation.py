@@ -16,7 +16,7 @@ from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast
 from petrobot.coordinator.launch import with_runs
-from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimate import Observation, Tally, TallyKey
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Estimates, Learning
 from petrobot.coordinator.learning.propagation import incidences, measured_from, propagate
@@ -93,8 +93,8 @@ def test_a_series_comes_to_the_conjunctive_product(
     task, estimates = series(len(rows)), Estimates()
     choice, expected_r, reach, expected_c = {}, 1.0, 1.0, 0.0
     for name, (one, other, share) in zip("abc", rows, strict=False):
-        estimates.tallies[Key(name, f"do_{name}")] = tally(*one)
-        estimates.tallies[Key(name, f"try_{name}")] = tally(*other)
+        estimates.tallies[TallyKey(name, f"do_{name}")] = tally(*one)
+        estimates.tallies[TallyKey(name, f"try_{name}")] = tally(*other)
         choice[name] = {f"do_{name}": share, f"try_{name}": 1 - share}
         mixed = [(share, *one), (1 - share, *other)]
         expected_r *= sum(w * g / (g + b + e) for w, g, b, e, _ in mixed)
@@ -128,7 +128,7 @@ in = ["a:error"]
 out = ["a"]
 """
     )
-    found = propagate(loads(text, "loop"), Estimates({Key("a", "do_a"): tally(3, 0, 1, 2.0)}))
+    found = propagate(loads(text, "loop"), Estimates({TallyKey("a", "do_a"): tally(3, 0, 1, 2.0)}))
     assert found.conjunctive == pytest.approx(0.75)
     assert found.complete == pytest.approx(1.0)
     assert found.parts["a"].runs == pytest.approx(4 / 3)
@@ -141,11 +141,13 @@ def test_what_never_executed_takes_the_error_branch() -> None:
     known = tally(9, 0, 0, 1.0)
     known = known.adding(Observation(Status.ERROR, 0.0, "unreachable", Executed.NO))
     task = replace(series(1))
-    measured = measured_from(task, Estimates({Key("a", "do_a"): known}))
+    measured = measured_from(task, Estimates({TallyKey("a", "do_a"): known}))
     assert known.reliability == 1.0
     assert measured.runs["a", "do_a"][Status.SUCCESS].share == pytest.approx(0.9)
     assert measured.runs["a", "do_a"][Status.ERROR].share == pytest.approx(0.1)
-    assert propagate(task, Estimates({Key("a", "do_a"): known})).conjunctive == pytest.approx(0.9)
+    assert propagate(task, Estimates({TallyKey("a", "do_a"): known})).conjunctive == pytest.approx(
+        0.9
+    )
 
 
 # --- competing risks --------------------------------------------------------------------------
@@ -214,8 +216,8 @@ def test_a_preempting_event_is_a_cause_not_a_race() -> None:
     task, _ = with_runs(sorting(), 1)
     estimates = Estimates(
         {
-            Key("pick", "pick_slow"): tally(1, 0, 0, 0.4),
-            Key("place", "place_soft"): caught_or_missed(100, 93),
+            TallyKey("pick", "pick_slow"): tally(1, 0, 0, 0.4),
+            TallyKey("place", "place_soft"): caught_or_missed(100, 93),
         }
     )
     measured = measured_from(task, estimates)
@@ -271,7 +273,7 @@ def test_an_abort_is_a_mere_cut_off() -> None:
             else Observation(status, end, "why")
         )
         out = out.adding(seen, "x")
-    law = measured_from(series(1), Estimates({Key("a", "do_a"): out})).runs["a", "do_a"]
+    law = measured_from(series(1), Estimates({TallyKey("a", "do_a"): out})).runs["a", "do_a"]
     assert law[Status.SUCCESS].share == pytest.approx(0.7, abs=0.06)
     assert law[Status.SUCCESS].mean == pytest.approx(1.0, abs=0.2)
     assert sum(e.share for e in law.values()) == pytest.approx(1.0)

@@ -1,7 +1,7 @@
-"""What a campaign adds to its cells: CPU seconds a throw in a block and in a bare lock-step cell of
+"""What a campaign adds to its cells: CPU seconds a trial in a block and in a bare lock-step cell of
 the same seeds, in turn.
 
-`python -m tools.bench.campaign [--throws N] [--rounds N]`; the first round of each warms caches and
+`python -m tools.bench.campaign [--trials N] [--rounds N]`; the first round of each warms caches and
 does not count.
 """
 
@@ -15,25 +15,25 @@ from pathlib import Path
 
 from petrobot.coordinator.cli.loading import task_path
 from petrobot.coordinator.launch import Setting, lockstep_cell
-from petrobot.coordinator.studies.campaign.block import Bench, run_block
-from petrobot.coordinator.studies.campaign.plan import Plan
+from petrobot.coordinator.studies.campaign.block import LoadedPlan, run_block
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan
 
 ROOT = Path(__file__).parents[2]
 
 
-def bare(bench: Bench, seed: int, throws: int) -> float:
+def bare(bench: LoadedPlan, seed: int, trials: int) -> float:
     """CPU seconds of `petrobot run` without its terminal and report."""
     begun = time.process_time()
-    cell, party = lockstep_cell(bench.directory, Setting(bench.task, {"regime": "B"}, throws, seed))
+    cell, party = lockstep_cell(bench.directory, Setting(bench.task, {"regime": "B"}, trials, seed))
     cell.run(lambda: party.over, 10_000_000)
     return time.process_time() - begun
 
 
-def block(bench: Bench, seed: int, throws: int) -> float:
+def block(bench: LoadedPlan, seed: int, trials: int) -> float:
     """CPU seconds of the same as a campaign's block."""
     begun = time.process_time()
-    one = replace(bench.plan.blocks[0], seed=seed, count=throws)
-    run_block(bench, one, [{}] * throws)
+    one = replace(bench.plan.blocks[0], seed=seed, count=trials)
+    run_block(bench, one, [{}] * trials)
     return time.process_time() - begun
 
 
@@ -43,14 +43,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--throws", type=int, default=4, metavar="N", help="in each cell (%(default)s)"
+        "--trials", type=int, default=4, metavar="N", help="in each cell (%(default)s)"
     )
     parser.add_argument(
         "--rounds", type=int, default=3, metavar="N", help="that count (%(default)s)"
     )
     options = parser.parse_args()
-    bench = Bench.of(
-        Plan(
+    bench = LoadedPlan.of(
+        CampaignPlan(
             str(task_path("catch_ball")),
             str(ROOT / "services.toml"),
             options.trials,
@@ -63,7 +63,7 @@ def main() -> None:
         times["bare cell"].append(bare(bench, seed, options.trials) / options.trials)
         times["campaign block"].append(block(bench, seed, options.trials) / options.trials)
     for name, spent in times.items():
-        print(f"{name:16}{statistics.mean(spent[1:]):.4f} CPU s a throw")
+        print(f"{name:16}{statistics.mean(spent[1:]):.4f} CPU s a trial")
     ratios = [b / a for a, b in zip(*(spent[1:] for spent in times.values()), strict=True)]
     print(f"{'ratio':16}{statistics.mean(ratios):.3f}  ({', '.join(f'{r:.3f}' for r in ratios)})")
 

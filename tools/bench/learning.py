@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.learning.automata import NikolicFu
 from petrobot.coordinator.learning.batch import Array
-from petrobot.coordinator.learning.rules import Rule
+from petrobot.coordinator.learning.rules import NikolicFu, Rule
 from petrobot.coordinator.learning.selectors import RULES
 from tests.learning.worlds import Played, World, gapped, play
 

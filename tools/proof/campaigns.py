@@ -20,7 +20,7 @@ from typing import Any
 
 from tools.proof.proof import ROOT
 
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.table import TABLE, read_table
 from tests.waiting import Limit
 
@@ -90,7 +90,7 @@ def campaign(sizes: Sizes, name: str, throws: int, seed: int, regime: str, *more
     return result
 
 
-def rows_of(sizes: Sizes, name: str) -> list[Row]:
+def rows_of(sizes: Sizes, name: str) -> list[TrialRow]:
     """The table of a campaign."""
     return list(read_table(sizes.folder / name / TABLE))
 

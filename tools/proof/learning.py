@@ -25,9 +25,9 @@ from tools.proof.proof import ROOT, Proof
 
 from petrobot.coordinator.cli.loading import load_directory, load_task
 from petrobot.coordinator.cli.report import compared
-from petrobot.coordinator.studies.campaign.policies import RoundRobin, offered
-from petrobot.coordinator.studies.campaign.rows import Row
-from petrobot.coordinator.studies.report.campaign_page import Judged, by_combination
+from petrobot.coordinator.studies.campaign.policies import AllCombinations, offered
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.report.campaign_page import CombinationFigures, by_combination
 from petrobot.coordinator.studies.report.comparing import Weighting
 from petrobot.coordinator.task import Task
 
@@ -79,19 +79,23 @@ def learn(sizes: Sizes, options: argparse.Namespace) -> Result:
     }
 
 
-def screened(sizes: Sizes, task: Task, regime: str) -> tuple[list[Row], list[dict[str, str]]]:
+def screened(sizes: Sizes, task: Task, regime: str) -> tuple[list[TrialRow], list[dict[str, str]]]:
     """Throws of all combinations, which take turns, and which of them each was to be."""
     count = 1
     for p in task.primitive_tasks.values():
         count *= len(p.alternatives)
     campaign(sizes, "screen", sizes.of(100, 5) * count, 50, regime, "--selector", "round_robin")
-    rotation = RoundRobin(offered(task, load_directory(sizes.services)), {})
+    rotation = AllCombinations(offered(task, load_directory(sizes.services)), {})
     rows = rows_of(sizes, "screen")
     return rows, [rotation.combination(row.n - 1) for row in rows if row.trial is not None]
 
 
 def best_fixed(
-    sizes: Sizes, task: Task, regime: str, finalists: Sequence[Judged], weighting: Weighting
+    sizes: Sizes,
+    task: Task,
+    regime: str,
+    finalists: Sequence[CombinationFigures],
+    weighting: Weighting,
 ) -> dict[str, str]:
     """The combination with the lowest J: the best few of all on more throws, none of them the
     judge's.
@@ -99,7 +103,7 @@ def best_fixed(
     The costs of the first table, in which every action was run, give the one rho of all J in this
     proof.
     """
-    every: list[Row] = []
+    every: list[TrialRow] = []
     plans: list[dict[str, str]] = []
     for number, one in enumerate(finalists):
         chosen = dict(one.combination)
@@ -107,7 +111,7 @@ def best_fixed(
         rows = [row for row in rows_of(sizes, f"final_{number}") if row.trial is not None]
         every += rows
         plans += [chosen] * len(rows)
-    ranked: list[Judged] = by_combination(task, every, plans, weighting)
+    ranked: list[CombinationFigures] = by_combination(task, every, plans, weighting)
     return dict(ranked[0].combination)
 
 

@@ -1,2 +1,2 @@
-"""Campaigns: many mission runs of a task in parallel lock-step cells, one table row for each run of
-the task."""
+"""Campaigns: many mission runs of a task in parallel lock-step cells, one table row for each
+trial."""

@@ -1,5 +1,5 @@
-"""One block of a campaign: a mission run in a lock-step cell of its own, from plain data to plain
-data."""
+"""Run one block of a campaign: a mission run in a lock-step cell of its own, from plain data to
+plain data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from petrobot.coordinator.launch import (
 from petrobot.coordinator.learning.estimate import COUNT
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.mission import Mission, MissionError
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan, digest
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.trials import CostOf, TrialLog
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError
@@ -36,28 +36,29 @@ from petrobot.services.comm.lockstep.party import TICK, Party
 Weights = Mapping[str, Mapping[str, float]]
 """By primitive task: the probability of each action."""
 LONGEST_TRIAL = 3600.0
-"""Simulated seconds after which a trial counts as one that never ends."""
+"""Simulated seconds after which a trial counts as endless."""
 PLOTS = "plots"
 """Key of a score under which a task declares pictures of its own (docs/campaigns.md)."""
 
 
 @dataclass(frozen=True)
-class Bench:
-    """Everything that the blocks of one plan share: read once in each process."""
+class LoadedPlan:
+    """A plan with its files loaded. All blocks share it; each process loads it once."""
 
-    plan: Plan
+    plan: CampaignPlan
     task: Task
     directory: Directory
 
     @classmethod
-    def of(cls, plan: Plan) -> Bench:
-        """Read the plan's files. Raises CampaignError, also when they are not those that the
-        campaign began with."""
+    def of(cls, plan: CampaignPlan) -> LoadedPlan:
+        """Load the files of a plan. Raises CampaignError, also if a file has changed since the
+        campaign began."""
         for key, said in plan.digests.items():
             path = str(getattr(plan, key))
             if path and digest(path) != said:
                 raise CampaignError(
-                    f"{path} has changed since the campaign began; start it anew in another folder"
+                    f"{path} has changed since the campaign began; restore it, or start a new "
+                    "campaign in another folder"
                 )
         try:
             return cls(plan, load_task(Path(plan.task)), load_directory(Path(plan.services)))
@@ -66,14 +67,14 @@ class Bench:
 
 
 class BlockSelector:
-    """Draws each choice from probabilities that were fixed before the block, keyed by mission seed,
-    trial and occurrence."""
+    """Draws actions from probabilities that were fixed before the block. Each draw depends only on
+    mission seed, trial and occurrence, so it is the same on any worker."""
 
     def __init__(self, seed: int, weights: Sequence[Weights]) -> None:
         self._seed, self._weights = seed, weights
         self._counts: dict[tuple[int, str], int] = {}
         self.trial: Callable[[], int] = lambda: 0
-        """Index of the trial that goes on, from 0."""
+        """Returns the index of the current trial, from 0."""
 
     def choose(
         self,
@@ -82,7 +83,7 @@ class BlockSelector:
         alternatives: tuple[str, ...],
         variables: Mapping[str, Any] | None = None,
     ) -> tuple[str, str]:
-        """One alternative and why."""
+        """Choose one alternative and say why."""
         k = max(0, min(self.trial(), len(self._weights) - 1))
         given = self._weights[k].get(task, {}) if self._weights else {}
         offered = [
@@ -90,6 +91,8 @@ class BlockSelector:
         ]
         if not offered:
             return alternatives[0], "first of the task file"
+        # The generator is keyed by (mission seed, trial, occurrence, primitive task): the draw does
+        # not depend on how many draws other tasks or trials made before it.
         occurrence = self._counts[k, task] = self._counts.get((k, task), -1) + 1
         if len(offered) == 1:
             return offered[0][0], "fixed by the campaign"
@@ -100,12 +103,12 @@ class BlockSelector:
         return offered[index][0], f"drawn with probability {offered[index][1] / bounds[-1]:.3f}"
 
 
-def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
-    """Run a block. `weights`: for each of its trials, the probabilities of each primitive task's
-    actions.
+def run_block(bench: LoadedPlan, block: Block, weights: Sequence[Weights]) -> dict[str, Any]:
+    """Run a block. `weights`: for each of its trials, the probabilities of the actions of each
+    primitive task.
 
-    Gives `trials` (see Trial.to_plain), `score` (one map for each trial), `plots`, `mission_s`,
-    `cpu_s`, `wall_s`, `rss_mb`. Raises CampaignError.
+    Returns `trials` (see Trial.to_plain), `score` (one mapping per trial), `plots`, `mission_s`,
+    `cpu_s`, `wall_s` and `rss_mb`. Raises CampaignError.
     """
     cpu, wall = time.process_time(), time.perf_counter()
     selector = BlockSelector(block.seed, weights)
@@ -119,7 +122,8 @@ def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[st
         limit = round(LONGEST_TRIAL * block.count / TICK)
         if not cell.run(lambda: coordinator.over, limit):
             raise CampaignError(
-                f"seed {block.seed}: not over after {limit * TICK:.0f} s of simulated time"
+                f"seed {block.seed}: not finished after {limit * TICK:.0f} s of simulated time; "
+                "repeat it with `petrobot run --mode lockstep --seed` to see where it hangs"
             )
     except (CellError, MissionError) as fault:
         raise CampaignError(
@@ -143,7 +147,7 @@ def run_block(bench: Bench, block: Block, weights: Sequence[Weights]) -> dict[st
 
 
 def resident_mb() -> float:
-    """Memory that this process holds now (MiB); 0 where the system does not say."""
+    """Return the resident memory of this process (MiB); 0 if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except (OSError, IndexError, ValueError):
@@ -151,7 +155,7 @@ def resident_mb() -> float:
     return round(pages * os.sysconf("SC_PAGE_SIZE") / 2**20, 1)
 
 
-def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission, list[Party]]:
+def _cell(bench: LoadedPlan, block: Block, selector: BlockSelector) -> tuple[Mission, list[Party]]:
     plan, directory = bench.plan, bench.directory
     regime = {"regime": block.regime} if block.regime else {}
     setting = Setting(bench.task, {**plan.parameters, **regime}, block.count, block.seed, selector)
@@ -166,8 +170,8 @@ def _cell(bench: Bench, block: Block, selector: BlockSelector) -> tuple[Mission,
 
 
 def costs(task: Task, directory: Directory) -> CostOf:
-    """The declared cost measure of each primitive task. In lock step computing costs what
-    services.toml declares."""
+    """Return a function that gives the cost of a run by the measure that its primitive task
+    declares. In lock step, CPU time is the compute time declared in services.toml."""
 
     def cost(record: RunRecorded, values: Mapping[str, Any]) -> float | None:
         measure = task.primitive_tasks[record.primitive_task].cost
@@ -183,10 +187,11 @@ def costs(task: Task, directory: Directory) -> CostOf:
 
 
 def scores(score: Mapping[str, Any], count: int) -> list[dict[str, Any]]:
-    """The task's own results for each trial, as `table.column` by the score's lists of rows.
+    """Return the task's own results for each trial, as `table.column` from the score's lists of
+    rows.
 
-    A row belongs to the trial that its `run` says (its `n` if it has none). If no list has such
-    rows and there is only one trial, the plain values of the score are its results, as
+    A row belongs to the trial given by its `run`, or by its `n` if it has no `run`. If no list has
+    such rows and there is only one trial, the plain values of the score are its results, as
     `score.name`.
     """
     out: list[dict[str, Any]] = [{} for _ in range(count)]

@@ -1,5 +1,4 @@
-"""Rows of a campaign's table as estimates and learners take them, and the estimates file made of
-them."""
+"""Convert rows of a campaign's table into estimates, and write the estimates file of a campaign."""
 
 from __future__ import annotations
 
@@ -7,14 +6,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key, Observation, Tally
+from petrobot.coordinator.learning.estimate import Firings, FiringsKey, Observation, Tally, TallyKey
 from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.estimates_tables import CAMPAIGN
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.waits import Flow, PassageKey
 from petrobot.coordinator.studies.campaign.plan import CampaignError
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry
 from petrobot.coordinator.task import Executed, Status, Task
 
@@ -22,18 +20,19 @@ ESTIMATES = "estimates.db"
 
 
 def context_of(regime: str) -> str:
-    """A regime as the context of estimates and selectors; as `petrobot run --learn` names it."""
+    """Return a regime as the context of estimates and selectors, named as `petrobot run --learn`
+    names it."""
     return f"regime={regime}" if regime else ""
 
 
 def regime_of(context: str) -> str:
-    """Back from `context_of`."""
+    """Return the regime of a context made by `context_of`."""
     return context.removeprefix("regime=")
 
 
 def observation(task: Task, run: RunEntry) -> Observation:
-    """A run that was preempted and counts none, or had not ended, is censored. CPU time is what
-    services.toml declares."""
+    """Return a run as an observation. A preempted run that counts none, or a run that did not end,
+    is censored. CPU time is what services.toml declares."""
     measure = task.primitive_task_of(run.place).cost
     preempted = run.cancelled and bool(run.taken)
     return Observation(
@@ -48,13 +47,13 @@ def observation(task: Task, run: RunEntry) -> Observation:
     )
 
 
-def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
-    """Count a row's runs and firings."""
+def add_row(estimates: Estimates, task: Task, row: TrialRow, salt: str) -> None:
+    """Count the runs and firings of a row."""
     if row.trial is None:
         return
     context = context_of(row.regime)
     for run in row.trial.runs:
-        key = Key(task.primitive_task_of(run.place).name, run.action, context)
+        key = TallyKey(task.primitive_task_of(run.place).name, run.action, context)
         name = f"{salt}/{row.regime}/{row.seed}/{row.k}"
         estimates.tallies[key] = estimates.tallies.get(key, Tally()).adding(
             observation(task, run), name
@@ -63,16 +62,16 @@ def add_row(estimates: Estimates, task: Task, row: Row, salt: str) -> None:
     for transition, seconds in row.trial.waits:
         waits.setdefault(transition, []).append(seconds)
     for transition, count in row.trial.fired.items():
-        where = PassageKey(task.name, transition, context)
-        flow = estimates.flows.get(where, Flow())
+        where = FiringsKey(task.name, transition, context)
+        flow = estimates.flows.get(where, Firings())
         known = waits.get(transition, [])
         for i in range(count):
             flow = flow.adding(known[i] if i < len(known) else None)
         estimates.flows[where] = flow
 
 
-def estimates_of(task: Task, rows: Iterable[Row], salt: str) -> Estimates:
-    """The estimates of a whole table. `salt` names the campaign."""
+def estimates_of(task: Task, rows: Iterable[TrialRow], salt: str) -> Estimates:
+    """Return the estimates of a whole table. `salt` names the campaign."""
     made = Estimates()
     for row in rows:
         add_row(made, task, row, salt)
@@ -86,9 +85,10 @@ def write_estimates(
     campaign: str,
     asked: Mapping[str, Question] | None = None,
 ) -> Path:
-    """Write the campaign's runs into its estimates file, under an origin of the campaign's own.
+    """Write the runs of a campaign to its estimates file, under the campaign's own origin, and
+    return its path.
 
-    So merging it twice counts nothing twice, and what others have learned into the file stays.
+    Merging it twice counts nothing twice, and what others have learned into the file stays.
     `asked`: by what the actions of each primitive task are judged. Raises CampaignError.
     """
     path = folder / ESTIMATES

@@ -1,9 +1,9 @@
-"""What a campaign is given, and how it is cut into blocks: the same blocks and seeds whoever does
-them, however many do.
+"""The plan of a campaign, and its division into blocks. Blocks and seeds depend only on the plan,
+not on the number of workers.
 
-A block is one mission run with a few trials in a cell of its own. Trial i of a regime has number
-`k` in the mission run with seed `seed * SEEDS + block`: so `petrobot run TASK --mode lockstep
---seed (that) --runs (the block's)` repeats it alone.
+A block is one mission run of a few trials in its own cell. Its mission seed is `seed * SEEDS +
+block`, and a trial has number `k` in it. So `petrobot run TASK --mode lockstep --seed (mission
+seed) --runs (trials of the block)` repeats a block alone.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from petrobot.services.host.json_text import json_text
 from petrobot.services.host.whole_file import write_whole
 
 SEEDS = 1_000_000
-"""Mission seeds of one campaign seed."""
+"""Mission seeds reserved for each campaign seed."""
 MANIFEST = "campaign.json"
 TABLE = "table.csv"
 SCHEMA = 1
 
 
 class CampaignError(Exception):
-    """A campaign cannot begin or go on; the text names file, key and remedy."""
+    """A campaign cannot begin or continue; the text names file, key and remedy."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A campaign. Paths are kept as given; digests tell whether what they name has changed
-    since."""
+class CampaignPlan:
+    """A campaign. Paths are kept as given; digests tell whether the files have changed since it
+    began."""
 
     task: str
     """Path of the task file."""
@@ -44,36 +44,38 @@ class Plan:
     seed: int = 1
     selector: str = "fixed"
     chosen: Mapping[str, str] = field(default_factory=dict)
-    """The action of each primitive task that is chosen by hand."""
+    """Actions that the user fixed, by primitive task."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     block: int = 5
-    """Trials in one mission run; it changes which trials there are."""
+    """Trials in one mission run; it influences the trials themselves."""
     batch: int = 20
-    """Trials between two updates of what is learned; 0: nothing is learned, so nobody waits."""
+    """Trials between two updates of what is learned; 0: nothing is learned, so no block waits for
+    another."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the selector."""
+    """Options of the selector."""
     mock: str = ""
-    """File of scripted actions, as of `petrobot run --mock`."""
+    """Path of a file of scripted actions, as for `petrobot run --mock`."""
     digests: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of the files above, by key."""
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data for manifest and workers."""
-        return json.loads(json_text({"schema": SCHEMA, **asdict(self)}))  # type: ignore[no-any-return]
+        """Return plain data for manifest and workers."""
+        plain: dict[str, Any] = json.loads(json_text({"schema": SCHEMA, **asdict(self)}))
+        return plain
 
     @classmethod
-    def from_plain(cls, data: Mapping[str, Any]) -> Plan:
-        """Back from `to_plain`. Raises CampaignError for another schema."""
+    def from_plain(cls, data: Mapping[str, Any]) -> CampaignPlan:
+        """Read what `to_plain` returned. Raises CampaignError for another schema."""
         if data.get("schema") != SCHEMA:
             raise CampaignError(
-                f"{MANIFEST}: schema {data.get('schema')!r}, this petrobot writes {SCHEMA}"
+                f"{MANIFEST}: schema: expected {SCHEMA}, got {data.get('schema')!r}"
             )
         given = {key: value for key, value in data.items() if key != "schema"}
         return cls(**{**given, "regimes": tuple(given["regimes"])})
 
     @property
     def blocks(self) -> list[Block]:
-        """All blocks in the order of the table: the regimes take turns."""
+        """All blocks in the order of the table: the regimes alternate."""
         counts = [
             self.runs // len(self.regimes) + (r < self.runs % len(self.regimes))
             for r in range(len(self.regimes))
@@ -100,8 +102,8 @@ class Plan:
 
     @property
     def batches(self) -> Iterator[list[Block]]:
-        """Blocks whose choices are drawn from one state: `batch` trials or a little more, all of
-        them if nothing is learned."""
+        """Blocks whose choices are drawn from the same state: `batch` trials or slightly more; all
+        blocks if nothing is learned."""
         blocks, batch = self.blocks, []
         for block in blocks:
             batch.append(block)
@@ -114,46 +116,46 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A mission run of a campaign."""
+    """One mission run of a campaign."""
 
     index: int
-    """In the order of the table, from 0."""
+    """Index in the order of the table, from 0."""
     number: int
-    """In its regime, from 0: its seed depends on this alone."""
+    """Index within its regime, from 0; the mission seed depends only on this."""
     regime: str
     first: int
-    """Trials of the campaign before it."""
+    """Number of trials of the campaign before this block."""
     regime_first: int
-    """Trials of its regime before it."""
+    """Number of trials of its regime before this block."""
     count: int
     seed: int
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return asdict(self)
 
 
 def digest(path: Path | str) -> str:
-    """SHA-256 of a file. Raises CampaignError when it cannot be read."""
+    """Return the SHA-256 of a file. Raises CampaignError if it cannot be read."""
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError as fault:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
 
 
-def write_manifest(folder: Path, plan: Plan) -> None:
-    """Keep the plan beside its table."""
+def write_manifest(folder: Path, plan: CampaignPlan) -> None:
+    """Write the plan beside its table."""
     write_whole(folder / MANIFEST, json_text(plan.to_plain(), indent=2) + "\n")
 
 
-def read_manifest(folder: Path) -> Plan:
-    """The plan of a campaign's folder. Raises CampaignError."""
+def read_manifest(folder: Path) -> CampaignPlan:
+    """Read the plan from a campaign's folder. Raises CampaignError."""
     path = folder / MANIFEST
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(data, Mapping):
-            raise ValueError(f"a {type(data).__name__} is no plan")
-        return Plan.from_plain(data)
+            raise ValueError(f"expected a JSON object, got a {type(data).__name__}")
+        return CampaignPlan.from_plain(data)
     except (FileNotFoundError, NotADirectoryError) as fault:
         remedy = "give a folder that `petrobot campaign --out FOLDER` wrote"
         raise CampaignError(
@@ -164,22 +166,22 @@ def read_manifest(folder: Path) -> Plan:
     except (KeyError, ValueError, TypeError, AttributeError) as fault:
         said = f"the key {fault} is missing" if isinstance(fault, KeyError) else str(fault)
         raise CampaignError(
-            f"{path}: {said}; it is empty, torn or no plan: {_remedy(folder)}"
+            f"{path}: {said}; it is empty, incomplete or not a plan: {_remedy(folder)}"
         ) from fault
 
 
 def _remedy(folder: Path) -> str:
-    """What to do about a manifest that cannot be read."""
+    """Say what to do about a manifest that cannot be read."""
     if not (folder / TABLE).exists():
-        return f"no run stands in {folder} yet: remove {MANIFEST} and give the command again"
+        return f"{folder} holds no run yet: remove {MANIFEST} and give the command again"
     return (
-        f"put it back from a copy, remove {folder} to begin anew, or give another --out "
-        f"(what {TABLE} was made with is not known without it)"
+        f"restore it from a copy, remove {folder} to begin again, or give another --out "
+        f"(without it nothing tells how {TABLE} was made)"
     )
 
 
-def differences(old: Plan, new: Plan) -> list[str]:
-    """Keys in which two plans differ, but for paths whose files are the same."""
+def differences(old: CampaignPlan, new: CampaignPlan) -> list[str]:
+    """Return the keys in which two plans differ, except paths of files with the same contents."""
     before, after = old.to_plain(), new.to_plain()
     same_file = {
         key for key in ("task", "services", "mock") if old.digests.get(key) == new.digests.get(key)
@@ -187,9 +189,9 @@ def differences(old: Plan, new: Plan) -> list[str]:
     return [key for key in before if key not in same_file and before[key] != after.get(key)]
 
 
-def identity(plan: Plan) -> str:
-    """A short name of what a campaign runs, the same wherever its files lie: trials of equal
-    identity are the same trials."""
+def identity(plan: CampaignPlan) -> str:
+    """Return a short hash of what a campaign runs, independent of paths: trials of campaigns with
+    equal identity are the same trials."""
     data = plan.to_plain()
     for key in ("task", "services", "mock"):
         data[key] = plan.digests.get(key, "")

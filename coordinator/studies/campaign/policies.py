@@ -1,8 +1,8 @@
-"""Who chooses actions in a campaign: for each trial, the probabilities of each primitive task's
-actions.
+"""Policies that choose the actions in a campaign: for each trial, the probabilities of the actions
+of each primitive task.
 
-A policy is asked before a batch and told all rows of the batch after it, in the order of the table;
-so what is chosen depends on neither the number of workers nor on who was faster.
+A policy chooses before a batch and receives all rows of the batch after it, in the order of the
+table. So choices depend neither on the number of workers nor on their speed.
 """
 
 from __future__ import annotations
@@ -16,47 +16,49 @@ import numpy as np
 
 from petrobot.coordinator.learning.learning import Learning
 from petrobot.coordinator.learning.objective import Question
-from petrobot.coordinator.learning.records import Choice, End
+from petrobot.coordinator.learning.records import Choice, RunEnd
 from petrobot.coordinator.learning.selectors import RULES
 from petrobot.coordinator.studies.campaign.block import Weights
 from petrobot.coordinator.studies.campaign.observed import context_of, observation, regime_of
-from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, Plan
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.plan import Block, CampaignError, CampaignPlan
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.location_file import Directory
 
 
-class Policy(Protocol):
+class ChoicePolicy(Protocol):
     """Chooses before a batch, learns after it."""
 
     learns: bool
-    """Whether `update` changes what is chosen."""
+    """Whether `update` changes later choices."""
 
     def weights(self, block: Block) -> list[Weights]:
-        """For each trial of a block, the probabilities of each primitive task's actions."""
+        """Return, for each trial of a block, the probabilities of the actions of each primitive
+        task."""
 
-    def update(self, rows: Sequence[Row]) -> None:
-        """Take the rows of a whole batch, in the order of the table."""
+    def update(self, rows: Sequence[TrialRow]) -> None:
+        """Learn from the rows of a whole batch, in the order of the table."""
 
     def state(self) -> dict[str, Any]:
-        """What it knows, as plain data for the result."""
+        """Return what the policy knows, as plain data for the result."""
 
     def selectors(self) -> dict[str, dict[str, Any]]:
-        """States of selectors for the estimates file, by primitive task."""
+        """Return the states of selectors for the estimates file, by primitive task."""
 
 
 def offered(task: Task, directory: Directory) -> dict[str, tuple[str, ...]]:
-    """By primitive task: its alternatives that some node offers."""
+    """Return, by primitive task, its alternatives that some node offers; all of them if no node
+    offers any."""
     return {
         p.name: tuple(a for a in p.alternatives if a in directory.actions) or p.alternatives
         for p in task.primitive_tasks.values()
     }
 
 
-class Fixed:
-    """The actions chosen by hand; the first alternative of every other primitive task.
+class FixedActions:
+    """Always the actions that the user chose; the first alternative for every other primitive task.
 
-    `by_regime`: further choices, by regime (what a learning campaign has come to).
+    `by_regime`: further choices by regime (the result of a learning campaign).
     """
 
     learns = False
@@ -76,24 +78,24 @@ class Fixed:
         }
 
     def weights(self, block: Block) -> list[Weights]:
-        """The same for every trial of a regime."""
+        """Return the same choice for every trial of a regime."""
         return [self._by_regime.get(block.regime, self._weights)] * block.count
 
-    def update(self, rows: Sequence[Row]) -> None:
-        """Nothing is learned."""
+    def update(self, rows: Sequence[TrialRow]) -> None:
+        """Learn nothing."""
 
     def state(self) -> dict[str, Any]:
-        """The actions."""
+        """Return the chosen actions."""
         return {task: next(iter(actions)) for task, actions in self._weights.items()}
 
     def selectors(self) -> dict[str, dict[str, Any]]:
-        """None."""
+        """Return no states: nothing is learned."""
         return {}
 
 
-class RoundRobin:
-    """All combinations of alternatives in turn (of those not chosen by hand), from trial to trial
-    of a regime."""
+class AllCombinations:
+    """All combinations of alternatives in turn, from trial to trial of a regime. Actions that the
+    user fixed do not change."""
 
     learns = False
 
@@ -105,8 +107,8 @@ class RoundRobin:
         }
 
     def combination(self, index: int) -> dict[str, str]:
-        """Combination number `index` (counted on and on): the first primitive task changes with
-        each trial."""
+        """Return combination number `index`; after the last combination, it starts again. The first
+        primitive task changes with each trial."""
         out = {}
         for task, actions in self._alternatives.items():
             index, which = divmod(index, len(actions))
@@ -114,28 +116,28 @@ class RoundRobin:
         return out
 
     def weights(self, block: Block) -> list[Weights]:
-        """One combination for each trial."""
+        """Return one combination for each trial."""
         combinations = [self.combination(block.regime_first + k) for k in range(block.count)]
         return [{task: {action: 1.0} for task, action in c.items()} for c in combinations]
 
-    def update(self, rows: Sequence[Row]) -> None:
-        """Nothing is learned."""
+    def update(self, rows: Sequence[TrialRow]) -> None:
+        """Learn nothing."""
 
     def state(self) -> dict[str, Any]:
-        """The alternatives."""
+        """Return the alternatives."""
         return dict(self._alternatives)
 
     def selectors(self) -> dict[str, dict[str, Any]]:
-        """None."""
+        """Return no states: nothing is learned."""
         return {}
 
 
-class Random(RoundRobin):
-    """Every alternative with the same probability, drawn anew at each choice: what estimates and
-    forecasts train on."""
+class RandomActions(AllCombinations):
+    """Every alternative with the same probability, drawn independently at each choice. Estimates
+    and forecasts are best trained on this."""
 
     def weights(self, block: Block) -> list[Weights]:
-        """The same for every trial."""
+        """Return equal probabilities for every trial."""
         even: Weights = {
             task: dict.fromkeys(actions, 1.0 / len(actions))
             for task, actions in self._alternatives.items()
@@ -143,10 +145,10 @@ class Random(RoundRobin):
         return [even] * block.count
 
 
-class Learned:
-    """A learner for each primitive task with alternatives and each regime (docs/learning.md).
+class LearnedActions:
+    """One learner for each primitive task with alternatives and each regime (docs/learning.md).
 
-    One choice for each trial and primitive task: a run that is repeated within its trial takes the
+    There is one choice per trial and primitive task: a run that is repeated within a trial uses the
     same action again.
     """
 
@@ -163,14 +165,14 @@ class Learned:
         self._task, self._alternatives, self._chosen = task, alternatives, chosen
         self._learning = Learning(task, selector, question)
         self._before: dict[str, Any] | None = None
-        """The selectors' states before the batch that is being given out."""
+        """States of the selectors before the batch that is being handed out."""
         self._fixed: Weights = {
             t: {chosen.get(t, actions[0]): 1.0} for t, actions in alternatives.items()
         }
 
     def weights(self, block: Block) -> list[Weights]:
-        """A choice for each trial. Each is counted as a trial for the others of its batch, until
-        the batch is known."""
+        """Choose for each trial. Until the results of the batch are known, each choice already
+        counts as a trial for the following choices of the batch."""
         if self._before is None:
             self._before = self._learning.state()
         return [{**self._fixed, **self._choices(block, k)} for k in range(block.count)]
@@ -186,8 +188,8 @@ class Learned:
             out[name] = {action: 1.0}
         return out
 
-    def update(self, rows: Sequence[Row]) -> None:
-        """Take what was really run, in the order of the table."""
+    def update(self, rows: Sequence[TrialRow]) -> None:
+        """Replace the assumed choices by what was really run, in the order of the table."""
         for selector in self._learning.selectors.values():
             selector.reset()
         self._learning.restore(self._before or {})
@@ -197,18 +199,20 @@ class Learned:
             for run in row.trial.runs if row.trial is not None else ():
                 name = self._task.primitive_task_of(run.place).name
                 self._learning.apply(Choice(name, run.action, context))
-                self._learning.apply(End(name, run.action, context, observation(self._task, run)))
+                self._learning.apply(
+                    RunEnd(name, run.action, context, observation(self._task, run))
+                )
 
     def state(self) -> dict[str, Any]:
-        """By regime and primitive task: learned probabilities, J from the learner's sums, and the
-        best action."""
+        """Return, by regime and primitive task: learned probabilities, J from the learner's sums,
+        and the best action."""
         contexts = sorted({c for s in self._learning.selectors.values() for c in s.learners})
         return {
             regime_of(c): {n: self._of(n, c) for n in self._learning.selectors} for c in contexts
         }
 
     def selectors(self) -> dict[str, dict[str, Any]]:
-        """The learners' states: `petrobot run --learn` goes on from them."""
+        """Return the states of the learners; `petrobot run --learn` continues from them."""
         return self._learning.state()
 
     def _of(self, name: str, context: str) -> dict[str, Any]:
@@ -225,68 +229,69 @@ class Learned:
         }
 
 
-PLAIN: Mapping[str, type[Fixed] | type[RoundRobin]] = {
-    "fixed": Fixed,
-    "round_robin": RoundRobin,
-    "random": Random,
+PLAIN: Mapping[str, type[FixedActions] | type[AllCombinations]] = {
+    "fixed": FixedActions,
+    "round_robin": AllCombinations,
+    "random": RandomActions,
 }
 
 
 def learns(selector: str) -> bool:
-    """Whether a selector learns, so that a campaign goes on in batches."""
+    """Return whether a selector learns, so that a campaign runs in batches."""
     return selector not in PLAIN
 
 
 def check_chosen(task: Task, directory: Directory, chosen: Mapping[str, str]) -> None:
-    """Raises CampaignError for a primitive task or an action that is not known, or that no node
+    """Raise CampaignError for an unknown primitive task or action, or an action that no node
     offers."""
     for name, action in chosen.items():
         primitive = task.primitive_tasks.get(name)
         if primitive is None or action not in primitive.alternatives:
             known = ", ".join(primitive.alternatives if primitive else task.primitive_tasks)
             raise CampaignError(
-                f"--choose {name}={action}: not known to {task.name}; choose among {known}"
+                f"--choose {name}={action}: {task.name} does not know it; choose one of {known}"
             )
         if action not in directory.actions:
             raise CampaignError(
-                f"--choose {name}={action}: {directory.source} places no action {action}"
+                f"--choose {name}={action}: {directory.source} gives {action} to no node"
             )
 
 
-def policy_of(plan: Plan, task: Task, directory: Directory) -> Policy:
-    """The policy that a plan names. Raises CampaignError."""
+def policy_of(plan: CampaignPlan, task: Task, directory: Directory) -> ChoicePolicy:
+    """Create the policy that a plan names. Raises CampaignError."""
     check_chosen(task, directory, plan.chosen)
     alternatives = offered(task, directory)
     if plan.selector == "fixed":
         by_regime = plan.options.get("by_regime", {})
         for more in by_regime.values():
             check_chosen(task, directory, more)
-        return Fixed(alternatives, plan.chosen, by_regime)
+        return FixedActions(alternatives, plan.chosen, by_regime)
     if plan.selector in PLAIN:
         return PLAIN[plan.selector](alternatives, plan.chosen)
     if plan.selector not in RULES:
         known = ", ".join(dict.fromkeys([*PLAIN, *RULES]))
-        raise CampaignError(f"--selector {plan.selector}: not known; choose among {known}")
+        raise CampaignError(f"--selector {plan.selector}: unknown; choose one of {known}")
     question = Question(target=plan.options.get("target"), rho=plan.options.get("rho"))
-    return Learned(task, plan.selector, alternatives, plan.chosen, question)
+    return LearnedActions(task, plan.selector, alternatives, plan.chosen, question)
 
 
 def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
-    """By regime: the best action of each primitive task that a learning campaign has come to.
-    Raises CampaignError."""
+    """Return, by regime, the best action of each primitive task in the result of a learning
+    campaign. Raises CampaignError."""
     path = folder / "result.json"
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
     except OSError as fault:
         remedy = (
-            "give the folder of a campaign that has ended, as `petrobot campaign --out "
-            "FOLDER` leaves it"
+            "give the folder of a finished campaign, as `petrobot campaign --out FOLDER` leaves it"
         )
         raise CampaignError(
-            f"{path}: no finished campaign: {fault.strerror or fault}; {remedy}"
+            f"{path}: not the result of a finished campaign: {fault.strerror or fault}; {remedy}"
         ) from fault
     except ValueError as fault:
-        raise CampaignError(f"{path}: no finished campaign: it is no JSON ({fault})") from fault
+        raise CampaignError(
+            f"{path}: not the result of a finished campaign: not JSON ({fault})"
+        ) from fault
     try:
         if result["selector"] in PLAIN:
             raise CampaignError(
@@ -299,5 +304,5 @@ def learned_choices(folder: Path) -> dict[str, dict[str, str]]:
         }
     except (KeyError, TypeError, AttributeError) as fault:
         raise CampaignError(
-            f"{path}: no result of a campaign: selector and policy are missing"
+            f"{path}: not the result of a campaign: selector or policy is missing"
         ) from fault

@@ -1,5 +1,5 @@
-"""One row of a campaign's table: what the columns are, and a trial as a row and back. Columns come
-from task and score."""
+"""Rows of a campaign's table: their columns, and a trial as a row and back. The columns depend on
+the task and its score."""
 
 from __future__ import annotations
 
@@ -28,20 +28,19 @@ GENERAL = (
     "at",
     "mission_s",
 )
-"""`n` of the campaign, `k` of the mission run with `seed`; `time`: s that the trial took; `at`: s
-since the mission began."""
+"""`n`: number in the campaign; `k`: number in the mission run with `seed`; `time`: duration of the
+trial (s); `at`: its begin (s since the mission began)."""
 BY_PLACE = ("status", "cause", "seconds", "cost")
-"""Of the trial's first run in a place; all runs stand in the column `runs`."""
+"""Columns of the trial's first run in each place; the column `runs` holds all runs."""
 LAST = ("more", "runs", "waits", "fired")
-"""JSON: results of the task's own that the first block did not have; RunEntry.to_plain of each run;
-Trial.waits, Trial.fired."""
-
-Cell = str | int | float | None
+"""JSON columns: results of the task's own that the first block did not have; RunEntry.to_plain of
+each run; Trial.waits; Trial.fired."""
 
 
 @dataclass
-class Row:
-    """A trial of a campaign. `trial` is None when the mission run was given up before it."""
+class TrialRow:
+    """A trial of a campaign. `trial` is None if the mission run was given up before the trial
+    began."""
 
     n: int
     regime: str
@@ -54,11 +53,11 @@ class Row:
     """The task's own results, as `table.column`."""
 
 
-def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
-    """The rows of a block's result."""
+def rows_of(block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
+    """Return the rows of a block's result."""
     trials = {t["k"]: Trial.from_plain(t) for t in result["trials"]}
     return [
-        Row(
+        TrialRow(
             block.first + k,
             block.regime,
             block.seed,
@@ -72,9 +71,9 @@ def rows_of(block: Block, result: Mapping[str, Any]) -> list[Row]:
     ]
 
 
-def columns(task: Task, rows: Sequence[Row]) -> list[str]:
-    """The table's columns: the general ones, those of the task file, and those of the task's score
-    in these first rows."""
+def columns(task: Task, rows: Sequence[TrialRow]) -> list[str]:
+    """Return the columns of a table: general ones, those of the task file, and those of the task's
+    score in these first rows."""
     chosen = [f"chosen.{name}" for name in task.primitive_tasks]
     places = [
         f"{p.name}.{part}"
@@ -86,15 +85,15 @@ def columns(task: Task, rows: Sequence[Row]) -> list[str]:
     return [*GENERAL, *chosen, *places, *own, *LAST]
 
 
-def cells(task: Task, row: Row, names: Sequence[str]) -> list[str]:
-    """A row as texts, in the order of the columns."""
+def cells(task: Task, row: TrialRow, names: Sequence[str]) -> list[str]:
+    """Return a row as texts, in the order of the columns."""
     found = {**_general(row), **_runs(task, row.trial), **row.score}
     more = {k: v for k, v in row.score.items() if k not in names}
     found["more"] = _json(more) if more else ""
     return [_text(found.get(name)) for name in names]
 
 
-def _general(row: Row) -> dict[str, Any]:
+def _general(row: TrialRow) -> dict[str, Any]:
     base = {name: getattr(row, name) for name in ("n", "regime", "seed", "k", "block", "mission_s")}
     trial = row.trial
     if trial is None:
@@ -133,14 +132,13 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return repr(round(value, 9))
     if isinstance(value, str):
-        return value.replace("\r\n", "\n").replace(
-            "\r", "\n"
-        )  # a bare carriage return would end a line of the CSV file
+        # a bare carriage return would end a line of the CSV file
+        return value.replace("\r\n", "\n").replace("\r", "\n")
     return str(value) if isinstance(value, int) else _json(value)
 
 
-def read_row(record: Mapping[str, str]) -> Row:
-    """A row back from its texts. Raises KeyError or ValueError for a record that is none."""
+def read_row(record: Mapping[str, str]) -> TrialRow:
+    """Read a row from its texts. Raises KeyError or ValueError if the record is not a row."""
     trial = None
     if record["begun"] == "true":
         trial = Trial(
@@ -157,7 +155,7 @@ def read_row(record: Mapping[str, str]) -> Row:
         )
     own = {key: value_of(text) for key, text in record.items() if _is_own(key) and text != ""}
     own |= json.loads(record["more"]) if record.get("more") else {}
-    return Row(
+    return TrialRow(
         int(record["n"]),
         record["regime"],
         int(record["seed"]),
@@ -170,7 +168,7 @@ def read_row(record: Mapping[str, str]) -> Row:
 
 
 def _is_own(key: str) -> bool:
-    """Whether a column may be the score's: those of places are read from `runs`."""
+    """Return whether a column may belong to the score; columns of places are read from `runs`."""
     return "." in key and not key.startswith("chosen.") and key.rpartition(".")[2] not in BY_PLACE
 
 
@@ -179,7 +177,7 @@ def _number(text: str) -> float | None:
 
 
 def value_of(text: str) -> Any:
-    """A cell's text as the value that it was written from, as far as a text tells."""
+    """Return the value of a cell's text, as far as a text shows it."""
     if text in ("true", "false"):
         return text == "true"
     try:

@@ -1,5 +1,5 @@
-"""What a campaign's table says in numbers: shares with intervals, times, choices, estimates and J
-of every action."""
+"""Figures of a campaign's table: shares with intervals, times, choices, estimates, and J of every
+action."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from typing import Any
 
 import numpy as np
 
-from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.learning.objective import Comparison, Question, compare
 from petrobot.coordinator.learning.statistics import wilson
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES, add_row, context_of, regime_of
-from petrobot.coordinator.studies.campaign.plan import TABLE, Plan
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.plan import TABLE, CampaignPlan
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.table import sessions, times
 from petrobot.coordinator.task import PrimitiveTask, Task
 
 
 @dataclass
-class Counts:
-    """Trials of one regime, or of all."""
+class TrialCounts:
+    """Counts of trials, of one regime or of all."""
 
     runs: int = 0
-    """Trials that were begun."""
+    """Trials that began."""
     not_begun: int = 0
-    """Trials for which the mission run was given up before."""
+    """Trials that did not begin because the mission run was given up."""
     goals: int = 0
     completed: int = 0
     all_success: int = 0
     times: list[float] = field(default_factory=list)
-    """s, of the completed ones."""
+    """Durations of the completed trials (s)."""
 
-    def add(self, row: Row) -> None:
+    def add(self, row: TrialRow) -> None:
         """Count a trial."""
         if row.trial is None:
             self.not_begun += 1
@@ -49,7 +49,7 @@ class Counts:
             self.times.append(row.trial.time)
 
     def to_plain(self, has_goal: bool) -> dict[str, Any]:
-        """Plain data; R_goal of a task without goal transitions is none."""
+        """Return plain data; R_goal is None for a task without goal transitions."""
         met = self.goals if has_goal else self.completed
         low, high = wilson(met, self.runs)
         return {
@@ -71,9 +71,10 @@ def _share(part: int, whole: int) -> float | None:
 def question_of(
     primitive: PrimitiveTask, options: Mapping[str, Any], declared: bool = True
 ) -> Question:
-    """What is asked of a primitive task's actions: target and rho as a plan's options give them.
+    """Return by what the actions of a primitive task are judged: target and rho as in the plan's
+    options.
 
-    Without a target in the options it is the one that the task file declares, unless `declared` is
+    If the options have no target, the one that the task file declares is used, unless `declared` is
     off.
     """
     target = options.get("target", primitive.target_reliability if declared else None)
@@ -82,14 +83,14 @@ def question_of(
 
 def comparisons(
     task: Task,
-    tallies: Mapping[Key, Tally],
+    tallies: Mapping[TallyKey, Tally],
     regime: str | None = None,
     options: Mapping[str, Any] | None = None,
 ) -> dict[str, Comparison]:
-    """By primitive task: all its alternatives with runs judged together, over all regimes as
-    scenarios or in one.
+    """Compare, for each primitive task, all alternatives that have runs: over all regimes as
+    scenarios, or in one regime.
 
-    `options`: those of the campaign's plan. In one regime a target counts only if it was given (as
+    `options`: those of the campaign's plan. In one regime, a target counts only if it was given (as
     in `Learning.comparison`).
     """
     out = {}
@@ -113,34 +114,34 @@ class Summary:
     """Everything that is counted in one pass over the rows."""
 
     task: Task
-    whole: Counts = field(default_factory=Counts)
-    by_regime: dict[str, Counts] = field(default_factory=dict)
+    whole: TrialCounts = field(default_factory=TrialCounts)
+    by_regime: dict[str, TrialCounts] = field(default_factory=dict)
     chosen: dict[str, dict[str, int]] = field(default_factory=dict)
     estimates: Estimates = field(default_factory=Estimates)
     salt: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Of the campaign's plan: target reliability and rho, where they were given."""
+    """Options of the campaign's plan: target reliability and rho, if they were given."""
     mission_s: dict[int, float] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls,
         task: Task,
-        rows: Iterable[Row],
+        rows: Iterable[TrialRow],
         salt: str = "",
         options: Mapping[str, Any] | None = None,
     ) -> Summary:
-        """Of a table's rows. `salt` names the campaign in the estimates; `options` are its
-        plan's."""
+        """Summarise the rows of a table. `salt` names the campaign in the estimates; `options` are
+        those of its plan."""
         made = cls(task, salt=salt, options=options or {})
         for row in rows:
             made.add(row)
         return made
 
-    def add(self, row: Row) -> None:
+    def add(self, row: TrialRow) -> None:
         """Count a row."""
         self.whole.add(row)
-        self.by_regime.setdefault(row.regime, Counts()).add(row)
+        self.by_regime.setdefault(row.regime, TrialCounts()).add(row)
         self.mission_s[row.block] = row.mission_s
         for run in row.trial.runs if row.trial is not None else ():
             primitive = self.task.primitive_task_of(run.place).name
@@ -149,17 +150,17 @@ class Summary:
         add_row(self.estimates, self.task, row, self.salt)
 
     def asked(self) -> dict[str, Question]:
-        """By what the actions of each primitive task are judged."""
+        """Return by what the actions of each primitive task are judged."""
         return {p.name: question_of(p, self.options) for p in self.task.primitive_tasks.values()}
 
     def comparisons(self) -> dict[str, Comparison]:
-        """The actions of each primitive task judged over all regimes, as the campaign's options
+        """Compare the actions of each primitive task over all regimes, as the campaign's options
         ask."""
         return comparisons(self.task, self.estimates.tallies, options=self.options)
 
     def _judged(self, name: str, found: Comparison) -> dict[str, Any]:
-        """What J of a primitive task was made with: measure, target, rho, regimes, who meets the
-        target where."""
+        """Return what J of a primitive task is based on: measure, target, rho, regimes, and which
+        action meets the target where."""
         asked = question_of(self.task.primitive_tasks[name], self.options)
         return {
             "cost": asked.measure,
@@ -173,7 +174,7 @@ class Summary:
         }
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         has_goal, found = bool(self.task.goal_transitions), self.comparisons()
         return {
             **self.whole.to_plain(has_goal),
@@ -194,8 +195,10 @@ class Summary:
         }
 
 
-def result_of(folder: Path, plan: Plan, made: Summary, policy: Mapping[str, Any]) -> dict[str, Any]:
-    """The result of a campaign as the command line writes it."""
+def result_of(
+    folder: Path, plan: CampaignPlan, made: Summary, policy: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the result of a campaign as the command line writes it."""
     summary, task = made.to_plain(), made.task
     held, took = sessions(folder), times(folder)
     wall = sum(float(s["wall_s"]) for s in held)

@@ -1,5 +1,5 @@
-"""A campaign's table on disk: one CSV file that only ever grows by whole blocks, in order, so an
-interrupted one goes on."""
+"""The table of a campaign on disk: one CSV file that grows only by whole blocks, in order, so that
+an interrupted campaign can continue."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from typing import Any
 
 from petrobot.coordinator.studies.campaign.plan import TABLE as TABLE
 from petrobot.coordinator.studies.campaign.plan import Block, CampaignError
-from petrobot.coordinator.studies.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.studies.campaign.rows import TrialRow, cells, columns, read_row
 from petrobot.coordinator.task import Task
 from petrobot.services.host.whole_file import sync_folder, write_whole
 
 PARQUET = "table.parquet"
 
 
-class Table:
-    """The table of a task's campaign in a folder."""
+class CampaignTable:
+    """The table of a campaign in its folder."""
 
     def __init__(self, folder: Path, task: Task) -> None:
         self.path = folder / TABLE
@@ -31,8 +31,8 @@ class Table:
         self._columns: list[str] | None = None
 
     def recover(self, blocks: Sequence[Block]) -> int:
-        """Cut off what an interruption left of a block; gives how many blocks are complete. Raises
-        CampaignError."""
+        """Remove incomplete blocks that an interruption left, and return the number of complete
+        ones. Raises CampaignError."""
         if not self.path.exists():
             return 0
         ends = _record_ends(self.path)
@@ -53,8 +53,8 @@ class Table:
             file.truncate(end)
         return done
 
-    def append(self, rows: Sequence[Row]) -> None:
-        """Add a block's rows; they are on disk when this returns."""
+    def append(self, rows: Sequence[TrialRow]) -> None:
+        """Append the rows of a block; they are on disk when this returns."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         if self._columns is None:
@@ -70,13 +70,13 @@ class Table:
         if first:
             sync_folder(self.path.parent)
 
-    def rows(self) -> Iterator[Row]:
-        """All rows, one after the other."""
+    def rows(self) -> Iterator[TrialRow]:
+        """Yield all rows."""
         return read_table(self.path) if self.path.exists() else iter(())
 
 
-def read_table(path: Path) -> Iterator[Row]:
-    """The rows of a table. Raises CampaignError naming the line that is none."""
+def read_table(path: Path) -> Iterator[TrialRow]:
+    """Yield the rows of a table. Raises CampaignError naming the line that cannot be read."""
     csv.field_size_limit(1 << 26)
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -85,14 +85,14 @@ def read_table(path: Path) -> Iterator[Row]:
                     yield read_row(record)
                 except (KeyError, ValueError, TypeError) as fault:
                     raise CampaignError(
-                        f"{path}: line {number} is no row of a campaign: {fault!r}"
+                        f"{path}: line {number}: not a row of a campaign: {fault!r}"
                     ) from fault
     except OSError as fault:
         raise CampaignError(f"{path}: {fault.strerror or fault}") from fault
 
 
 def _record_ends(path: Path) -> Iterator[int]:
-    """Where each complete record ends: after a newline that stands outside quotes."""
+    """Yield the byte offset after each complete record: after a newline outside quotes."""
     quoted, end = False, 0
     with path.open("rb") as file:
         for line in file:
@@ -103,7 +103,7 @@ def _record_ends(path: Path) -> Iterator[int]:
 
 
 def write_parquet(folder: Path) -> Path | None:
-    """The table as Parquet beside the CSV file if pyarrow is installed, else None."""
+    """Write the table as Parquet beside the CSV file; None if pyarrow is not installed."""
     try:
         arrow_csv: Any = importlib.import_module("pyarrow.csv")
         parquet: Any = importlib.import_module("pyarrow.parquet")
@@ -115,15 +115,18 @@ def write_parquet(folder: Path) -> Path | None:
     return target
 
 
-# One process at a time writes a campaign's folder; the operating system lets go of the lock of one that was killed.
+# --- lock ---
+
+# Only one process at a time writes a campaign's folder. If it is killed, the operating system
+# releases its lock.
 
 LOCK = "running.lock"
 
 
 @contextmanager
 def held(folder: Path) -> Iterator[None]:
-    """Hold the folder. Raises CampaignError when another process does, or when it cannot be
-    written."""
+    """Hold the folder's lock. Raises CampaignError if another process holds it, or if the folder
+    cannot be written."""
     try:
         file = (folder / LOCK).open("a+", encoding="ascii")
     except OSError as fault:
@@ -137,7 +140,7 @@ def held(folder: Path) -> Iterator[None]:
             file.seek(0)
             who = file.read().strip() or "?"
             raise CampaignError(
-                f"{folder}: process {who} is running this campaign; wait until it has ended, "
+                f"{folder}: process {who} is running this campaign; wait until it has finished, "
                 f"or end it (kill {who})"
             ) from fault
         file.truncate(0)
@@ -146,7 +149,7 @@ def held(folder: Path) -> Iterator[None]:
         yield
 
 
-# What a campaign took, beside its table: a row for each block (times.csv) and one for each session (sessions.csv).
+# --- cost of a campaign: one row for each block (times.csv) and for each session (sessions.csv) ---
 
 TIMES = "times.csv"
 TIME_COLUMNS = ("block", "worker", "cpu_s", "wall_s", "mission_s", "rss_mb")
@@ -155,8 +158,8 @@ SESSION_COLUMNS = ("began_at", "workers", "wall_s", "blocks", "lost")
 
 
 def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
-    """Append what a block took: process id, CPU time, wall time and simulated time (s), memory
-    (MB)."""
+    """Append the cost of a block: process id, CPU time, wall time and simulated time (s), memory
+    (MiB)."""
     took = [
         block.index,
         *(result[name] for name in ("pid", "cpu_s", "wall_s", "mission_s", "rss_mb")),
@@ -165,30 +168,30 @@ def note_block(folder: Path, block: Block, result: Mapping[str, Any]) -> None:
 
 
 def note_sessions(folder: Path, sessions: Iterable[Mapping[str, Any]]) -> None:
-    """Write all sessions at once, so that a kill leaves the old file or the new one."""
+    """Write all sessions at once, so that a kill leaves either the old file or the new one."""
     rows = [[session[name] for name in SESSION_COLUMNS] for session in sessions]
     write_whole(folder / SESSIONS, _lines([SESSION_COLUMNS, *rows]))
 
 
 def times(folder: Path) -> list[dict[str, str]]:
-    """What the blocks took, in the order they ended; a block that was done again stands there
-    twice."""
+    """Return the costs of the blocks, in the order in which they ended; a block that was run again
+    is there twice."""
     return _read(folder / TIMES)
 
 
 def sessions(folder: Path) -> list[dict[str, str]]:
-    """The sessions so far, the first one first."""
+    """Return the sessions so far, the first one first."""
     return _read(folder / SESSIONS)
 
 
 def began(folder: Path) -> str | None:
-    """When a campaign's first session began (UTC, ISO 8601); None if it is not known."""
+    """Return when the first session of a campaign began (UTC, ISO 8601); None if it is unknown."""
     known = sessions(folder)
     return known[0]["began_at"] if known else None
 
 
 def _append(path: Path, names: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Not synced: what a block took is told, and nothing follows from it."""
+    """Append rows without fsync: these costs are only reported, nothing depends on them."""
     rows = rows if path.exists() else [names, *rows]
     with path.open("a", encoding="utf-8", newline="") as file:
         file.write(_lines(rows))

@@ -1,8 +1,8 @@
-"""What one trial was: one token out of the runs place and all that came of it, as plain data; and
-who writes it down.
+"""One trial (one run token taken out of the runs place, and everything that followed) as plain
+data, and the observer that records it.
 
-A *trial* here is one run of a task, whatever the task does (design: "mission run" is a whole
-execution, which may hold several). A task without a runs place has one trial in each mission run.
+A *trial* is one run of a task, whatever the task does; a mission run is a whole execution and may
+contain several trials. A task without a runs place has one trial per mission run.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from petrobot.coordinator.task.net import Marking
 from petrobot.services.comm.calls.notices import Progress
 
 DIGITS = 6
-"""Decimals of every time and cost in the table (us)."""
+"""Decimals of all times and costs in the table (microseconds)."""
 
 _RANK = {status: n for n, status in enumerate(("", *(status.value for status in Status)))}
-"""How bad a status is."""
+"""Severity of each status."""
 
 CostOf = Callable[[RunRecorded, Mapping[str, Any]], float | None]
-"""Cost of a run that was recorded, from its record and the values of its result."""
+"""Returns the cost of a recorded run, from its record and the values of its result."""
 
 
 @dataclass(slots=True)
@@ -42,67 +42,69 @@ class RunEntry:
     place: str
     action: str
     begun: float
-    """When its token came into the place, since the trial's begin."""
+    """When its token entered the place, since the trial began."""
     took: float = 0.0
-    """From there until the coordinator knew its end, or a preempting transition took the token:
-    with all waiting."""
+    """From then until the coordinator knew its end, or until a preempting transition took the
+    token; includes all waiting."""
     status: str = ""
-    """success, failure, error; empty for a censored run (it was preempted and counts none, or had
-    not ended)."""
+    """success, failure or error; empty for a censored run (preempted and counts none, or not
+    ended)."""
     cause: str = ""
     text: str = ""
     seconds: float = 0.0
-    """How long it took on its node's clock."""
+    """Duration on the clock of its node."""
     cost: float | None = None
     executed: str = Executed.YES.value
     taken: str = ""
     """The transition that took its token."""
     cancelled: bool = False
     values: dict[str, float] = field(default_factory=dict)
-    """Numbers of its result."""
+    """Numbers in its result."""
 
     def to_plain(self) -> list[Any]:
-        """A list in the order of the fields."""
+        """Return a list in the order of the fields."""
         return [getattr(self, name) for name in self.__slots__]
 
     @classmethod
     def from_plain(cls, data: Sequence[Any]) -> RunEntry:
-        """Back from `to_plain`."""
+        """Read what `to_plain` returned."""
         return cls(*data)
 
 
 @dataclass(slots=True)
 class Trial:
-    """One run of the task. Times in s."""
+    """One trial. Times in s."""
 
     k: int
-    """Its number in its mission run, from 1."""
+    """Number in its mission run, from 1."""
     begun: float
-    """Since the mission run began."""
+    """Time since the mission run began."""
     time: float | None = None
-    """Until every token was back where it stood before; None if it never was."""
+    """Time until every token was back where it was at the beginning; None if that never
+    happened."""
     completed: bool = False
-    """The task could go on, or was over as designed; False when it was given up in this trial."""
+    """True if the task could continue, or finished as designed; False if it was given up in this
+    trial."""
     goals: int = 0
-    """Firings of goal transitions."""
+    """Number of firings of goal transitions."""
     status: str = Status.SUCCESS.value
     """The worst status of its runs."""
     cause: str = ""
     runs: list[RunEntry] = field(default_factory=list)
     waits: list[tuple[str, float]] = field(default_factory=list)
-    """(transition, s) for each firing of a transition that waited for an event or a timer, from
-    when it could have fired."""
+    """(transition, s) for each firing of a transition that waited for an event or a timer, from the
+    moment it was enabled."""
 
     fired: dict[str, int] = field(default_factory=dict)
     """How often each transition fired."""
 
     @property
     def all_success(self) -> bool:
-        """Every run ended with SUCCESS: what R_conj counts."""
+        """Whether every run ended with SUCCESS, as R_conj counts it."""
         return self.completed and all(run.status in (Status.SUCCESS.value, "") for run in self.runs)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data for the way from a worker to the campaign."""
+        """Return plain data, which a worker sends to the campaign."""
         plain = {
             name: getattr(self, name) for name in self.__slots__ if name not in ("runs", "waits")
         }
@@ -113,7 +115,7 @@ class Trial:
 
     @classmethod
     def from_plain(cls, data: Mapping[str, Any]) -> Trial:
-        """Back from `to_plain`."""
+        """Read what `to_plain` returned."""
         runs = [RunEntry.from_plain(run) for run in data["runs"]]
         return cls(
             **{
@@ -125,7 +127,7 @@ class Trial:
 
 
 class TrialLog:
-    """An observer of the executor that writes down each trial."""
+    """Observer of the executor that records each trial."""
 
     def __init__(self, task: Task, cost_of: CostOf) -> None:
         flat = task.flat
@@ -140,20 +142,23 @@ class TrialLog:
             and not any(a.end in (End.PREEMPT, End.GOING) for a in t.inputs)
         }
         self.trials: list[Trial] = []
+        # By place: when its latest token entered. A transition is enabled from the latest of these
+        # times over its input places.
         self._since = dict.fromkeys(self._net.places, 0.0)
         self._entries: dict[str, tuple[Trial, RunEntry]] = {}
-        self._going: dict[str, float] = {}
+        self._active: dict[str, float] = {}
         self._values: dict[str, Mapping[str, Any]] = {}
         self._ends: dict[int, list[RunEntry]] = {}
-        """By trial: its runs in the order in which they ended."""
+        """By trial: its runs in the order of their ends."""
         self._given_up: str | None = None
-        """Why the mission run ended before its last trial was completed, if it did."""
+        """Why the mission run ended before its last trial completed, if it did."""
         self._origin: float | None = None
 
     # --- an observer --------------------------------------------------------------------------
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """The first one begins the time axis; results are kept until their runs are recorded."""
+        """Start the time axis at the first stimulus; remember results until their runs are
+        recorded."""
         if self._origin is None:
             self._origin = now
             self._since = dict.fromkeys(self._net.places, now)
@@ -163,7 +168,7 @@ class TrialLog:
             self._values[stimulus.run] = stimulus.values
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Keep what a trial is made of."""
+        """Record what belongs to a trial."""
         if isinstance(instruction, Fired):
             self._fired(now, instruction)
         elif isinstance(instruction, StartRun):
@@ -176,10 +181,10 @@ class TrialLog:
             self._finished(now, instruction)
 
     def progress(self, now: float, run: str, notice: Progress) -> None:
-        """Nothing to keep."""
+        """Ignore progress."""
 
     def settled(self, now: float, state: State) -> None:
-        """Nothing to keep."""
+        """Ignore the state."""
 
     # --- what happened ------------------------------------------------------------------------
 
@@ -198,7 +203,7 @@ class TrialLog:
         for run in fired.runs:
             if run in self._entries:
                 self._entries[run][1].taken = fired.transition
-                if run in self._going:  # preempted
+                if run in self._active:  # preempted
                     self._ended(now, run)
         if not self.trials:
             return
@@ -218,7 +223,7 @@ class TrialLog:
             trial.time = self._span(now, trial)
 
     def _idle(self, marking: Marking) -> bool:
-        """Whether all but the runs left is as it was at first."""
+        """Return whether the marking is the initial one, except for the remaining run tokens."""
         if self._runs_place is None:
             return False
         own = self._runs_place
@@ -237,17 +242,17 @@ class TrialLog:
         entry = RunEntry(start.place, start.action, self._span(came, trial) if trial else 0.0)
         if trial is not None:
             trial.runs.append(entry)
-            self._entries[start.run], self._going[start.run] = (trial, entry), came
+            self._entries[start.run], self._active[start.run] = (trial, entry), came
         return entry
 
     def _ended(self, now: float, run: str) -> None:
-        came = self._going.pop(run, None)
+        came = self._active.pop(run, None)
         if came is not None:
             self._entries[run][1].took = round(now - came, DIGITS)
 
     def _recorded(self, now: float, record: RunRecorded) -> None:
         known = self._entries.get(record.run)
-        if known is None:  # it ended without ever having been sent to a node
+        if known is None:  # it ended before it was sent to a node
             self._entry(
                 now,
                 StartRun(record.run, record.place, record.primitive_task, record.action, {}, 0.0),
@@ -255,9 +260,8 @@ class TrialLog:
             known = self._entries.get(record.run)
             if known is None:
                 return
-        if (
-            record.run in self._going
-        ):  # else a preemption has taken its token, and the place may hold a later one
+        # Otherwise a preemption has taken its token, and the place may hold a later one.
+        if record.run in self._active:
             self._since[record.place] = now
         self._ended(now, record.run)
         trial, entry = known
@@ -274,8 +278,7 @@ class TrialLog:
             trial.status, trial.cause = entry.status, entry.cause
 
     def _corrected(self, corrected: Corrected) -> None:
-        """The verdict on a run replaces its status, and the trial is what its runs really came
-        to."""
+        """Replace the status of a run by its verdict, and update the status of its trial."""
         trial, entry = self._entries[corrected.run]
         entry.status, entry.text = corrected.status.value, corrected.text or entry.text
         entry.cause = corrected.cause if corrected.status is not Status.SUCCESS else ""
@@ -304,7 +307,7 @@ class TrialLog:
 
 
 def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """The numbers and truth values of a result."""
+    """Return the numbers and truth values of a result."""
     return {
         name: round(float(value), DIGITS)
         for name, value in values.items()

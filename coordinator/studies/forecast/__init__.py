@@ -1,7 +1,8 @@
-"""Forecasts from measured runs: what further runs of a task will come to, said before they run and
-compared afterwards.
+"""Forecasts from measured runs: predict what further trials of a task will yield, before they run,
+and compare afterwards.
 
-The method (docs/forecast.md): runs of the training trials give laws for each action in the contexts
-that a chi-square test tells apart; the task's net composes them, trial by trial, by simulation; a
-bootstrap over training trials gives predictive intervals.
+The method (docs/forecast.md): the training trials give duration distributions and outcome
+probabilities of each action, in contexts that a chi-square test distinguishes. The task's net
+composes them by simulation, trial by trial. A bootstrap over the training trials gives predictive
+intervals.
 """

@@ -1,12 +1,13 @@
-"""Whether a measurement agrees with a forecast that was registered before: predictive tests, Holm,
-equivalence, whole law.
+"""Compare a measurement with a forecast that was registered before: predictive tests, equivalence
+tests, and the distribution of the time.
 
-Shares: a beta-binomial predictive law whose weight is that of the forecast's own uncertainty
-(Jeffreys prior), so a share of 1 that was forecast from n trials still expects a miss in a further
-n. Times: normal with the bootstrap's predictive deviation. Many comparisons: S. Holm, Scandinavian
-Journal of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is the
-measurement's 90 % interval lies within the margin about the forecast number (D. J. Schuirmann,
-1987).
+Shares: a beta-binomial predictive distribution whose weight comes from the forecast's own
+uncertainty, with the Jeffreys prior. So a share of 1 that was forecast from n trials still allows a
+miss in another n. Times: a normal distribution with the predictive deviation of the bootstrap. The
+significance levels of many comparisons are adjusted by the method of S. Holm, Scandinavian Journal
+of Statistics 6 (1979) 65-70. Equivalence: two one-sided tests at 5 % each, that is, the 90 %
+interval of the measurement lies within the margin around the forecast (D. J. Schuirmann, J.
+Pharmacokinetics and Biopharmaceutics 15 (1987) 657-680).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from petrobot.coordinator.studies.forecast.shares import (
 )
 
 FAMILY = ("R_goal", "P_complete", "mean", "q90")
-"""What is judged together by Holm, in all regimes."""
+"""Figures that are tested together by Holm's method, in all regimes."""
 LEVEL = 0.01
 MARGIN_SHARE = 0.02
 MARGIN_TIME = 0.05
@@ -38,12 +39,12 @@ EQUIVALENCE = 0.90
 
 
 def agreement(forecast: Mapping[str, Any], regimes: Mapping[str, Training]) -> dict[str, Any]:
-    """Compare each regime's forecast with what was measured. Raises ValueError if they have no
+    """Compare the forecast of each regime with what was measured. Raises ValueError if they have no
     regime in common."""
     common = [name for name in forecast["regimes"] if name in regimes]
     if not common:
         raise ValueError(
-            f"the campaign ran {', '.join(regimes)}, the forecast is of "
+            f"no regime in common: the campaign ran {', '.join(regimes)}, the forecast is of "
             f"{', '.join(forecast['regimes'])}"
         )
     rows, controls, laws, ways = [], [], [], []
@@ -109,8 +110,9 @@ def _row(regime: str, figure: str, said: Mapping[str, Any], training: Training) 
 
 
 def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, training: int) -> float:
-    """Two-sided p-value of a time of n new trials, given the predictive deviation for `runs` of
-    them (both from n^-1/2 laws)."""
+    """Return the two-sided p-value of a time of n new trials, given the predictive deviation for
+    `runs` of them. Both the sampling error and the training error shrink as n^-1/2."""
+    # sd belongs to `runs` new trials; rescale it to n: variance ~ 1 / new trials + 1 / training
     scaled = sd * math.sqrt((1.0 / n + 1.0 / training) / (1.0 / runs + 1.0 / training))
     if scaled <= 0.0:
         return 1.0 if seen == value else 0.0
@@ -118,7 +120,7 @@ def time_p_value(value: float, sd: float, seen: float, runs: int, n: int, traini
 
 
 def mean_interval(times: Values, level: float = EQUIVALENCE) -> tuple[float, float]:
-    """Student's interval of the mean."""
+    """Return Student's interval of the mean."""
     half = (
         float(t.ppf((1 + level) / 2, len(times) - 1) * times.std(ddof=1) / math.sqrt(len(times)))
         if len(times) > 1
@@ -129,7 +131,7 @@ def mean_interval(times: Values, level: float = EQUIVALENCE) -> tuple[float, flo
 
 
 def quantile_interval(times: Values, q: float, level: float = EQUIVALENCE) -> tuple[float, float]:
-    """Interval of a quantile between two order statistics."""
+    """Return an interval of a quantile between two order statistics, whose ranks are binomial."""
     ordered, n = np.sort(times), len(times)
     low = int(binom.ppf((1 - level) / 2, n, q))
     high = int(binom.ppf((1 + level) / 2, n, q)) + 1
@@ -139,7 +141,7 @@ def quantile_interval(times: Values, q: float, level: float = EQUIVALENCE) -> tu
 
 
 def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
-    """The negative control: the product of marginal reliabilities as a forecast of R_conj."""
+    """Test the negative control: the product of marginal reliabilities as a forecast of R_conj."""
     value, n = said["product"]["R_conj"], len(training.trials)
     seen = figures(measured(training))["R_conj"]
     p = share_p_value(value, float(said["training_trials"]), round(seen * n), n)
@@ -153,8 +155,8 @@ def _product(regime: str, said: Mapping[str, Any], training: Training) -> dict[s
 
 
 def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, Any]:
-    """Kolmogorov's distance between the measured and the forecast law of the time; its 99 % point
-    is the bootstrap's."""
+    """Compare the measured and the forecast distribution of the time by Kolmogorov's distance; the
+    bootstrap gives its 99 % quantile."""
     played = measured(training)
     times = np.sort(played.time[~np.isnan(played.time)])
     if not len(times) or not said["law"]["s"]:
@@ -164,6 +166,8 @@ def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, 
     below = np.searchsorted(times, grid, side="left") / len(times)
     q = np.array(GRID)
     distance = float(np.max(np.maximum(q - at, 0.0) + np.maximum(below - q, 0.0)))
+    # the distance of a sample shrinks as n^-1/2; with more trials than forecast the limit stays,
+    # because the forecast's own error does not shrink
     limit = said["distance_99"] * max(1.0, math.sqrt(said["runs"] / len(times)))
     return {
         "regime": regime,
@@ -176,8 +180,8 @@ def _law(regime: str, said: Mapping[str, Any], training: Training) -> dict[str, 
 def _routing(
     regime: str, before: Mapping[str, Any], after: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """For each place: chi-square test that training and new trials left it by the same ways equally
-    often."""
+    """Test for each place, by chi-square, whether tokens left it by the same transitions equally
+    often in training and new trials."""
     rows = []
     for place in before:
         table = ways_table(before[place], after.get(place, {}))

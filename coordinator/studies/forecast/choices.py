@@ -1,5 +1,5 @@
-"""Whether a campaign chooses as a forecast says that it will: other actions are another forecast's
-matter."""
+"""Check that a campaign chooses actions as a forecast assumes: for other choices, another forecast
+is needed."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from scipy.stats import chi2_contingency
 from petrobot.coordinator.studies.forecast.history import Training
 
 Counts = Mapping[str, Mapping[str, float]]
-"""By primitive task and action: runs."""
+"""By primitive task and action: number of runs."""
 OTHER = 1e-6
-"""Level below which two mixes of actions are not the same one: far beyond any chance, since
-refusing is not a test's verdict."""
+"""Significance level at which two mixes of actions differ. It is far beyond any chance, because the
+forecast is refused then."""
 FEW = 30
-"""Runs in which a mix shows; fewer runs of one action alone say nothing about the others."""
+"""Least number of training runs from which a mix can be seen. If fewer runs were all of one action,
+the others may still have been possible."""
 
 
 def choice_counts(training: Training) -> dict[str, dict[str, int]]:
-    """How often each action was run."""
+    """Return how often each action was run."""
     counts: dict[str, dict[str, int]] = {}
     for trial in training.trials:
         for run in trial.runs:
@@ -31,7 +32,7 @@ def choice_counts(training: Training) -> dict[str, dict[str, int]]:
 
 
 def choices_of(training: Training) -> dict[str, dict[str, float]]:
-    """How often each action was chosen, as shares."""
+    """Return how often each action was chosen, as shares."""
     counts = choice_counts(training)
     return {
         t: {a: n / sum(actions.values()) for a, n in actions.items()}
@@ -40,7 +41,8 @@ def choices_of(training: Training) -> dict[str, dict[str, float]]:
 
 
 def misfit(said: Mapping[str, Any], run: Counts) -> list[str]:
-    """Primitive tasks whose actions a campaign chooses otherwise than a regime's forecast says."""
+    """Return the primitive tasks whose actions a campaign chooses differently from the forecast of
+    a regime."""
     return [
         name
         for name, counts in run.items()
@@ -64,7 +66,7 @@ def _alike(said: Mapping[str, Any], name: str, counts: Mapping[str, float]) -> b
 
 
 def in_words(choices: Counts, names: Iterable[str]) -> str:
-    """Actions of some primitive tasks, for people."""
+    """Describe the actions of some primitive tasks for people."""
     out = []
     for name in names:
         whole = sum(choices[name].values())
@@ -79,7 +81,7 @@ def in_words(choices: Counts, names: Iterable[str]) -> str:
 
 
 def remedy(choices: Counts, names: Iterable[str]) -> str:
-    """How a campaign chooses as a forecast says."""
+    """Say how to make a campaign choose as a forecast assumes."""
     sole = [f"{name}={next(iter(choices[name]))}" for name in names if len(choices[name]) == 1]
     if len(sole) < len(list(names)):
         return "run it with the selector of the training campaign"

@@ -1,16 +1,18 @@
-"""Laws of runs: empirical competing risks of (outcome, duration) in contexts that chi-square tests
-tell apart.
+"""Distributions of runs: empirical competing risks of (outcome, duration), in contexts that
+chi-square tests distinguish.
 
 Contexts are grown as in CHAID (G. V. Kass, Applied Statistics 29 (1980) 119-127): the factor on
 which the response depends most significantly splits the runs, again and again, until no test
-rejects independence. Factors are what had ended before in the same trial: in each action place
-outcome, action and duration of the latest run, and the number of runs. First the outcome is
-unfolded so, then, for each outcome of each of these contexts, the duration: so a strong dependence
-among durations never hides one among outcomes. Within a context a duration keeps its linear trend
-with an earlier one. Runs that were cut off are censored: the ends that were seen weigh what the
-Aalen-Johansen estimate gives them. What it leaves beyond the longest run goes on at a constant rate
-(B. W. Brown, M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974), and whoever
-draws it is told.
+rejects independence. Factors are what ended before in the same trial: for each action place,
+outcome, action and duration of the latest run, and the number of runs. A first tree splits by the
+outcome. In each of its leaves, each outcome has a second tree that splits by the duration, so a
+strong dependence among durations never hides one among outcomes. Within a context, a duration keeps
+its linear trend with an earlier one.
+
+Runs that were cut off are censored: the observed ends get the weights of the Aalen-Johansen
+estimate. What the estimate leaves beyond the longest run continues at a constant rate (B. W. Brown,
+M. Hollander and R. M. Korwar, in Reliability and Biometry, SIAM 1974), and each draw from there is
+marked as an extrapolation.
 """
 
 from __future__ import annotations
@@ -37,23 +39,23 @@ from petrobot.coordinator.studies.forecast.history import (
 )
 
 ALPHA = 0.01
-"""Level at which dependence counts, over all factors of a node (Bonferroni)."""
+"""Significance level of a split, over all factors of a node (Bonferroni)."""
 LEAST = 30
-"""Runs in a context at least."""
+"""Least number of runs in a context."""
 DEEPEST = 6
 OWN = 0.7
-"""A factor of the runs' own place goes before the best one if the logarithm of its p-value is at
-least this share of its."""
+"""A factor of the runs' own place is preferred to the best factor if the logarithm of its p-value
+is at least this share of the best one's."""
 SURE = 3.0
 """Standard errors beyond which a trend within a context counts."""
 GROUPS = 6
-"""Classes of an earlier duration at most, where durations are told apart by it; half of them for
+"""Largest number of classes of an earlier duration that split durations; half as many split
 outcomes."""
 
 
 @dataclass(frozen=True)
-class Law:
-    """Ends that were seen in one context. Arrays over its members."""
+class EndDistribution:
+    """The ends that were observed in one context. Arrays over its members."""
 
     outcome: Codes
     preempted: np.ndarray
@@ -61,26 +63,26 @@ class Law:
     weight: Values
     trial: Codes
     trend: Trend | None = None
-    """Durations only: how they go with an earlier one, within this context."""
+    """Only for durations: their dependence on an earlier duration, within this context."""
 
     @property
     def beyond(self) -> np.ndarray:
-        """Members that stand for what comes after the longest run that was seen: their own ends are
-        not known."""
+        """Members that stand for what happens after the longest observed run: their own ends are
+        unknown."""
         found: np.ndarray = self.outcome == NONE
         return found
 
     @property
     def rate(self) -> float:
-        """Ends a second beyond the longest run; 0 where no end was seen at all."""
+        """Ends per second beyond the longest run; 0 if no end was observed at all."""
         left, longest = float(self.weight[self.beyond].sum()), float(self.took.max(initial=0.0))
         return -math.log(left) / longest if 0.0 < left < 1.0 and longest > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
 class Trend:
-    """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier` is
-    that of each member (s)."""
+    """A duration that changes by `slope` s for each s of the latest run in `place`; `earlier`: that
+    earlier duration for each member (s)."""
 
     place: int
     slope: float
@@ -89,21 +91,22 @@ class Trend:
 
 @dataclass(frozen=True)
 class Split:
-    """What tells the contexts below a node apart."""
+    """The factor that separates the contexts below a node."""
 
     kind: str
     """outcome, action, visits or took."""
     place: int
     edges: tuple[float, ...] = ()
-    """took: where its classes end (s)."""
+    """For took: upper limits of its classes (s)."""
     missing: bool = False
-    """took: the first child is for trials in which no such run had ended."""
+    """For took: the first child is for trials in which no such run ended."""
     groups: Mapping[int, int] = field(default_factory=dict)
-    """outcome, action, visits: child of each code; any other code has the last child."""
+    """For outcome, action and visits: the child of each code; all other codes belong to the last
+    child."""
     p_value: float = 1.0
 
     def child(self, seen: Seen, count: int) -> Codes:
-        """Child of each column, from what was seen in all places."""
+        """Return the child of each column, from what ended before in all places."""
         if self.kind == "took":
             seconds = seen.took[self.place]
             group = np.searchsorted(np.array(self.edges), np.nan_to_num(seconds), side="right")
@@ -116,23 +119,23 @@ class Split:
 
 
 def codes_of(seen: Seen, kind: str) -> Codes:
-    """Codes (q, n) of a factor."""
+    """Return the codes (q, n) of a factor."""
     return {"outcome": seen.outcome, "action": seen.action, "visits": seen.visits}[kind]
 
 
 @dataclass
-class Context:
-    """A node of the tree: a law, and a split with children unless it is a leaf."""
+class ContextNode:
+    """A node of the tree: a distribution, and a split with children unless it is a leaf."""
 
-    law: Law
+    ends: EndDistribution
     number: int
     split: Split | None = None
-    children: list[Context] = field(default_factory=list)
-    durations: dict[int, Context] = field(default_factory=dict)
+    children: list[ContextNode] = field(default_factory=list)
+    durations: dict[int, ContextNode] = field(default_factory=dict)
     """In a leaf of an outcome tree: the tree of the durations of each outcome."""
 
-    def leaves(self) -> list[Context]:
-        """All contexts that no test splits further."""
+    def leaves(self) -> list[ContextNode]:
+        """Return all contexts that no test splits further."""
         return (
             [leaf for child in self.children for leaf in child.leaves()]
             if self.children
@@ -140,12 +143,13 @@ class Context:
         )
 
 
-class Laws:
-    """Laws of all actions of one regime: `contexts[(place code, action code)]`."""
+class RunDistributions:
+    """Outcome probabilities and duration distributions of all actions of one regime:
+    `contexts[(place code, action code)]`."""
 
     def __init__(self, training: Training, *, unfold: bool = True) -> None:
         self.vocabulary = training.vocabulary
-        self.contexts: dict[tuple[int, int], Context] = {}
+        self.contexts: dict[tuple[int, int], ContextNode] = {}
         self._numbers = 0
         runs = training.runs
         for key in sorted(set(zip(runs.place.tolist(), runs.action.tolist(), strict=True))):
@@ -154,12 +158,14 @@ class Laws:
 
     @property
     def count(self) -> int:
-        """Nodes of all trees."""
+        """Number of nodes of all trees."""
         return self._numbers
 
-    def _grow(self, runs: Runs, deepest: int, *, outcomes: bool) -> Context:
+    def _grow(self, runs: Runs, deepest: int, *, outcomes: bool) -> ContextNode:
         ended = with_weights(runs) if outcomes else runs
-        context = Context(_law(ended, trend=not outcomes and bool(deepest)), self._numbers)
+        context = ContextNode(
+            _distribution(ended, trend=not outcomes and bool(deepest)), self._numbers
+        )
         self._numbers += 1
         found = best_split(runs, outcomes=outcomes) if deepest and len(runs) >= 2 * LEAST else None
         if found is not None:
@@ -175,7 +181,7 @@ class Laws:
         return context
 
     def splits(self) -> list[dict[str, Any]]:
-        """What was told apart, for people: place, action, by what, how many contexts, p-value."""
+        """Describe all splits: place, action, factor, number of contexts, p-value."""
         names, out = self.vocabulary, []
         for (place, action), top in self.contexts.items():
             stack, outcomes = [top], {top.number}
@@ -191,7 +197,7 @@ class Laws:
                             "of": "outcome" if node.number in outcomes else "duration",
                             "by": f"{node.split.kind} of {names.places[node.split.place]}",
                             "contexts": len(node.children),
-                            "runs": len(node.law.took),
+                            "runs": len(node.ends.took),
                             "p": node.split.p_value,
                         }
                     )
@@ -200,14 +206,15 @@ class Laws:
 
 
 def with_weights(runs: Runs) -> Runs:
-    """The runs that ended, weighing their steps of the Aalen-Johansen estimate; the weights sum to
-    1.
+    """Return the runs that ended, weighted by the steps of the Aalen-Johansen estimate; the weights
+    sum to 1.
 
-    What it leaves is shared by the runs that were cut off after the last end, which stay as members
-    without an outcome (NONE).
+    The runs that were cut off after the last end stay as members without an outcome (NONE) and
+    share the weight that the estimate leaves.
     """
     ordered = runs.of(np.lexsort((runs.censored, runs.took)))
     n, ended = len(runs), ~ordered.censored
+    # Kaplan-Meier: an end leaves the share 1 - 1 / (runs still active) of the probability
     stays = np.where(ended, 1.0 - 1.0 / (n - np.arange(n)), 1.0)
     left = np.concatenate([[1.0], np.cumprod(stays)])
     last = int(np.flatnonzero(ended)[-1]) + 1 if ended.any() else 0
@@ -218,16 +225,16 @@ def with_weights(runs: Runs) -> Runs:
     )
 
 
-def _law(runs: Runs, *, trend: bool) -> Law:
+def _distribution(runs: Runs, *, trend: bool) -> EndDistribution:
     whole = runs.weight.sum()
     weight = runs.weight / whole if whole else runs.weight
-    return Law(
+    return EndDistribution(
         runs.outcome, runs.preempted, runs.took, weight, runs.trial, _trend(runs) if trend else None
     )
 
 
 def _trend(runs: Runs) -> Trend | None:
-    """The strongest linear dependence on an earlier duration, if it is beyond three standard
+    """Return the strongest linear dependence on an earlier duration, if it exceeds three standard
     errors."""
     best: Trend | None = None
     strongest, n = SURE, len(runs)
@@ -243,12 +250,13 @@ def _trend(runs: Runs) -> Trend | None:
 
 
 def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
-    """The most significant split of runs and the child of each run; None if no test rejects
+    """Return the most significant split of runs and the child of each run; None if no test rejects
     independence.
 
-    Of factors that tell about as much, one of the runs' own place: branches side by side go on in
-    step, so the visits of one tell those of the other in every trial that was run, but the branches
-    drift apart where they are played.
+    Among factors that explain about as much, one of the runs' own place is preferred. Parallel
+    branches advance in step, so in measured trials the visits of one tell as much as the visits of
+    the other; in simulated trials the branches drift apart, and only a branch's own visits are
+    reliable.
     """
     response = runs.outcome if outcomes else _classes(runs.took)
     groups = GROUPS // 2 if outcomes else GROUPS
@@ -273,7 +281,7 @@ def best_split(runs: Runs, *, outcomes: bool) -> tuple[Split, Codes] | None:
 
 
 def _classes(took: Values) -> Codes:
-    """Durations in four classes of about equal size."""
+    """Return durations in four classes of about equal size."""
     return np.searchsorted(np.quantile(took, (0.25, 0.5, 0.75)), took, side="right")
 
 
@@ -282,8 +290,9 @@ def _candidate(runs: Runs, kind: str, place: int) -> tuple[Split, Codes] | None:
     found, counts = np.unique(codes, return_counts=True)
     large = [int(c) for c, n in zip(found, counts, strict=True) if n >= LEAST]
     if len(found) - len(large) and len(codes) - counts[counts >= LEAST].sum() < LEAST and large:
-        # The rest joins the most visits that are frequent: a fourth visit is more like a third one
-        # than like a first one. Of classes without an order it joins the smallest large one.
+        # Too few runs for a class of their own join the largest frequent number of visits: a fourth
+        # visit resembles a third one more than a first one. Codes without an order join the
+        # smallest of the large classes.
         large.remove(
             max(large) if kind == "visits" else min(large, key=lambda c: int(counts[found == c][0]))
         )
@@ -310,8 +319,8 @@ def _by_duration(runs: Runs, place: int, most: int) -> tuple[Split, Codes] | Non
 
 
 def _log_p(child: Codes, response: Codes) -> float:
-    """Logarithm of the p-value of the chi-square test of independence; 0 where one of them does not
-    vary."""
+    """Return the logarithm of the p-value of the chi-square test of independence; 0 if one of the
+    codes does not vary."""
     table = crossed(child, response)
     if min(table.shape) < 2:
         return 0.0
@@ -320,7 +329,7 @@ def _log_p(child: Codes, response: Codes) -> float:
 
 
 def crossed(one: Codes, other: Codes) -> np.ndarray:
-    """Contingency table of two codes, only of those that occur."""
+    """Return the contingency table of two codes, for the codes that occur."""
     _, a = np.unique(one, return_inverse=True)
     _, b = np.unique(other, return_inverse=True)
     table = np.zeros((a.max() + 1, b.max() + 1), np.int64)
@@ -329,8 +338,8 @@ def crossed(one: Codes, other: Codes) -> np.ndarray:
 
 
 def dependences(training: Training) -> list[dict[str, Any]]:
-    """Chi-square tests of the statuses of two places within one trial (first runs), the most
-    significant first."""
+    """Test by chi-square the statuses of two places within one trial (first runs), the most
+    significant pair first."""
     vocabulary, runs = training.vocabulary, training.runs
     status = first_statuses(vocabulary, runs, len(training.trials))
     out = []
@@ -350,8 +359,8 @@ def dependences(training: Training) -> list[dict[str, Any]]:
 
 
 def first_statuses(vocabulary: Vocabulary, runs: Runs, trials: int) -> Codes:
-    """(q, trials): status code of the first run in each place of each trial; CENSORED - 1 where
-    there is none."""
+    """Return the status code of the first run in each place of each trial, (q, trials); CENSORED -
+    1 if there is none."""
     out = np.full((len(vocabulary.places), trials), CENSORED - 1)
     status, _ = vocabulary.parts(runs.outcome)
     for i in range(len(runs) - 1, -1, -1):
@@ -359,7 +368,7 @@ def first_statuses(vocabulary: Vocabulary, runs: Runs, trials: int) -> Codes:
     return out
 
 
-# Draws ends of runs and waits from laws, for many replicas at once, each with its own bootstrap weights of the trials.
+# --- drawing ends of runs and waits ---
 
 Mask = NDArray[np.bool_]
 
@@ -371,39 +380,42 @@ class Ends:
     outcome: Codes
     preempted: Mask
     took: Values
-    """s; infinite where no run was ever seen to end."""
+    """Duration (s); infinite if no run was ever observed to end."""
     beyond: Mask
-    """It lasts longer than any run that was seen: its end is an extrapolation."""
+    """The run lasts longer than any observed one: its end is an extrapolation."""
 
 
 class Drawer:
-    """`weights` (replicates, trials): how often each training trial counts in each replicate; `of`
-    each column's replicate."""
+    """Draws ends of runs and waits, for many replicates at once, each with its own bootstrap
+    weights of the trials.
+
+    `weights` (replicates, trials): how often each training trial counts in each replicate.
+    """
 
     def __init__(
         self,
-        laws: Laws,
+        runs: RunDistributions,
         waits: Mapping[str, tuple[Values, Codes]],
         weights: Values,
         random: np.random.Generator,
     ) -> None:
-        self._laws, self._waits, self._weights, self._random = laws, waits, weights, random
+        self._runs, self._waits, self._weights, self._random = runs, waits, weights, random
         self._bounds: dict[object, Values] = {}
 
     def ends(self, place: int, action: Codes, replicate: Codes, seen: Seen) -> Ends:
-        """Ends of runs that begin now in a place, given what had ended before.
+        """Draw the ends of runs that begin now in a place, given what ended before.
 
         Raises KeyError for an action that was never run there.
         """
         n = len(action)
         out = Ends(np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros(n), np.zeros(n, np.bool_))
         for code in np.unique(action):
-            top = self._laws.contexts[place, int(code)]
+            top = self._runs.contexts[place, int(code)]
             self._descend(top, np.flatnonzero(action == code), replicate, seen, out)
         return out
 
     def _descend(
-        self, node: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+        self, node: ContextNode, columns: Codes, replicate: Codes, seen: Seen, out: Ends
     ) -> None:
         if node.split is None:
             self._draw_leaf(node, columns, replicate, seen, out)
@@ -415,42 +427,44 @@ class Drawer:
                 self._descend(below, own, replicate, seen, out)
 
     def _draw_leaf(
-        self, leaf: Context, columns: Codes, replicate: Codes, seen: Seen, out: Ends
+        self, leaf: ContextNode, columns: Codes, replicate: Codes, seen: Seen, out: Ends
     ) -> None:
-        """First the outcome, then the duration from the outcome's own tree."""
-        law = leaf.law
-        index = self._draw(leaf.number, law.weight, law.trial, replicate[columns])
-        if not leaf.durations and not law.beyond.any():
-            out.took[columns] = law.took[index] + _along(law, index, seen.took[:, columns])
+        """Draw first the outcome, then the duration from the tree of that outcome."""
+        ends = leaf.ends
+        index = self._draw(leaf.number, ends.weight, ends.trial, replicate[columns])
+        if not leaf.durations and not ends.beyond.any():
+            out.took[columns] = ends.took[index] + _along(ends, index, seen.took[:, columns])
             np.clip(out.took, 0.0, None, out=out.took)
             return
-        out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
-        beyond = law.beyond[index]
+        out.outcome[columns], out.preempted[columns] = ends.outcome[index], ends.preempted[index]
+        beyond = ends.beyond[index]
         if beyond.any():
             self._draw_beyond(leaf, columns[beyond], replicate, out)
         for code, tree in leaf.durations.items():
-            own = columns[law.outcome[index] == code]
+            own = columns[ends.outcome[index] == code]
             if len(own):
                 self._descend(tree, own, replicate, seen, out)
 
-    def _draw_beyond(self, leaf: Context, columns: Codes, replicate: Codes, out: Ends) -> None:
-        """Longer than the longest run: at a constant rate, with outcomes in the shares of those
-        that were seen."""
-        law, seen = leaf.law, np.flatnonzero(~leaf.law.beyond)
+    def _draw_beyond(self, leaf: ContextNode, columns: Codes, replicate: Codes, out: Ends) -> None:
+        """Draw an end later than the longest run: at a constant rate, with outcomes in the observed
+        shares."""
+        ends, seen = leaf.ends, np.flatnonzero(~leaf.ends.beyond)
         out.beyond[columns] = True
-        if not law.rate or not len(seen):
+        if not ends.rate or not len(seen):
             out.outcome[columns], out.preempted[columns], out.took[columns] = CUT, False, np.inf
             return
         index = seen[
             self._draw(
-                (leaf.number, "beyond"), law.weight[seen], law.trial[seen], replicate[columns]
+                (leaf.number, "beyond"), ends.weight[seen], ends.trial[seen], replicate[columns]
             )
         ]
-        out.outcome[columns], out.preempted[columns] = law.outcome[index], law.preempted[index]
-        out.took[columns] = law.took.max() - np.log1p(-self._random.random(len(columns))) / law.rate
+        out.outcome[columns], out.preempted[columns] = ends.outcome[index], ends.preempted[index]
+        out.took[columns] = (
+            ends.took.max() - np.log1p(-self._random.random(len(columns))) / ends.rate
+        )
 
     def wait(self, transition: str, replicate: Codes) -> Values | None:
-        """Waits of a transition (s), one for each column; None if it was never measured."""
+        """Draw the wait of a transition (s) for each column; None if it was never measured."""
         if transition not in self._waits:
             return None
         seconds, trials = self._waits[transition]
@@ -459,13 +473,15 @@ class Drawer:
         return drawn
 
     def _draw(self, key: object, weight: Values, trials: Codes, replicate: Codes) -> Codes:
-        """A member for each column, by its replicate's weights; by the plain ones where those leave
-        none."""
+        """Draw a member for each column by the weights of its replicate; by the plain weights if
+        the replicate leaves none."""
         bounds = self._bounds.get(key)
         if bounds is None:
             each = weight * self._weights[:, trials]
             each = np.where(each.sum(axis=1, keepdims=True) > 0, each, weight)
             bounds = np.cumsum(each, axis=1)
+            # Row b of cumulated weights is shifted to (b, b + 1], so that one searchsorted over all
+            # rows draws for all replicates at once.
             bounds = bounds / bounds[:, -1:] + np.arange(len(bounds))[:, None]
             self._bounds[key] = bounds
         members = bounds.shape[1]
@@ -476,14 +492,14 @@ class Drawer:
         return index
 
     def chance(self, n: int) -> Values:
-        """Uniform numbers."""
+        """Return uniform numbers."""
         return self._random.random(n)
 
 
-def _along(law: Law, index: Codes, took: Values) -> Values:
-    """What the trend of a law adds to drawn durations, for columns in which other runs took other
-    times before."""
-    if law.trend is None:
+def _along(ends: EndDistribution, index: Codes, took: Values) -> Values:
+    """Return what the trend adds to drawn durations, for columns whose earlier run had another
+    duration than the member's."""
+    if ends.trend is None:
         return np.zeros(len(index))
-    now = took[law.trend.place]
-    return law.trend.slope * np.where(np.isnan(now), 0.0, now - law.trend.earlier[index])
+    now = took[ends.trend.place]
+    return ends.trend.slope * np.where(np.isnan(now), 0.0, now - ends.trend.earlier[index])

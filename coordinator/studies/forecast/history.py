@@ -1,5 +1,5 @@
-"""Runs of a campaign as arrays: what each came to, how long it took, and what had ended before it
-in its trial."""
+"""Runs of a campaign as arrays: what each yielded, how long it took, and what ended before it in
+its trial."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from petrobot.coordinator.learning.estimate import Tally
 from petrobot.coordinator.learning.estimates_file import EstimatesError, EstimatesFile
 from petrobot.coordinator.learning.learning import Estimates
 from petrobot.coordinator.studies.campaign.observed import context_of, regime_of
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.task import End, Kind, Status, Task, Transition
 
@@ -29,7 +29,7 @@ CENSORED = -1
 NONE = 0
 """Outcome and action code of a place where no run has ended in this trial yet."""
 CUT = 1
-"""Outcome code of a run that nothing is known to end: no status, and no transition took it."""
+"""Outcome code of a run whose end is unknown: no status, and no transition took its token."""
 STATUSES: Final[tuple[Status, ...]] = tuple(Status)
 
 
@@ -39,22 +39,22 @@ class ForecastError(Exception):
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Numbers for names: action places, transitions and actions of a flat task."""
+    """Numeric codes of the action places, transitions and actions of a flat task."""
 
     places: tuple[str, ...]
     transitions: tuple[str, ...]
     actions: tuple[str, ...]
     open: frozenset[str] = frozenset()
-    """Places whose ended runs the marking alone does not lead on (an event, a timer or a variable
-    decides): there the transition that took a run belongs to its outcome; elsewhere it follows from
-    the statuses and from what else has ended."""
+    """Places where an event, a timer or a variable decides how an ended run continues. Only there,
+    the transition that took the run is part of its outcome; elsewhere it follows from the statuses
+    and from what else ended."""
     cutting: frozenset[str] = frozenset()
-    """Transitions that preempt as soon as the marking allows it: they cut runs off, whose own ends
-    are then not known."""
+    """Transitions that preempt as soon as the marking allows it. They cut runs off, so the runs'
+    own ends are unknown."""
 
     @classmethod
     def of(cls, task: Task) -> Vocabulary:
-        """Of a task."""
+        """Return the codes of a task."""
         flat = task.flat
         taking = [
             t
@@ -74,31 +74,31 @@ class Vocabulary:
         return cls(places, tuple(flat.transitions), tuple(actions), undecided, frozenset(cutting))
 
     def outcome(self, status: int, taken: int) -> int:
-        """One code, above 0, for a status code and the transition that took the token (-1: none
-        did)."""
+        """Return one code, above 0, for a status code and the transition that took the token (-1:
+        none)."""
         return CUT + (status + 1) * (len(self.transitions) + 1) + taken + 1
 
     def parts(self, outcome: Codes) -> tuple[Codes, Codes]:
-        """Status codes and transitions behind outcome codes above 0."""
+        """Return the status codes and transitions of outcome codes above 0."""
         status, taken = np.divmod(outcome - CUT, len(self.transitions) + 1)
         return status - 1, taken - 1
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What had ended before in the same trial. Arrays (q places, n columns)."""
+    """What ended before in the same trial. Arrays (q places, n columns)."""
 
     outcome: Codes
-    """Of the latest run in each place; NONE without any."""
+    """Outcome of the latest run in each place; NONE if there is none."""
     action: Codes
     took: Values
-    """s; nan without any."""
+    """Its duration (s); nan if there is none."""
     visits: Codes
-    """How many runs had ended there."""
+    """Number of runs that ended there."""
 
     @classmethod
     def nothing(cls, q: int, n: int) -> Seen:
-        """Nothing has ended yet."""
+        """Return the state in which nothing has ended yet."""
         return cls(
             np.zeros((q, n), np.int64),
             np.zeros((q, n), np.int64),
@@ -107,7 +107,7 @@ class Seen:
         )
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Seen:
-        """Some columns."""
+        """Select columns."""
         return Seen(
             self.outcome[:, which],
             self.action[:, which],
@@ -116,7 +116,7 @@ class Seen:
         )
 
     def note(self, q: int, columns: Codes, outcome: Codes, action: Codes, took: Values) -> None:
-        """Runs have ended in a place."""
+        """Record that runs ended in a place."""
         self.outcome[q, columns], self.action[q, columns], self.took[q, columns] = (
             outcome,
             action,
@@ -127,25 +127,25 @@ class Seen:
 
 @dataclass(frozen=True)
 class Runs:
-    """All runs of some trials. `n` runs, `q` action places."""
+    """All runs of some trials: `n` runs, `q` action places."""
 
     place: Codes
     action: Codes
     """Code of the action, above 0."""
     outcome: Codes
     preempted: NDArray[np.bool_]
-    """A transition took its token while it went on."""
+    """A transition took its token while it was active."""
     censored: NDArray[np.bool_]
-    """Something cut it off: its own end is not known, only that it had lasted so long."""
+    """It was cut off: only known to have lasted at least so long."""
     took: Values
-    """s from the token's coming to its end."""
+    """Seconds from the arrival of its token to its end."""
     trial: Codes
     """Index of its trial."""
     weight: Values
     seen: Seen
 
     def of(self, which: NDArray[np.bool_] | Codes) -> Runs:
-        """Some of them."""
+        """Select runs."""
         return Runs(
             self.place[which],
             self.action[which],
@@ -164,24 +164,24 @@ class Runs:
 
 @dataclass(frozen=True)
 class Training:
-    """What a regime's trials are known to be."""
+    """The measured trials of a regime."""
 
     task: Task
     vocabulary: Vocabulary
     trials: tuple[Trial, ...]
     runs: Runs
     waits: dict[str, tuple[Values, Codes]]
-    """By waiting transition: seconds of each firing, and the trial that it belongs to."""
+    """By waiting transition: seconds of each firing, and the index of its trial."""
     whole: bool = True
-    """Its trials are those that were run; else each holds a single run or wait, and what a trial
-    came to is not known."""
+    """True if the trials are those that were run. Otherwise each holds a single run or wait, and
+    the result of a whole trial is unknown."""
 
     @classmethod
     def of(cls, task: Task, trials: Iterable[Trial], *, whole: bool = True) -> Training:
-        """Of trials. Raises ValueError without any."""
+        """Prepare trials. Raises ValueError if there are none."""
         kept, vocabulary = tuple(trials), Vocabulary.of(task)
         if not kept:
-            raise ValueError("no trial to learn from")
+            raise ValueError("expected at least one trial to learn from, got none")
         waits: dict[str, list[tuple[float, int]]] = {}
         timers = _cutting_timers(task)
         for i, trial in enumerate(kept):
@@ -203,8 +203,8 @@ class Training:
         )
 
 
-def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
-    """The training of each regime of a table."""
+def by_regime(task: Task, rows: Iterable[TrialRow]) -> dict[str, Training]:
+    """Return the training of each regime of a table."""
     trials: dict[str, list[Trial]] = {}
     for row in rows:
         if row.trial is not None:
@@ -213,8 +213,8 @@ def by_regime(task: Task, rows: Iterable[Row]) -> dict[str, Training]:
 
 
 def _cutting_timers(task: Task) -> list[str]:
-    """Timers that preempt beside other runs and wait for nothing but runs: their waits follow from
-    those that they took."""
+    """Return timers that preempt beside other runs and wait for nothing but runs: their waits
+    follow from the runs that they took."""
     return [
         t.name
         for t in task.flat.transitions.values()
@@ -227,8 +227,8 @@ def _cutting_timers(task: Task) -> list[str]:
 
 
 def _waited(timer: str, trial: Trial) -> list[float]:
-    """Seconds of each firing of a timer, from when the last run that it takes had begun (or ended,
-    where it takes ended ones)."""
+    """Return the seconds of each firing of a timer, from when the last run that it takes began (or
+    ended, if it takes ended ones)."""
     by_place: dict[str, list[RunEntry]] = {}
     for run in trial.runs:
         if run.taken == timer:
@@ -276,8 +276,10 @@ def _runs(vocabulary: Vocabulary, trials: tuple[Trial, ...]) -> Runs:
 
 
 def _ended_before(flat: list[tuple[int, RunEntry]], j: int, begin: int, end: int) -> list[int]:
-    """Runs of the same trial that had ended when run j began, in the order of their ends."""
+    """Return the runs of the same trial that ended before run j began, in the order of their
+    ends."""
     came = flat[j][1].begun
+    # 1e-9 s: times are rounded to microseconds, but their sums are not
     over = [
         i for i in range(begin, end) if i != j and flat[i][1].begun + flat[i][1].took <= came + 1e-9
     ]
@@ -291,25 +293,28 @@ def _outcome(vocabulary: Vocabulary, run: RunEntry) -> int:
 
 
 def _is_cut_off(vocabulary: Vocabulary, run: RunEntry) -> bool:
-    """By a transition that fires as the marking allows, or by nothing of the task (an abort, the
-    end of the records)."""
+    """Return whether a run was cut off: by a transition that fires as the marking allows, or by
+    nothing of the task (an abort, the end of the records)."""
     if run.cancelled and run.taken in vocabulary.transitions:
         return run.taken in vocabulary.cutting
     return not run.status
 
 
 def reads_variables(t: Transition) -> bool:
-    """Whether its condition looks at more than the statuses of the runs that it takes."""
+    """Return whether a transition's condition reads more than the statuses of the runs that it
+    takes."""
     return t.when is not None and not t.when.names <= {
         f"{a.place}.status" for a in t.inputs if a.end is not None
     }
 
 
-# Training from an estimates file, where only sums and samples of runs are left: every run stands for itself, without history.
+# --- training from an estimates file ---
+
+# It holds only sums and samples of runs, so each run stands alone, without what ended before it.
 
 
 def read_estimates(path: Path) -> Estimates:
-    """What an estimates file holds. Raises ForecastError."""
+    """Read an estimates file. Raises ForecastError."""
     try:
         kept = EstimatesFile(path).read() if path.exists() else None
     except EstimatesError as fault:
@@ -323,7 +328,7 @@ def read_estimates(path: Path) -> Estimates:
 
 
 def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
-    """Of estimates, by regime."""
+    """Return the training of each regime in an estimates file."""
     regimes = sorted({regime_of(key.context) for key in estimates.tallies})
     return {
         regime: Training.of(task, _trials(task, estimates, regime), whole=False)
@@ -332,8 +337,7 @@ def trainings_of(task: Task, estimates: Estimates) -> dict[str, Training]:
 
 
 def _trials(task: Task, estimates: Estimates, regime: str) -> list[Trial]:
-    """A trial of its own for each run of the samples, as often as it stands for a run that was
-    counted."""
+    """Return one trial for each run of the samples, as often as it stands for a counted run."""
     flat, context = task.flat, context_of(regime)
     out: list[Trial] = []
     for place in flat.places.values():
@@ -352,8 +356,8 @@ def _trials(task: Task, estimates: Estimates, regime: str) -> list[Trial]:
 
 
 def _runs_of_sums(place: str, action: str, tally: Tally) -> list[RunEntry]:
-    """Runs with the counts of the tally and the durations of its sample (each exit's, again and
-    again; its mean without any)."""
+    """Return runs with the counts of the tally and the durations of its sample, repeated as needed;
+    the mean if an exit has no sampled run."""
     out: list[RunEntry] = []
     for exit_, moments in tally.durations.items():
         counted, _, transition = exit_.partition(":")

@@ -1,5 +1,5 @@
-"""The forecast of one regime: expected numbers, predictive samples by a cluster bootstrap, and the
-product rule beside them."""
+"""The forecast of one regime: expected figures, predictive samples by a cluster bootstrap, and the
+product rule for comparison."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.studies.forecast.choices import choice_counts, choices_of
-from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws, dependences
+from petrobot.coordinator.studies.forecast.distributions import (
+    Drawer,
+    RunDistributions,
+    dependences,
+)
 from petrobot.coordinator.studies.forecast.history import Training, Values
 from petrobot.coordinator.studies.forecast.net_arrays import SUCCESS, Structure
 from petrobot.coordinator.studies.forecast.play import Choices, Play, Played
@@ -17,24 +21,24 @@ from petrobot.coordinator.studies.forecast.residual import doubts, residuals, ro
 from petrobot.coordinator.studies.forecast.shares import predictive_interval, share_weight
 
 POINT = 40_000
-"""Trials played for the expected numbers: the simulation's own error of a share is then below 0.25
-points."""
+"""Trials simulated for the expected figures. The simulation error of a share is then below 0.25
+points (standard error sqrt(0.25 / 40000))."""
 REPLICATES = 200
 TOGETHER = 25_000
-"""Trials played side by side."""
+"""Trials simulated side by side."""
 LEVEL = 0.95
 SHARES = ("R_goal", "P_complete", "R_conj")
 TIMES = ("mean", "q90")
 GRID = tuple(float(q) for q in np.linspace(0.005, 0.995, 100))
-"""Probabilities at which the law of the time is kept."""
+"""Probabilities at which the distribution of the time is stored."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a forecast."""
+    """What a forecast is asked for."""
 
     runs: int
-    """Trials that will be run."""
+    """Number of trials that will be run."""
     choices: Choices
     seed: int = 1
     replicates: int = REPLICATES
@@ -42,7 +46,7 @@ class Request:
 
 
 def figures(played: Played) -> dict[str, float]:
-    """The numbers that are forecast, of played or measured trials; times are nan where no trial
+    """Return the forecast figures of simulated or measured trials; times are nan if no trial
     completed."""
     times = played.time[played.completed & ~np.isnan(played.time)]
     return {
@@ -57,17 +61,19 @@ def figures(played: Played) -> dict[str, float]:
 def predict(training: Training, request: Request) -> dict[str, Any]:
     """Forecast further trials of a regime. Raises ValueError for a choice that was never
     measured."""
-    structure, laws = Structure.of(training.task), Laws(training)
-    _refuse_unmeasured(training, laws, request.choices)
+    structure, measured_runs = Structure.of(training.task), RunDistributions(training)
+    _refuse_unmeasured(training, measured_runs, request.choices)
     random = np.random.default_rng(request.seed)
     even = np.ones((1, len(training.trials)))
     residual = (
-        residuals(training, _replayed(training, structure, laws, request)) if training.whole else []
+        residuals(training, _replayed(training, structure, measured_runs, request))
+        if training.whole
+        else []
     )
     whole = _played(
-        training, structure, laws, request, even, np.zeros(request.point, np.int64), random
+        training, structure, measured_runs, request, even, np.zeros(request.point, np.int64), random
     )
-    samples, distances = _bootstrap(training, structure, laws, request, whole, random)
+    samples, distances = _bootstrap(training, structure, measured_runs, request, whole, random)
     point = figures(whole)
     times = whole.time[whole.completed]
     return {
@@ -80,8 +86,8 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
         "product": product_rule(training, request.choices),
         "law": {"q": list(GRID), "s": _rounded(np.quantile(times, GRID)) if len(times) else []},
         "distance_99": round(float(np.quantile(distances, 0.99)), 6),
-        "contexts": laws.count,
-        "splits": laws.splits(),
+        "contexts": measured_runs.count,
+        "splits": measured_runs.splits(),
         "dependence": dependences(training),
         "residual": residual,
         "doubts": doubts(residual, whole, request.point),
@@ -100,67 +106,79 @@ def predict(training: Training, request: Request) -> dict[str, Any]:
     }
 
 
-def _refuse_unmeasured(training: Training, laws: Laws, choices: Choices) -> None:
+def _refuse_unmeasured(
+    training: Training, measured_runs: RunDistributions, choices: Choices
+) -> None:
     names = training.vocabulary
     for q, place in enumerate(names.places):
         primitive = training.task.primitive_task_of(place).name
         for action, probability in choices.get(primitive, {}).items():
-            measured_there = any(key[0] == q for key in laws.contexts)
+            measured_there = any(key[0] == q for key in measured_runs.contexts)
             if (
                 probability > 0
                 and measured_there
-                and (q, names.actions.index(action) + 1) not in laws.contexts
+                and (q, names.actions.index(action) + 1) not in measured_runs.contexts
             ):
                 raise ValueError(
-                    f"{primitive}: {action} was never run in {place}; train with --selector random"
+                    f"{primitive}: {action} was never run in {place}, so nothing is known of it; train "
+                    "with --selector random"
                 )
 
 
 def _played(
     training: Training,
     structure: Structure,
-    laws: Laws,
+    measured_runs: RunDistributions,
     request: Request,
     weights: Values,
     replicate: np.ndarray,
     random: np.random.Generator,
 ) -> Played:
-    drawer = Drawer(laws, training.waits, weights, random)
+    drawer = Drawer(measured_runs, training.waits, weights, random)
     try:
         return Play(structure, drawer, request.choices, replicate, longest_of(training)).run()
     except KeyError as fault:
         place, action = fault.args[0]
         names = training.vocabulary
-        text = f"{names.places[place]}: no run of {names.actions[action - 1]} was measured"
+        text = (
+            f"{names.places[place]}: no run of {names.actions[action - 1]} was measured; train "
+            "with more trials"
+        )
         raise ValueError(text) from fault
 
 
-def _replayed(training: Training, structure: Structure, laws: Laws, request: Request) -> Played:
-    """Four times as many trials as were run, with the choices of the training."""
+def _replayed(
+    training: Training, structure: Structure, measured_runs: RunDistributions, request: Request
+) -> Played:
+    """Simulate four times as many trials as were run, with the choices of the training."""
     n = len(training.trials)
     own = Request(request.runs, choices_of(training), request.seed)
     random = np.random.default_rng([request.seed, 1])
     return _played(
-        training, structure, laws, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random
+        training, structure, measured_runs, own, np.ones((1, n)), np.zeros(4 * n, np.int64), random
     )
 
 
 def longest_of(training: Training) -> int:
-    """Steps after which a played trial counts as endless: twenty times as many as the longest
-    measured one had, and a hundred."""
+    """Return the number of steps after which a simulated trial counts as endless: 100 plus twenty
+    times the longest measured trial."""
     return 100 + 20 * max(len(trial.runs) + len(trial.waits) for trial in training.trials)
 
 
 def _bootstrap(
     training: Training,
     structure: Structure,
-    laws: Laws,
+    measured_runs: RunDistributions,
     request: Request,
     whole: Played,
     random: np.random.Generator,
 ) -> tuple[dict[str, Values], Values]:
-    """Figures of `runs` new trials under resampled training trials, and how far each law of the
-    time is from the whole one."""
+    """Return the figures of `runs` new trials for resampled training trials, and the distance of
+    each distribution of the time from the whole one.
+
+    Trials are resampled as a whole (cluster bootstrap), because the runs of one trial depend on
+    each other.
+    """
     n = len(training.trials)
     at_once = max(1, TOGETHER // request.runs)
     found: dict[str, list[float]] = {name: [] for name in (*SHARES, *TIMES)}
@@ -170,7 +188,7 @@ def _bootstrap(
         count = min(at_once, request.replicates - begin)
         weights = random.multinomial(n, np.full(n, 1.0 / n), size=count).astype(np.float64)
         replicate = np.repeat(np.arange(count), request.runs)
-        played = _played(training, structure, laws, request, weights, replicate, random)
+        played = _played(training, structure, measured_runs, request, weights, replicate, random)
         for b in range(count):
             own = replicate == b
             one = Played(
@@ -183,7 +201,7 @@ def _bootstrap(
 
 
 def distance(sample: Values, reference: Values) -> float:
-    """Kolmogorov's distance of a sample's law from that of a (large, sorted) reference."""
+    """Return Kolmogorov's distance between a sample and a (large, sorted) reference."""
     if not len(sample) or not len(reference):
         return 1.0
     ordered = np.sort(sample)
@@ -210,8 +228,8 @@ def _figure(
 
 
 def product_rule(training: Training, choices: Choices) -> dict[str, Any]:
-    """The product of reliabilities over the places of the normal flow: R_conj of a series, if all
-    were independent."""
+    """Return the product of reliabilities over the places of the normal flow: R_conj of a series,
+    if all were independent."""
     names, runs = training.vocabulary, training.runs
     status, _ = names.parts(runs.outcome)
     normal = [q for q, p in enumerate(names.places) if p not in training.task.flat.error_elements]

@@ -1,5 +1,5 @@
-"""Forecast files: written before the runs, with the time, a hash of what they rest on, and a hash
-of what they say."""
+"""Forecast files: written before the runs, with the time, a hash of their basis and a hash of their
+contents."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from petrobot.coordinator.analysis.time.completion import law
 from petrobot.coordinator.analysis.time.stochastic import NoEstimate, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast as solve
 from petrobot.coordinator.learning.learning import Estimates
-from petrobot.coordinator.learning.propagation import Choice, measured_from
+from petrobot.coordinator.learning.propagation import ChoiceShares, measured_from
 from petrobot.coordinator.studies.campaign.observed import context_of
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, predict
@@ -35,9 +35,9 @@ METHOD = (
     "durations, statuses of one trial independent of each other."
 )
 LARGEST = 50_000
-"""Markings up to which the stochastic view is solved."""
+"""Largest number of markings for which the stochastic view is solved."""
 JUMPS = 20_000
-"""Jumps of the uniformised chain up to which its quantile is worked out."""
+"""Largest number of jumps of the uniformised chain for which its quantile is computed."""
 
 
 def register(
@@ -47,8 +47,8 @@ def register(
     about: Mapping[str, Any],
     estimates: Estimates | None = None,
 ) -> dict[str, Any]:
-    """A forecast of the regimes in `requests`; `about` says what it rests on. With `estimates` the
-    stochastic view stands beside.
+    """Make a forecast of the regimes in `requests`; `about` describes its basis. With `estimates`,
+    the solution of the stochastic view is added.
 
     Raises ForecastError.
     """
@@ -56,7 +56,7 @@ def register(
     for name, request in requests.items():
         if name not in trainings:
             raise ForecastError(
-                f"no trial of regime {name} was measured; there are {', '.join(trainings)}"
+                f"no trial of regime {name} was measured; measured: {', '.join(trainings)}"
             )
         try:
             regimes[name] = predict(trainings[name], request) | {"choices": request.choices}
@@ -72,7 +72,7 @@ def register(
         **about,
         "regimes": regimes,
     }
-    body = finite(told)  # as the file will say it: the hash must be the same when it is read again
+    body = finite(told)  # as it will be read from the file, so that the hash is the same then
     return {**body, "sha256": _hash(body)}
 
 
@@ -81,53 +81,54 @@ def _hash(body: Mapping[str, Any]) -> str:
 
 
 def write(path: Path, forecast: Mapping[str, Any]) -> None:
-    """Raises ForecastError; a file that is there already is never written over."""
+    """Write a forecast file. Raises ForecastError, also if the file exists: a registered forecast
+    is never overwritten."""
     text = json_text(forecast, indent=2) + "\n"
     try:
         make_folder(path.parent)
         write_whole(path, text, fresh=True)
     except FileExistsError as fault:
         raise ForecastError(
-            f"{path} is there already: a registered forecast stays as it is; give another --out"
+            f"{path} exists: a registered forecast is never overwritten; give another --out"
         ) from fault
     except OSError as fault:
         raise ForecastError(f"{path}: {fault.strerror or fault}") from fault
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Raises ForecastError, also when the file was changed after it was written."""
+    """Read a forecast file. Raises ForecastError, also if the file was changed after it was
+    written."""
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         body = {key: value for key, value in found.items() if key != "sha256"}
         if found["schema"] != SCHEMA:
-            raise ForecastError(f"{path}: schema {found['schema']!r}, this petrobot reads {SCHEMA}")
+            raise ForecastError(f"{path}: schema: expected {SCHEMA}, got {found['schema']!r}")
         said = found["sha256"]
     except OSError as fault:
         raise _no_forecast(path, fault.strerror or str(fault)) from fault
     except ValueError as fault:
-        raise _no_forecast(path, f"it is no JSON ({fault})") from fault
+        raise _no_forecast(path, f"not JSON ({fault})") from fault
     except (KeyError, TypeError, AttributeError) as fault:
-        raise _no_forecast(path, "a table with schema and sha256 is missing") from fault
+        raise _no_forecast(path, "expected an object with schema and sha256") from fault
     if said != _hash(body):
-        raise ForecastError(f"{path} was changed after it was registered")
+        raise ForecastError(f"{path} was changed after it was registered; restore it from a copy")
     for regime in found["regimes"].values():
-        if "training_throws" in regime:  # files registered before a throw became a trial
+        if "training_throws" in regime:  # key in files of older versions
             regime["training_trials"] = regime.pop("training_throws")
     return found
 
 
 def _no_forecast(path: Path, why: str) -> ForecastError:
     return ForecastError(
-        f"{path} is no forecast: {why}; give a file that `petrobot forecast --out FILE` wrote"
+        f"{path} is not a forecast: {why}; give a file that `petrobot forecast --out FILE` wrote"
     )
 
 
-def exact(task: Task, estimates: Estimates, regime: str, choice: Choice) -> dict[str, Any]:
-    """The numbers of the stochastic view for one run of the task; only `why` where it cannot be
-    solved.
+def exact(task: Task, estimates: Estimates, regime: str, choice: ChoiceShares) -> dict[str, Any]:
+    """Return the figures of the stochastic view for one trial; only `why` if it cannot be solved.
 
-    Its times begin with the initial marking, so they hold the wait for the event that begins the
-    run, too.
+    Its times begin with the initial marking, so they include the wait for the event that begins the
+    trial.
     """
     try:
         view = stochastic_view(task, measured_from(task, estimates, context_of(regime), choice))

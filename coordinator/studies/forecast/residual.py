@@ -1,5 +1,5 @@
-"""Whether a forecast can be true: trials played with the training's own choices against the trials
-that they were learned from."""
+"""Check a forecast against its own training: simulate trials with the training's choices and
+compare them with the training trials."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from petrobot.coordinator.studies.forecast.play import Choices, Played
 from petrobot.coordinator.studies.forecast.shares import holm
 
 LEVEL = 0.01
-"""Level at which played and measured trials differ, over all tests of a regime (Holm)."""
+"""Significance level at which simulated and measured trials differ, over all tests of a regime
+(Holm)."""
 NEGLIGIBLE = 0.02
-"""Share of trials that may rest on a guess, or by which a share of played trials may miss the
-measured one: what is less moves no forecast share by more than the margin of equivalence."""
+"""Share of trials that may rest on a guess, or by which a simulated share may miss the measured
+one. Less than this moves no forecast share by more than the margin of equivalence."""
 TIME, MEAN = "time", "mean time"
 OFF_TIME = 0.05
-"""The same of mean times (relative) and of shares of trials in classes of the time."""
+"""The same for mean times (relative) and for shares of trials in classes of the time."""
 
 
 def measured(training: Training) -> Played:
-    """Measured trials in the form of played ones."""
+    """Return measured trials in the form of simulated ones."""
     trials = training.trials
     return Played(
         np.array([t.goals for t in trials], np.int64),
@@ -35,12 +36,12 @@ def measured(training: Training) -> Played:
 
 
 def residuals(training: Training, played: Played) -> list[dict[str, Any]]:
-    """Chi-square tests that measured and played trials come from one law, with p, Holm's p and how
-    far off they are.
+    """Test by chi-square whether measured and simulated trials have the same distributions; returns
+    p, Holm's p and the difference.
 
-    Goals, completion, all-SUCCESS, classes of the time, its mean, and for each place by which
-    transitions its runs left it. `off` is the largest difference of two shares; of the mean time
-    the relative one.
+    Tested are goals, completion, all-SUCCESS, classes of the time, its mean, and for each place the
+    transitions by which its runs left it. `off` is the largest difference of two shares; for the
+    mean time, the relative difference.
     """
     real = measured(training)
     tables = {
@@ -70,7 +71,7 @@ def _shares(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _same_mean(one: Values, other: Values) -> float:
-    """Welch's test: classes say little about a few trials that last very long."""
+    """Welch's test of equal means: classes tell little about a few trials that last very long."""
     kept_one, kept_other = one[~np.isnan(one)], other[~np.isnan(other)]
     if min(len(kept_one), len(kept_other)) < 2 or kept_one.std() + kept_other.std() == 0:
         return 1.0
@@ -91,7 +92,8 @@ def _mean_off(one: Values, other: Values) -> float:
 
 
 def _p_value(table: np.ndarray) -> float:
-    """1 where there is nothing to compare; 0 where one of them has no such thing at all."""
+    """Return the p-value; 1 if there is nothing to compare, 0 if only one side has any such
+    trials."""
     if table.shape[1] == 0 or (table.shape[1] == 1 and table.min() > 0):
         return 1.0
     return float(chi2_contingency(table).pvalue) if table.sum(axis=1).min() > 0 else 0.0
@@ -108,10 +110,10 @@ def _classes(times: Values, of: Values) -> Values:
 
 
 def routing(training: Training, choices: Choices | None = None) -> dict[str, dict[str, int]]:
-    """By action place: how often each transition took a token out of it.
+    """Return, by action place, how often each transition took a token from it.
 
-    With `choices` only in trials all of whose runs might have been chosen so: they alone say how
-    such trials go on.
+    With `choices`: only in trials all of whose runs could have been chosen so, because only they
+    tell how such trials continue.
     """
     primitive = training.task.primitive_task_of
     out: dict[str, dict[str, int]] = {}
@@ -129,20 +131,20 @@ def routing(training: Training, choices: Choices | None = None) -> dict[str, dic
 
 
 def ways_table(before: Mapping[str, int], after: Mapping[str, int]) -> np.ndarray:
-    """Contingency table (2, ways) of two countings of ways out of a place."""
+    """Return the contingency table (2, ways) of two counts of outgoing transitions of a place."""
     ways = sorted({*before, *after})
     return np.array([[counts.get(way, 0) for way in ways] for counts in (before, after)])
 
 
 def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -> list[str]:
-    """Why a forecast is doubtful, in words; nothing where it is not. `trials` were played for the
-    forecast.
+    """Return in words why a forecast is doubtful; empty if it is not. `trials`: number of trials
+    simulated for the forecast.
 
-    Played trials have to be off by more than chance and by more than matters: with many trials the
-    first alone says little.
+    Simulated trials must differ by more than chance and by more than what matters: with many
+    trials, a significant difference alone means little.
     """
     out = [
-        "trials played with the training's own choices differ from the training's: "
+        "simulated trials with the training's own choices differ from the measured ones: "
         f"{row['of']}, off by {row['off']:.1%} "
         f"(p = {row['p_holm']:.1e})"
         for row in residual
@@ -152,21 +154,20 @@ def doubts(residual: Sequence[Mapping[str, Any]], played: Played, trials: int) -
     for place, n in sorted(played.beyond.items()):
         if n > NEGLIGIBLE * trials:
             out.append(
-                f"in {n / trials:.1%} of the trials played a run in {place} goes on for "
-                "longer than any that was measured: "
-                "what it comes to then is a guess; train with runs that nothing cuts off so early"
+                f"in {n / trials:.1%} of the simulated trials a run in {place} lasts longer than "
+                "any measured one, so its end is a guess; train with runs that are not cut off "
+                "so early"
             )
     for name, n in sorted(played.astray.items()):
         if n > NEGLIGIBLE * trials:
             out.append(
-                f"in {n / trials:.1%} of the trials played {name} comes when the marking "
-                "does not allow it: how long a run goes on "
-                "until it is preempted depends on more than the run"
+                f"in {n / trials:.1%} of the simulated trials {name} comes when the marking does "
+                "not allow it: when a run is preempted depends on more than the run"
             )
     if played.endless > NEGLIGIBLE * trials:
         out.append(
-            f"{played.endless / trials:.1%} of the trials played never end: branches that "
-            "watch each other need more training "
-            "trials, so that the contexts can tell them apart"
+            f"{played.endless / trials:.1%} of the simulated trials never end; branches that "
+            "wait for each other need more training trials, so that contexts can be "
+            "distinguished"
         )
     return out

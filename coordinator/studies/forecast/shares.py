@@ -1,8 +1,8 @@
-"""Tests of shares: the predictive law of a share of new trials, and Holm's adjustment.
+"""Tests of shares: the predictive distribution of a share of new trials, and Holm's adjustment.
 
-The law is beta-binomial about the forecast, weighing as many trials as the forecast is sure of,
-with Jeffreys' prior: a share of 1 that was forecast from n trials still expects a miss now and then
-in a further n.
+The distribution is beta-binomial around the forecast. Its weight is the number of trials that would
+give the forecast's own uncertainty, with the Jeffreys prior: a share of 1 that was forecast from n
+trials still allows a miss in another n.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from scipy.stats import betabinom
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjusted p-values: each may be compared with the level for all of them together."""
+    """Adjust p-values by Holm's method: each one can then be compared with the significance level
+    for all of them together."""
     order = np.argsort(p_values, kind="stable")
     out, largest = [0.0] * len(p_values), 0.0
     for rank, i in enumerate(order):
@@ -24,12 +25,13 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def share_weight(value: float, sd: float, runs: int, training: int) -> float:
-    """How many trials the forecast of a share weighs: from its predictive deviation less the noise
-    of `runs` new trials.
+    """Return how many trials a forecast share is worth: from its predictive variance minus the
+    sampling variance of `runs` new trials.
 
-    At most as much as the training trials themselves; exactly that where the bootstrap saw no
-    variation.
+    At most the number of training trials; exactly that number if the bootstrap saw no variation.
     """
+    # variance of a new share = value (1 - value) / runs + own variance of the forecast;
+    # a share of weight w has the own variance value (1 - value) / w
     noise = value * (1.0 - value)
     own = sd * sd - noise / runs
     return float(training) if noise <= 0.0 or own <= noise / training else max(2.0, noise / own)
@@ -40,14 +42,14 @@ def _beta(value: float, weight: float) -> tuple[float, float]:
 
 
 def predictive_interval(value: float, weight: float, n: int, level: float = 0.95) -> list[float]:
-    """In which a share of n new trials is expected."""
+    """Return the interval in which a share of n new trials is expected."""
     a, b = _beta(value, weight)
     low, high = betabinom.ppf([(1 - level) / 2, (1 + level) / 2], n, a, b)
     return [round(float(low) / n, 6), round(float(high) / n, 6)]
 
 
 def share_p_value(value: float, weight: float, count: int, n: int) -> float:
-    """Two-sided p-value of `count` successes among n new trials."""
+    """Return the two-sided p-value of `count` successes among n new trials."""
     a, b = _beta(value, weight)
     below, above = float(betabinom.cdf(count, n, a, b)), float(betabinom.sf(count - 1, n, a, b))
     return min(1.0, 2.0 * min(below, above))

@@ -27,7 +27,7 @@ HEAD = (
 
 
 def forecast_text(made: Mapping[str, Any]) -> str:
-    """A forecast for people."""
+    """Return a forecast as text for a terminal."""
     lines = [f"{made['task']}: forecast of {made['registered_at']}"]
     for name, said in made["regimes"].items():
         lines.append(
@@ -52,7 +52,7 @@ def forecast_text(made: Mapping[str, Any]) -> str:
                 )
         lines.append(f"    {said['contexts']} contexts; {_worst(said['residual'])}")
         if 0.0005 < said["endless"] <= NEGLIGIBLE:
-            lines.append(f"    note: {said['endless']:.1%} of the trials played never end")
+            lines.append(f"    note: {said['endless']:.1%} of the simulated trials never end")
         lines += [f"    note: {note}" for note in said["assumptions"]]
         lines += [f"    DOUBTFUL: {doubt}" for doubt in said["doubts"]]
     return "\n".join(lines)
@@ -67,13 +67,13 @@ def _exact_lines(gspn: Mapping[str, Any]) -> list[str]:
 
 def _worst(residual: Sequence[Mapping[str, Any]]) -> str:
     if not residual:
-        return "from an estimates file: no trials to check against"
+        return "from an estimates file: no trials to compare with"
     worst = min(residual, key=lambda row: row["p"])
-    return f"played trials against the training's own: least p {worst['p']:.2f} ({worst['of']})"
+    return f"simulated against training trials: smallest p {worst['p']:.2f} ({worst['of']})"
 
 
 def rows_of(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The table of a comparison as texts."""
+    """Return the table of a comparison as texts."""
     return [
         (
             row["regime"] or "-",
@@ -115,7 +115,7 @@ def _interval(value: Sequence[float] | None) -> str:
 
 
 def control_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The product rule's table as texts."""
+    """Return the table of the product rule as texts."""
     return [
         (
             row["regime"] or "-",
@@ -129,7 +129,7 @@ def control_rows(found: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 
 def agreement_text(found: Mapping[str, Any]) -> str:
-    """A comparison for a terminal."""
+    """Return a comparison as text for a terminal."""
     before = "before the runs" if found["registered_before"] else "AFTER the runs had begun"
     lines = [
         f"{found['task']}: forecast of {found['forecast']['registered_at']} ({before}) and "
@@ -142,12 +142,14 @@ def agreement_text(found: Mapping[str, Any]) -> str:
         if law["distance"] is not None:
             verdict = "agrees" if law["agrees"] else "DISAGREES"
             lines.append(
-                f"law of the time, regime {law['regime'] or '-'}: distance {law['distance']} "
+                f"distribution of the time, regime {law['regime'] or '-'}: "
+                f"distance {law['distance']} "
                 f"of {law['limit']}: {verdict}"
             )
     odd = [row for row in found["routing"] if row["p_holm"] < 0.01]
     lines += [
-        f"ways out of {row['place']} differ, regime {row['regime'] or '-'}: p = {row['p_holm']:.1e}"
+        f"outgoing transitions of {row['place']} differ, regime {row['regime'] or '-'}: "
+        f"p = {row['p_holm']:.1e}"
         for row in odd
     ]
     for regime, doubts in found["doubts"].items():
@@ -157,13 +159,13 @@ def agreement_text(found: Mapping[str, Any]) -> str:
         ]
     if not found["same_block"]:
         lines.append(
-            "note: the training had another --block: the first trials of a cell are a "
-            "different share of all"
+            "note: the training had another --block, so the first trials of a cell are another "
+            "share of all trials"
         )
     if not found["same_task_file"]:
         lines.append("note: the task file has changed between training and these runs")
     lines.append(
-        "agrees" if found["agrees"] else "DISAGREES: at least one figure at 1 % after Holm"
+        "agrees" if found["agrees"] else "DISAGREES: at least one figure differs at 1 % (Holm)"
     )
     return "\n".join(lines)
 
@@ -178,7 +180,7 @@ def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def agreement_markdown(found: Mapping[str, Any]) -> str:
-    """A comparison as Markdown."""
+    """Return a comparison as Markdown."""
     before = "before" if found["registered_before"] else "**after**"
     lines = [
         f"Registered {found['forecast']['registered_at']}, {before} the runs (seed "
@@ -192,7 +194,7 @@ def agreement_markdown(found: Mapping[str, Any]) -> str:
         "",
     ]
     lines += _markdown([("regime", "product", "measured", "p", "verdict"), *control_rows(found)])
-    lines += ["", "Law of the time (Kolmogorov's distance, limit at 1 %):", ""]
+    lines += ["", "Distribution of the time (Kolmogorov's distance, limit at 1 %):", ""]
     laws = [
         (law["regime"] or "-", _number(law["distance"]), _number(law["limit"]))
         for law in found["law"]

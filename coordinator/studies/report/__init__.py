@@ -1,4 +1,4 @@
-"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures, and two
+"""Reports: a mission run or a campaign as one self-contained HTML page with SVG pictures; two
 campaigns compared."""
 
 from petrobot.coordinator.studies.report.run_page import report_html

@@ -1,30 +1,167 @@
-"""Pictures of actions that reports of runs and of campaigns share: choices and J over trials, R and
-C with their intervals."""
+"""Curves of choices, reliability and J over the trials, and pictures of them, for reports of
+campaigns and of single runs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
-from petrobot.coordinator.learning.estimate import Key, Tally
+from petrobot.coordinator.learning.estimate import Tally, TallyKey
 from petrobot.coordinator.learning.learning import Estimates
+from petrobot.coordinator.learning.records import Record, RunEnd
+from petrobot.coordinator.learning.selectors import cost_of
+from petrobot.coordinator.studies.campaign.block import LoadedPlan
 from petrobot.coordinator.studies.campaign.observed import regime_of
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan
+from petrobot.coordinator.studies.campaign.policies import LearnedActions, policy_of
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.report import charts
-from petrobot.coordinator.studies.report.learning_curves import Curves, LearningCurves
-from petrobot.coordinator.task import Task
+from petrobot.coordinator.task import Status, Task
+
+Curve = list[tuple[float, float]]
+Curves = dict[str, Curve]
+POINTS = 300
+"""Largest number of points of a curve."""
+WINDOW = 50
+"""Trials over which shares of choices are averaged."""
+
+
+@dataclass
+class LearningCurves:
+    """Curves of one primitive task in one regime, by action; x is the trial (a run of the primitive
+    task in that regime)."""
+
+    primitive_task: str
+    regime: str
+    context: str = ""
+    """For a single run: the context from which `regime` was derived."""
+    probability: Curves = field(default_factory=dict)
+    """Learned p; for campaigns that do not learn, the share of choices over the last `WINDOW`
+    trials."""
+    objective: Curves = field(default_factory=dict)
+    """J computed from the sums so far, with the rho so far."""
+
+
+def objective_curves(task: Task, rows: Sequence[TrialRow]) -> list[LearningCurves]:
+    """Return J and shares of choices of every primitive task with alternatives, by regime."""
+    out = []
+    for primitive in task.primitive_tasks.values():
+        if len(primitive.alternatives) < 2:
+            continue
+        for regime in dict.fromkeys(row.regime for row in rows):
+            runs = list(_runs(task, primitive.name, [row for row in rows if row.regime == regime]))
+            if runs:
+                made = LearningCurves(primitive.name, regime)
+                _fill(made, runs, primitive.alternatives)
+                out.append(made)
+    return out
+
+
+def recorded_curves(task: Task, records: Iterable[Record]) -> list[LearningCurves]:
+    """Return the same curves for a single mission run, from its records of learning."""
+    runs: dict[tuple[str, str], list[tuple[str, bool, float | None]]] = {}
+    for record in records:
+        if isinstance(record, RunEnd) and record.outcome.status is not None:
+            cost = cost_of(record.outcome, task.primitive_tasks[record.primitive_task].cost)
+            seen = (
+                record.action,
+                record.outcome.status is Status.SUCCESS,
+                None if math.isnan(cost) else cost,
+            )
+            runs.setdefault((record.primitive_task, record.context), []).append(seen)
+    out = []
+    for (name, context), seen_runs in runs.items():
+        alternatives = task.primitive_tasks[name].alternatives
+        if len(alternatives) > 1:
+            made = LearningCurves(name, regime_of(context), context)
+            _fill(made, seen_runs, alternatives)
+            out.append(made)
+    return out
+
+
+def _runs(
+    task: Task, primitive: str, rows: Sequence[TrialRow]
+) -> Iterator[tuple[str, bool, float | None]]:
+    for row in rows:
+        for run in row.trial.runs if row.trial is not None else ():
+            if run.status and task.primitive_task_of(run.place).name == primitive:
+                yield run.action, run.status == Status.SUCCESS.value, run.cost
+
+
+def _fill(
+    made: LearningCurves, runs: Sequence[tuple[str, bool, float | None]], actions: Sequence[str]
+) -> None:
+    sums = {action: [0, 0, 0.0, 0] for action in actions}
+    step = max(1, len(runs) // POINTS)
+    for i, (action, success, cost) in enumerate(runs, 1):
+        own = sums.setdefault(action, [0, 0, 0.0, 0])
+        own[0], own[1], own[2], own[3] = (
+            own[0] + 1,
+            own[1] + success,
+            own[2] + (cost or 0.0),
+            own[3] + (cost is not None),
+        )
+        if i % step and i != len(runs):
+            continue
+        recent = [a for a, *_ in runs[max(0, i - WINDOW) : i]]
+        costs = {a: s[2] / s[3] if s[3] else 0.0 for a, s in sums.items()}
+        rho = 1.0 / max(costs.values()) if max(costs.values()) > 0 else 0.0
+        for a, s in sums.items():
+            made.probability.setdefault(a, []).append((i, recent.count(a) / len(recent)))
+            if s[0]:
+                made.objective.setdefault(a, []).append((i, 1.0 - s[1] / s[0] + rho * costs[a]))
+
+
+def learned_curves(
+    plan: CampaignPlan, rows: Sequence[TrialRow], trials: Sequence[LearningCurves]
+) -> None:
+    """Replace shares of choices by the probabilities that the selectors had after each batch; does
+    nothing for a campaign without learner."""
+    bench = LoadedPlan.of(plan)
+    policy = policy_of(plan, bench.task, bench.directory)
+    if not isinstance(policy, LearnedActions):
+        return
+    for one in trials:
+        one.probability = {}
+    given = iter(rows)
+    counts = {(t.primitive_task, t.regime): 0 for t in trials}
+    for batch in plan.batches:
+        taken = list(islice(given, sum(block.count for block in batch)))
+        if len(taken) < sum(block.count for block in batch):
+            return
+        for block in batch:
+            policy.weights(block)
+        policy.update(taken)
+        state = policy.state()
+        for one in trials:
+            key = (one.primitive_task, one.regime)
+            counts[key] += sum(
+                1 for _ in _runs(bench.task, key[0], [row for row in taken if row.regime == key[1]])
+            )
+            for action, p in (
+                state.get(one.regime, {}).get(one.primitive_task, {}).get("p", {}).items()
+            ):
+                one.probability.setdefault(action, []).append((counts[key], p))
+
+
+# --- pictures ---
+
 
 Pictures = dict[str, tuple[str, str]]
-"""Heading and SVG by file name."""
+"""Heading and SVG text by file name."""
 TRIALS, ACTIONS = "Choices and J over trials", "Reliability and cost of each action"
 
 
 def put(pictures: Pictures, name: str, heading: str, svg: str) -> None:
-    """Add a picture under a name that is fit for a file."""
+    """Add a picture under a name that is valid for a file."""
     pictures["".join(c if c.isalnum() else "_" for c in name)] = (heading, svg)
 
 
 def trial_pictures(trials: Iterable[LearningCurves], word: str) -> Pictures:
-    """`word`: what the curves of choices show."""
+    """Return the pictures of these curves. `word`: what the curves of choices show."""
     out: Pictures = {}
     for one in trials:
         where = f"{one.primitive_task}{', ' + one.regime if one.regime else ''}"
@@ -38,7 +175,7 @@ def trial_pictures(trials: Iterable[LearningCurves], word: str) -> Pictures:
 
 
 def action_pictures(task: Task, estimates: Estimates) -> Pictures:
-    """R and C of every action that ran, by primitive task."""
+    """Return pictures of R and C of every action that ran, by primitive task."""
     out: Pictures = {}
     for primitive in task.primitive_tasks.values():
         known = [
@@ -72,8 +209,8 @@ def action_pictures(task: Task, estimates: Estimates) -> Pictures:
 
 
 LATENCY = "latency"
-"""Numbers of results whose names begin so are drawn: seconds from an image to the set point that it
-led to, and the like."""
+"""Numbers of results whose names begin so are drawn as latencies: seconds from an image to the set
+point that it led to, for example."""
 
 
 def add_latencies(found: dict[str, list[float]], action: str, values: Mapping[str, Any]) -> None:
@@ -84,19 +221,19 @@ def add_latencies(found: dict[str, list[float]], action: str, values: Mapping[st
 
 
 def latency_svg(found: Mapping[str, list[float]]) -> str:
-    """How often which latency was reported."""
+    """Return a histogram of the reported latencies."""
     return charts.histogram("Latencies that runs reported", "s", found)
 
 
-Row = tuple[str, str, float, float, float]
+IntervalRow = tuple[str, str, float, float, float]
 
 
-def _reliability(key: Key, tally: Tally) -> Row:
+def _reliability(key: TallyKey, tally: Tally) -> IntervalRow:
     low, high = tally.interval()
     return key.action, regime_of(key.context), low, tally.reliability, high
 
 
-def _cost(key: Key, tally: Tally, measure: str) -> Row:
+def _cost(key: TallyKey, tally: Tally, measure: str) -> IntervalRow:
     spent = tally.cost(measure)
     half = 1.96 * spent.deviation / spent.n**0.5
     return key.action, regime_of(key.context), spent.mean - half, spent.mean, spent.mean + half
@@ -109,7 +246,8 @@ def _unit(measure: str) -> str:
 
 
 def _settled(trials: LearningCurves) -> Curves:
-    """J curves without the first few trials, where a single failure hides everything else."""
+    """Return the curves of J without the first 2 % of the trials, where a single failure would
+    dominate the axis."""
     last = max((points[-1][0] for points in trials.objective.values()), default=0.0)
     return {
         a: [p for p in points if p[0] > 0.02 * last] or points

@@ -1,5 +1,5 @@
-"""A campaign as one HTML page: shares, choices and J over trials, R and C of actions, the task's
-own pictures, faults."""
+"""A campaign as one HTML page: shares, choices and J over the trials, R and C of actions, the
+task's own pictures, faults."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 from petrobot.coordinator.learning.objective import Figures, break_even, pareto
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.campaign.observed import regime_of
-from petrobot.coordinator.studies.campaign.plan import Plan
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.summary import Summary
 from petrobot.coordinator.studies.campaign.trials import Trial
 from petrobot.coordinator.studies.report import charts
@@ -24,17 +24,18 @@ from petrobot.coordinator.studies.report.action_pictures import (
     action_pictures,
     add_latencies,
     latency_svg,
+    learned_curves,
+    objective_curves,
     put,
     trial_pictures,
 )
 from petrobot.coordinator.studies.report.comparing import Weighting, objectives
-from petrobot.coordinator.studies.report.learning_curves import learned_curves, objective_curves
 from petrobot.coordinator.studies.report.page import gallery, html_page, section, table, text
 from petrobot.coordinator.studies.report.plots import declared
 from petrobot.coordinator.studies.report.run_page import gantt_svg
 from petrobot.coordinator.task import Status, Task
 
-# Fixed combinations of actions side by side: what each came to over the trials in which it was chosen, with one rho for all.
+# --- combinations of actions ---
 
 Combination = tuple[tuple[str, str], ...]
 """(primitive task, action) of each primitive task with alternatives, in the order of the task
@@ -42,9 +43,9 @@ file."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One combination. J is the mean over the primitive tasks with alternatives; `task_objective`
-    that of the whole task."""
+class CombinationFigures:
+    """Figures of one combination of actions. `objective` is the mean J over the primitive tasks
+    with alternatives, `task_objective` is J of the whole task."""
 
     combination: Combination
     trials: int
@@ -52,10 +53,10 @@ class Judged:
     objective: float
     task_objective: float
     time: float
-    """Mean of the completed trials (s)."""
+    """Mean duration of the completed trials (s)."""
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return {
             **dict(self.combination),
             "runs": self.trials,
@@ -66,8 +67,8 @@ class Judged:
         }
 
 
-def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]:
-    """The actions of a trial's first runs."""
+def combination_of(task: Task, row: TrialRow, names: Sequence[str]) -> dict[str, str]:
+    """Return the actions of a trial's first runs."""
     out: dict[str, str] = {}
     for run in row.trial.runs if row.trial is not None else ():
         name = task.primitive_task_of(run.place).name
@@ -78,19 +79,20 @@ def combination_of(task: Task, row: Row, names: Sequence[str]) -> dict[str, str]
 
 def by_combination(
     task: Task,
-    rows: Iterable[Row],
+    rows: Iterable[TrialRow],
     planned: Sequence[dict[str, str]] | None = None,
     weighting: Weighting | None = None,
-) -> list[Judged]:
-    """Every combination in these rows, the lowest J first.
+) -> list[CombinationFigures]:
+    """Compare the combinations of actions in these rows, all with one rho; the lowest J first.
 
     `planned`: the combination meant for each row; a trial that ended before all of its runs still
-    counts for it. Without it, only trials in which every primitive task ran can be told apart.
+    counts for it. Without it, only trials in which every primitive task ran can be assigned to a
+    combination.
     """
     kept = [row for row in rows if row.trial is not None]
     names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
     weighting = weighting or Weighting.of(task, kept)
-    groups: dict[Combination, list[Row]] = {}
+    groups: dict[Combination, list[TrialRow]] = {}
     for i, row in enumerate(kept):
         chosen = planned[i] if planned is not None else combination_of(task, row, names)
         if all(name in chosen for name in names):
@@ -102,14 +104,14 @@ def by_combination(
 
 
 def _judged(
-    task: Task, combination: Combination, rows: Sequence[Row], weighting: Weighting
-) -> Judged:
+    task: Task, combination: Combination, rows: Sequence[TrialRow], weighting: Weighting
+) -> CombinationFigures:
     found = objectives(task, rows, weighting)
     times = [row.trial.time for row in rows if row.trial is not None and row.trial.time is not None]
     goal = float(np.mean([row.trial is not None and row.trial.goals > 0 for row in rows]))
     mean = float(np.mean(times)) if times else float("nan")
     known = [value for name, value in found.items() if name != "task" and not np.isnan(value)]
-    return Judged(
+    return CombinationFigures(
         combination,
         len(rows),
         goal,
@@ -121,11 +123,11 @@ def _judged(
 
 DIFFERENCES = "Differences, paired"
 AHEAD = (DIFFERENCES, TRIALS, ACTIONS)
-"""Headings of pictures that stand before the tables of actions."""
+"""Headings of pictures that come before the tables of actions."""
 MOST = 12
-"""Combinations that are listed."""
+"""Largest number of listed combinations."""
 WORST = 40
-"""Trials that went wrong which are listed."""
+"""Largest number of listed trials that went wrong."""
 
 
 class CampaignReport:
@@ -133,7 +135,7 @@ class CampaignReport:
     heading."""
 
     def __init__(
-        self, plan: Plan, task: Task, rows: Sequence[Row], plots: Mapping[str, Any]
+        self, plan: CampaignPlan, task: Task, rows: Sequence[TrialRow], plots: Mapping[str, Any]
     ) -> None:
         self.plan, self.task, self.rows = plan, task, rows
         self.summary = Summary.of(task, rows, options=plan.options)
@@ -200,7 +202,7 @@ class CampaignReport:
     # --- page ---------------------------------------------------------------------------------
 
     def html(self, more: Sequence[str] = ()) -> str:
-        """The page; `more` are further sections, put behind the numbers."""
+        """Return the page; `more` are further sections, after the figures."""
         plan = self.plan
         lead = f"{len(self.rows)} of {plan.runs} runs, selector {plan.selector}, seed {plan.seed}"
         headings = list(dict.fromkeys(heading for heading, _ in self.pictures.values()))
@@ -253,8 +255,8 @@ class CampaignReport:
         return out
 
     def _combinations(self) -> dict[str, list[dict[str, Any]]]:
-        """The best combinations of actions by regime, of trials in which each primitive task ran;
-        none of a single one."""
+        """Return the best combinations of actions by regime, from trials in which each primitive
+        task ran; none if there is only one."""
         found = {}
         for regime in self.summary.by_regime:
             judged = by_combination(self.task, [row for row in self.rows if row.regime == regime])
@@ -264,7 +266,7 @@ class CampaignReport:
 
     def _causes(self) -> list[dict[str, Any]]:
         counts: dict[tuple[str, str, str, str, str], int] = {}
-        first: dict[tuple[str, str, str, str, str], Row] = {}
+        first: dict[tuple[str, str, str, str, str], TrialRow] = {}
         for row in self.rows:
             for run in row.trial.runs if row.trial is not None else ():
                 key = (row.regime, run.place, run.action, run.status or "none", run.cause)
@@ -324,8 +326,8 @@ def _action_row(f: Figures, front: set[str], best: Figures | None) -> dict[str, 
     }
 
 
-def timeline_of(rows: Sequence[Row]) -> Timeline:
-    """The runs of a mission run as bars."""
+def timeline_of(rows: Sequence[TrialRow]) -> Timeline:
+    """Return the runs of a mission run as bars of a timeline."""
     made = Timeline()
     for row in rows:
         for i, run in enumerate(row.trial.runs if row.trial is not None else ()):
@@ -340,7 +342,8 @@ def timeline_of(rows: Sequence[Row]) -> Timeline:
 
 
 def story(trial: Trial) -> str:
-    """A trial in one line: what ended when and how, and which transition took it."""
+    """Describe a trial in one line: what ended when and how, and which transition took its
+    token."""
     ends = sorted(trial.runs, key=lambda run: run.begun + run.took)
     parts = []
     for run in ends:
@@ -361,7 +364,7 @@ def story(trial: Trial) -> str:
 
 
 def comparison_section(found: Mapping[str, Any], one: str, other: str) -> str:
-    """Two campaigns side by side."""
+    """Return a section that compares two campaigns."""
     shares = [
         {
             "share": name,
@@ -407,7 +410,7 @@ def _interval(ends: Sequence[float]) -> str:
 def comparison_pictures(
     found: Mapping[str, Any], one: str, other: str
 ) -> dict[str, tuple[str, str]]:
-    """Differences with their intervals."""
+    """Return a picture of the differences with their intervals."""
     rows = [(name, "", *_ends(row)) for name, row in found["shares"].items()]
     rows += [(_objective_name(name), "", *_ends(row)) for name, row in found["J"].items()]
     svg = charts.intervals(f"{one} minus {other}, 95 % intervals, paired", "difference", rows)

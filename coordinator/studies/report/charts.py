@@ -1,7 +1,8 @@
 """Small charts as SVG: lines over trials, intervals by name, points, segments and histograms.
 
-Colours are those of the page they stand in, by day and by night (`coordinator/studies/report/page.py`,
-whose `standalone` makes a file of its own of a chart); every mark also differs by shape or dash.
+Their colours are CSS variables of the page, by day and by night
+(coordinator/studies/report/page.py, whose `standalone` turns a chart into a file of its own). Each
+series also has its own shape or dash, so no chart depends on colour alone.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ INK, SOFT, LINE, PAPER = "var(--ink)", "var(--soft)", "var(--line)", "var(--pape
 TOP, BOTTOM, RIGHT = 40, 46, 18
 FONT = 'font-family="system-ui,Segoe UI,Roboto,DejaVu Sans,sans-serif" font-size="12"'
 LETTER = 6.6
-"""Width of a letter (px), for margins and legends."""
+"""Average width of a letter (px), for margins and legends."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """A linear axis: values `low` to `high` on pixels `begin` to `end`."""
+    """A linear axis: maps values `low` to `high` to pixels `begin` to `end`."""
 
     low: float
     high: float
@@ -33,7 +34,7 @@ class Scale:
     end: float
 
     def __call__(self, value: float) -> float:
-        """The pixel of a value."""
+        """Return the pixel of a value."""
         return self.begin + (value - self.low) / (self.high - self.low) * (self.end - self.begin)
 
     @property
@@ -52,12 +53,13 @@ def _nice(step: float) -> float:
 def limits(
     values: Sequence[float], *, zero: bool = False, room: float = 0.04
 ) -> tuple[float, float]:
-    """Least and largest finite value with some room; with `zero` from 0 on."""
+    """Return the least and the largest finite value with a margin; with `zero`, the axis includes
+    0."""
     known = [v for v in values if math.isfinite(v)]
     low, high = (min(known), max(known)) if known else (0.0, 1.0)
     low = min(0.0, low) if zero else low
     span = high - low
-    if span <= 1e-9 * max(abs(low), abs(high), 1e-9):  # all the same: an axis about it
+    if span <= 1e-9 * max(abs(low), abs(high), 1e-9):  # all values equal: an axis around them
         span = abs(high) if abs(high) > 1e-9 else 1.0
         room = max(room, 0.04)
     return (low if zero and low == 0.0 else low - room * span), high + room * span
@@ -82,12 +84,12 @@ class Chart:
 
     @property
     def xs(self) -> Scale:
-        """The x axis."""
+        """Scale of the x axis."""
         return Scale(*self.x, self.left, self.width - RIGHT)
 
     @property
     def ys(self) -> Scale:
-        """The y axis, growing upwards (rows: downwards)."""
+        """Scale of the y axis, growing upwards (with rows: downwards)."""
         top, bottom = self._top, self.height - BOTTOM
         return Scale(*self.y, top, bottom) if self.rows else Scale(*self.y, bottom, top)
 
@@ -100,7 +102,7 @@ class Chart:
         return len(self._placed()[1]) if self.legend else 0
 
     def line(self, points: Sequence[tuple[float, float]], name: str, number: int) -> None:
-        """A curve of its own colour and dash."""
+        """Add a curve with its own colour and dash."""
         xs, ys = self.xs, self.ys
         known = [(x, y) for x, y in points if math.isfinite(y)]
         path = " ".join(f"{xs(x):.1f},{ys(y):.1f}" for x, y in known)
@@ -112,13 +114,13 @@ class Chart:
         )
 
     def dot(self, x: float, y: float, number: int, tip: str) -> None:
-        """A point; its shape goes with its colour."""
+        """Add a point whose shape and colour depend on its number."""
         self.marks.append(shape(self.xs(x), self.ys(y), number, tip))
 
     def segment(
         self, one: tuple[float, float], other: tuple[float, float], number: int, tip: str
     ) -> None:
-        """A thin line between two points with a mark at its end."""
+        """Add a thin line between two points with a mark at its end."""
         (x1, y1), (x2, y2) = ((self.xs(x), self.ys(y)) for x, y in (one, other))
         colour = PALETTE[number % len(PALETTE)]
         self.marks.append(
@@ -129,7 +131,7 @@ class Chart:
     def interval(
         self, row: float, low: float, value: float, high: float, number: int, tip: str
     ) -> None:
-        """An estimate with its interval in a row."""
+        """Add an estimate with its interval in a row."""
         xs, y, colour = self.xs, self.ys(row), PALETTE[number % len(PALETTE)]
         ends = "".join(
             f'<line x1="{xs(v):.1f}" x2="{xs(v):.1f}" y1="{y - 4:.1f}" y2="{y + 4:.1f}" '
@@ -145,7 +147,7 @@ class Chart:
     def bar(
         self, low: float, high: float, base: float, value: float, number: int, tip: str
     ) -> None:
-        """A histogram's bar from `base` to `value`."""
+        """Add a bar of a histogram from `base` to `value`."""
         x1, x2, y1, y2 = self.xs(low), self.xs(high), self.ys(value), self.ys(base)
         colour = PALETTE[number % len(PALETTE)]
         self.marks.append(
@@ -155,7 +157,7 @@ class Chart:
         )
 
     def names(self, names: Sequence[str], *, dashes: bool = False) -> None:
-        """The legend: a name for each number."""
+        """Add a legend: one name for each number."""
         for number, name in enumerate(names):
             colour = PALETTE[number % len(PALETTE)]
             mark = (
@@ -167,7 +169,7 @@ class Chart:
             self.legend.append((mark, name))
 
     def _placed(self) -> tuple[list[str], list[float]]:
-        """Legend entries with their places, and the rows used."""
+        """Return the legend entries with their positions, and the rows that they use."""
         out, rows, x = [], [0.0], float(self.left)
         for mark, name in self.legend:
             needs = 34 + LETTER * len(name)
@@ -183,7 +185,7 @@ class Chart:
         return out, rows
 
     def svg(self) -> str:
-        """The whole picture as a file."""
+        """Return the whole picture as a file."""
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width} '
             f'{self.height}" width="{self.width}" '
@@ -232,13 +234,14 @@ class Chart:
 
 
 def _digits(ticks: Sequence[float]) -> int:
-    """Decimals that tell all ticks apart exactly."""
+    """Return the number of decimals that shows all ticks exactly."""
     step = min((abs(b - a) for a, b in pairwise(ticks)), default=1.0)
     return next((d for d in range(7) if abs(step * 10**d - round(step * 10**d)) < 1e-6), 6)
 
 
 def shape(x: float, y: float, number: int, tip: str) -> str:
-    """A mark at a pixel: circle, square, diamond, triangle, ... in the number's colour."""
+    """Return a mark at a pixel: circle, square, diamond or triangle, in the colour of its
+    number."""
     colour, kind = PALETTE[number % len(PALETTE)], number % 4
     title = f"<title>{escape(tip)}</title>"
     if kind == 0:
@@ -261,7 +264,7 @@ def lines(
     *,
     unit: bool = False,
 ) -> str:
-    """Curves by name over a common axis; `unit`: y from 0 to 1."""
+    """Return a chart of curves by name over a common x axis; `unit`: y from 0 to 1."""
     xs = [x for points in curves.values() for x, _ in points]
     ys = [y for points in curves.values() for _, y in points]
     chart = Chart(title, x_label, y_label, limits(xs, room=0.0), (0.0, 1.0) if unit else limits(ys))
@@ -278,8 +281,8 @@ def intervals(
     *,
     unit: bool = False,
 ) -> str:
-    """Estimates with intervals: (row, series, low, value, high); series of one row stand below each
-    other."""
+    """Return a chart of estimates with intervals: (row, series, low, value, high); the series of
+    one row are drawn below each other."""
     names = list(dict.fromkeys(row for row, *_ in rows))
     series = list(dict.fromkeys(one for _, one, *_ in rows))
     values = [v for *_, low, value, high in rows for v in (low, value, high)]
@@ -309,7 +312,7 @@ def points(
     y_label: str,
     groups: Mapping[str, Sequence[tuple[tuple[float, ...], str]]],
 ) -> str:
-    """Points (x, y) or segments (x, y, x2, y2) by group, each with a tip."""
+    """Return a chart of points (x, y) or segments (x, y, x2, y2) by group, each with a tooltip."""
     every = [p for group in groups.values() for p, _ in group]
     xs = [v for p in every for v in p[0::2]]
     ys = [v for p in every for v in p[1::2]]
@@ -332,8 +335,8 @@ def histogram(
     *,
     least: float | None = None,
 ) -> str:
-    """Counts of values in classes of equal width, groups stacked; the first class begins at `least`
-    if that is given."""
+    """Return a histogram with classes of equal width and stacked groups; the first class begins at
+    `least`, if given."""
     every = [v for group in groups.values() for v in group]
     low, high = limits(every if least is None else [least, *every], room=0.0)
     high = high if high > low else low + 1.0

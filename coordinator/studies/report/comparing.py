@@ -1,9 +1,10 @@
-"""Two campaigns compared trial by trial: the same seeds met the same trials, so differences are
+"""Compare two campaigns trial by trial: equal seeds produce the same trials, so the differences are
 paired.
 
-Shares: McNemar's exact test (Q. McNemar 1947, binomial on the discordant pairs), difference with
-the adjusted Wald interval of A. Agresti and Y. Min (2005, half a pair added to each cell). J and
-costs: percentile bootstrap over pairs, all J from sums with one rho.
+Shares: McNemar's exact test (Q. McNemar, Psychometrika 12 (1947) 153-157; binomial test of the
+discordant pairs), and the difference with the adjusted Wald interval of A. Agresti and Y. Min,
+Statistics in Medicine 24 (2005) 729-740 (half a pair added to each cell). J and costs: percentile
+bootstrap over pairs, all J from sums with one rho.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.task import Status, Task
 
 REPLICATES = 2000
@@ -26,16 +27,16 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Pairs:
-    """Trials of two campaigns with equal regime, seed and number that were begun in both."""
+    """Trials of two campaigns with equal regime, seed and number that began in both."""
 
-    one: tuple[Row, ...]
-    other: tuple[Row, ...]
+    one: tuple[TrialRow, ...]
+    other: tuple[TrialRow, ...]
     left_out: int
-    """Trials without a partner, or not begun."""
+    """Trials without a partner, or that did not begin."""
 
 
-def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
-    """Match two tables."""
+def paired(one: Iterable[TrialRow], other: Iterable[TrialRow]) -> Pairs:
+    """Match the trials of two tables."""
     first = {(row.regime, row.seed, row.k): row for row in one}
     second = {(row.regime, row.seed, row.k): row for row in other}
     common = [
@@ -49,16 +50,16 @@ def paired(one: Iterable[Row], other: Iterable[Row]) -> Pairs:
 
 def compare(
     task: Task,
-    one: Iterable[Row],
-    other: Iterable[Row],
+    one: Iterable[TrialRow],
+    other: Iterable[TrialRow],
     weighting: Weighting | None = None,
     seed: int = 1,
 ) -> dict[str, Any]:
-    """What the first campaign does better (positive differences in shares, negative in J and time)
-    than the second.
+    """Return the differences between the first and the second campaign: positive is better for
+    shares, negative for J and time.
 
-    `weighting` gives the rho of J, so that several comparisons have one; without it, rho is that of
-    the actions in these two. Raises ValueError when they have no trial in common.
+    `weighting` gives the rho of J, so that several comparisons can use the same; without it, rho is
+    that of the actions in these two. Raises ValueError if they have no trial in common.
     """
     pairs = paired(one, other)
     if not pairs.one:
@@ -87,7 +88,7 @@ def compare(
 
 
 def own_flags(pairs: Pairs) -> list[str]:
-    """Truth values of the task's own score that every pair has."""
+    """Return the truth values of the task's own score that every pair has."""
     names = [n for n, v in pairs.one[0].score.items() if isinstance(v, bool)]
     return [
         n
@@ -96,17 +97,18 @@ def own_flags(pairs: Pairs) -> list[str]:
     ]
 
 
-def _flag(name: str) -> Callable[[Row], bool]:
+def _flag(name: str) -> Callable[[TrialRow], bool]:
     return lambda row: bool(row.score[name])
 
 
-def share_difference(pairs: Pairs, met: Callable[[Row], bool]) -> dict[str, Any]:
-    """Both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
+def share_difference(pairs: Pairs, met: Callable[[TrialRow], bool]) -> dict[str, Any]:
+    """Return both shares, the discordant pairs, McNemar's p-value, and the difference with its 95 %
     interval."""
     a = np.array([met(row) for row in pairs.one])
     b = np.array([met(row) for row in pairs.other])
     n, gained, lost = len(a), int(np.sum(a & ~b)), int(np.sum(~a & b))
     p = float(binomtest(gained, gained + lost).pvalue) if gained + lost else 1.0
+    # half a pair added to each of the four cells: n + 2 pairs
     middle = (gained - lost) / (n + 2)
     half = Z * np.sqrt(((gained + 0.5) + (lost + 0.5)) / (n + 2) - middle**2) / np.sqrt(n + 2)
     return {
@@ -146,16 +148,16 @@ def _time(pairs: Pairs) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Weighting:
-    """rho of each primitive task with alternatives, and of the task (whose cost is the time of a
-    trial)."""
+    """rho of each primitive task with alternatives, and of the task (whose cost is the duration of
+    a trial)."""
 
     rho: Mapping[str, float]
     task: float
 
     @classmethod
-    def of(cls, task: Task, rows: Sequence[Row]) -> Weighting:
-        """1 / the largest mean cost of an action in these rows; for the task 1 / the mean time of
-        their trials."""
+    def of(cls, task: Task, rows: Sequence[TrialRow]) -> Weighting:
+        """Return 1 / the largest mean cost of an action in these rows; for the task, 1 / the mean
+        duration of their trials."""
         names = [p.name for p in task.primitive_tasks.values() if len(p.alternatives) > 1]
         times = [
             row.trial.time for row in rows if row.trial is not None and row.trial.time is not None
@@ -166,9 +168,9 @@ class Weighting:
         )
 
 
-def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[str, float]:
-    """J of each primitive task with alternatives and of the task ("task"), with the given rho; nan
-    where nothing was run."""
+def objectives(task: Task, rows: Sequence[TrialRow], weighting: Weighting) -> dict[str, float]:
+    """Return J of each primitive task with alternatives and of the task ("task"), with the given
+    rho; nan where nothing ran."""
     whole = np.ones((1, len(rows)))
     found = {
         name: float(_objective(_sums(task, name, rows), whole, rho)[0])
@@ -180,8 +182,8 @@ def objectives(task: Task, rows: Sequence[Row], weighting: Weighting) -> dict[st
 def objective_difference(
     task: Task, pairs: Pairs, weighting: Weighting, random: np.random.Generator
 ) -> dict[str, Any]:
-    """J of each primitive task with alternatives, their mean, and J of the task (1 - R_goal + rho *
-    time), in both campaigns."""
+    """Return the differences of J of each primitive task with alternatives, of their mean, and of J
+    of the task (1 - R_goal + rho * time)."""
     n = len(pairs.one)
     weights = random.multinomial(n, np.full(n, 1 / n), size=REPLICATES)
     whole = np.ones((1, n))
@@ -221,8 +223,8 @@ Sums = tuple[Values, Values, Values, Values]
 """By trial: counted runs, successes, cost, runs with a cost."""
 
 
-def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
-    """Of a primitive task."""
+def _sums(task: Task, name: str, rows: Sequence[TrialRow]) -> Sums:
+    """Return the sums of a primitive task."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
         for run in row.trial.runs if row.trial is not None else ():
@@ -232,8 +234,9 @@ def _sums(task: Task, name: str, rows: Sequence[Row]) -> Sums:
     return out[0], out[1], out[2], out[3]
 
 
-def _task_sums(rows: Sequence[Row]) -> Sums:
-    """Of the whole task: a trial is a run, a met goal its success, its time the cost."""
+def _task_sums(rows: Sequence[TrialRow]) -> Sums:
+    """Return the sums of the whole task: a trial counts as a run, a reached goal as its success,
+    its duration as the cost."""
     out = np.zeros((4, len(rows)))
     for i, row in enumerate(rows):
         if row.trial is not None:
@@ -242,9 +245,9 @@ def _task_sums(rows: Sequence[Row]) -> Sums:
     return out[0], out[1], out[2], out[3]
 
 
-def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
-    """rho = 1 / the largest mean cost of an action of the primitive task in these rows; 0 without
-    costs."""
+def cost_weight(task: Task, name: str, rows: Iterable[TrialRow]) -> float:
+    """Return rho = 1 / the largest mean cost of an action of the primitive task in these rows; 0
+    without costs."""
     costs: dict[str, list[float]] = {}
     for row in rows:
         for run in row.trial.runs if row.trial is not None else ():
@@ -259,7 +262,7 @@ def cost_weight(task: Task, name: str, rows: Iterable[Row]) -> float:
 
 
 def _objective(sums: Sums, weights: Any, rho: float) -> Values:
-    """J = 1 - R + rho C for each row of weights."""
+    """Return J = 1 - R + rho C for each row of weights."""
     runs, successes, cost, costed = (weights @ s for s in sums)
     with np.errstate(divide="ignore", invalid="ignore"):
         value: Values = (

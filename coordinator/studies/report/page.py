@@ -1,4 +1,4 @@
-"""HTML that all report pages share: style, numbers, tables, sections with pictures."""
+"""HTML that all report pages share: style, figures, tables, sections with pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from typing import Any
 
 from petrobot.coordinator.task import Status
 
-# The colours of report pages and their pictures, by day and by night, and pictures as files of their own.
+# --- colours ---
+
+# Series: the palette of M. Okabe and K. Ito (2008), distinguishable with colour blindness, the
+# yellow darkened for white paper.
 
 LIGHT: Mapping[str, str] = {
     "ink": "#1b1f24",
@@ -31,7 +34,7 @@ LIGHT: Mapping[str, str] = {
     "series-7": "#7a6a00",
     "series-8": "#555555",
 }
-"""By day, and of every picture that is a file of its own."""
+"""Colours by day, and of every picture that is a file of its own."""
 DARK: Mapping[str, str] = {
     "ink": "#e8ecf0",
     "soft": "#9aa6b2",
@@ -51,17 +54,18 @@ DARK: Mapping[str, str] = {
     "series-7": "#b9a52e",
     "series-8": "#a0a0a0",
 }
-"""By night."""
+"""Colours by night."""
 SERIES = tuple(name for name in LIGHT if name.startswith("series"))
 
 
 def variables(colours: Mapping[str, str]) -> str:
-    """The colours as CSS variables."""
+    """Return the colours as CSS variables."""
     return "".join(f"--{name}:{colour};" for name, colour in colours.items())
 
 
 def standalone(svg: str) -> str:
-    """A picture of a page as a file of its own: with the page's light colours and a name space."""
+    """Turn a picture of a page into a file of its own, with the page's light colours and a name
+    space."""
     svg = re.sub(r"var\(--([a-z0-9-]+)\)", lambda found: LIGHT.get(found[1], found[0]), svg)
     return (
         svg
@@ -75,17 +79,20 @@ STYLE = (
 :root{{color-scheme:light dark;{variables(LIGHT)}}}
 @media (prefers-color-scheme:dark){{:root{{{variables(DARK)}}}}}
 """
-    + """body{margin:0 auto;max-width:1100px;padding:2rem 1.5rem 4rem;background:var(--paper);color:var(--ink);
+    + """body{margin:0 auto;max-width:1100px;padding:2rem 1.5rem 4rem;
+background:var(--paper);color:var(--ink);
 font:15px/1.5 system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
 h1{font-size:1.7rem;margin:0 0 .25rem}h2{font-size:1.15rem;margin:2.2rem 0 .6rem}
 p.lead{color:var(--soft);margin:0 0 1.5rem}
-.numbers{display:flex;flex-wrap:wrap;gap:.75rem}.numbers div{background:var(--panel);border-radius:8px;padding:.6rem .9rem}
+.numbers{display:flex;flex-wrap:wrap;gap:.75rem}
+.numbers div{background:var(--panel);border-radius:8px;padding:.6rem .9rem}
 .numbers b{display:block;font-size:1.25rem}.numbers span{color:var(--soft);font-size:.85rem}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
 th,td{text-align:left;padding:.35rem .6rem;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--soft);font-weight:600;font-size:.85rem}
 .success{color:var(--success)}.failure{color:var(--failure)}.error{color:var(--error)}
-.picture{overflow-x:auto;background:var(--panel);border-radius:8px;padding:.75rem}.picture svg{max-width:100%;height:auto}
+.picture{overflow-x:auto;background:var(--panel);border-radius:8px;padding:.75rem}
+.picture svg{max-width:100%;height:auto}
 .gallery{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,500px),1fr));gap:.75rem}
 h3{margin:1.2rem 0 .3rem;font-size:1rem}h3 small{color:var(--soft);font-weight:400}
 .wide{overflow-x:auto}
@@ -95,7 +102,7 @@ details summary{cursor:pointer;color:var(--soft)}
 
 
 def html_page(title: str, parts: Iterable[str]) -> str:
-    """A whole page that needs nothing else."""
+    """Return a whole page that needs no other file."""
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         '<meta name="viewport" '
@@ -105,14 +112,14 @@ def html_page(title: str, parts: Iterable[str]) -> str:
 
 
 def gallery(pictures: Iterable[str]) -> str:
-    """Pictures side by side as far as there is room."""
+    """Return pictures side by side, as far as there is room."""
     framed = "".join(picture(svg) for svg in pictures)
     return f'<div class="gallery">{framed}</div>' if framed else ""
 
 
 def apart(svg: str, alternative: str) -> str:
-    """A picture that brings a style of its own, so framed that it leaves the rest of the page
-    alone."""
+    """Return a picture that has its own style sheet, embedded so that its style does not affect the
+    page."""
     data = b64encode(svg.encode("utf-8")).decode("ascii")
     image = (
         f'<img src="data:image/svg+xml;base64,{data}" alt="{escape(alternative)}" '
@@ -122,17 +129,17 @@ def apart(svg: str, alternative: str) -> str:
 
 
 def picture(svg: str) -> str:
-    """A picture in its frame."""
+    """Return a picture in its frame."""
     return f'<div class="picture">{svg}</div>'
 
 
 def is_table(rows: Any) -> bool:
-    """Whether a value is a list of records."""
+    """Return whether a value is a list of records."""
     return isinstance(rows, list) and bool(rows) and all(isinstance(row, Mapping) for row in rows)
 
 
 def numbers(result: Mapping[str, Any]) -> str:
-    """The plain values of a result, large."""
+    """Return the plain values of a result in large type."""
     cells = [
         f"<div><b>{escape(text(value))}</b><span>{escape(key)}</span></div>"
         for key, value in result.items()
@@ -142,28 +149,31 @@ def numbers(result: Mapping[str, Any]) -> str:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Records as a table, columns in the order of their first use."""
+    """Return records as a table; the columns are in the order of their first use."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     head = "".join(f"<th>{escape(column)}</th>" for column in columns)
     body = "".join(
         f"<tr>{''.join(f'<td>{cell(c, row.get(c))}</td>' for c in columns)}</tr>" for row in rows
     )
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return (
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
 
 
 def cell(column: str, value: Any) -> str:
-    """One cell; statuses have their colours."""
+    """Return one cell; statuses have their colours."""
     return status(value) if column == "status" else escape(text(value))
 
 
 def status(value: Any) -> str:
-    """A status in its colour."""
+    """Return a status in its colour."""
     known = value in tuple(Status)
     return f'<b class="{value}">{escape(str(value).upper())}</b>' if known else escape(text(value))
 
 
 def text(value: Any) -> str:
-    """A value for people."""
+    """Return a value as text for people."""
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -176,5 +186,5 @@ def text(value: Any) -> str:
 
 
 def section(title: str, body: str) -> str:
-    """A heading and what stands under it; nothing without a body."""
+    """Return a heading and what is under it; nothing without a body."""
     return f"<h2>{escape(title)}</h2>{body}" if body else ""

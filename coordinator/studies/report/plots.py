@@ -1,5 +1,4 @@
-"""Pictures that a task declares itself, in the score of its laboratory: `plots` says which columns
-are drawn, and how.
+"""Pictures that a task declares itself: `plots` in its score says which columns to draw, and how.
 
     plots = { catch_map = { kind = "lines", title = "...", x = "table.column", y = "...", x2 =
     "...", y2 = "...",
@@ -19,12 +18,12 @@ from petrobot.coordinator.studies.report import charts
 
 PICTURES = "pictures"
 MOST = 4000
-"""Marks in one picture at most; of more, every k-th is drawn."""
+"""Largest number of marks in one picture; of more, every k-th is drawn."""
 
 
 def declared(plots: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """SVG by name of every declared picture for which the rows have values; each row is the score
-    of one trial."""
+    """Return, by name, the SVG of every declared picture for which the rows have values; each row
+    is the score of one trial."""
     out = {}
     for name, plot in plots.items():
         if not isinstance(plot, Mapping) or "x" not in plot:
@@ -100,7 +99,7 @@ def _number(value: Any) -> float:
 
 
 def finished(result: Mapping[str, Any]) -> dict[str, str]:
-    """Finished SVG texts by title that a score holds."""
+    """Return the finished SVG texts in a score, by title."""
     given = result.get(PICTURES, {})
     if not isinstance(given, Mapping):
         return {}

@@ -1,9 +1,9 @@
-"""Pictures of a report as PNG, for papers and mails that take no SVG: rendered by resvg, twice the
-size of the SVG.
+"""Pictures of a report as PNG, for papers and mails that do not accept SVG: rendered by resvg at
+twice the size of the SVG.
 
-resvg is one wheel that needs nothing of the system; a browser or Cairo would have to be installed
-apart, and OpenCV draws no SVG. The words are drawn with the font that is shipped beside this file,
-and with no other, so a picture looks the same on every host.
+resvg is one wheel without system dependencies. A browser or Cairo would have to be installed
+separately, and OpenCV does not draw SVG. Text is drawn only with the font shipped beside this file,
+so a picture looks the same on every host.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 SCALE = 2.0
-"""Pixels of the PNG for one of the SVG: sharp on dense screens and in print."""
+"""Pixels of the PNG for each pixel of the SVG: sharp on dense screens and in print."""
 PAPER = "#ffffff"
 REMEDY = 'pip install "resvg-py>=0.5,<1"'
 FONT = Path(__file__).parent / "fonts" / "DejaVuSans.ttf"
@@ -23,11 +23,11 @@ FAMILY = "DejaVu Sans"
 
 
 class RasterError(Exception):
-    """No PNG can be made: what is missing or wrong, and the remedy."""
+    """No PNG can be made; the text says what is missing or wrong and what to do."""
 
 
 def png(svg: str, scale: float = SCALE) -> bytes:
-    """A standalone SVG text as PNG bytes on white. Raises RasterError."""
+    """Render a standalone SVG text as PNG on white. Raises RasterError."""
     missing = unavailable()
     if missing:
         raise RasterError(missing)
@@ -46,12 +46,12 @@ def png(svg: str, scale: float = SCALE) -> bytes:
             )
         )
     except ValueError as fault:
-        raise RasterError(f"the picture is no SVG that can be rendered: {fault}") from fault
+        raise RasterError(f"the picture is not an SVG that can be rendered: {fault}") from fault
 
 
 @cache
 def unavailable() -> str:
-    """Why no PNG can be made by this installation, with the remedy; empty when it can."""
+    """Return why this installation cannot make a PNG, and what to do; empty if it can."""
     try:
         _resvg()
     except ImportError:

@@ -1,4 +1,4 @@
-"""A mission run as one self-contained HTML page: result, net, Gantt of the runs, firings and
+"""A mission run as one self-contained HTML page: result, net, Gantt chart of the runs, firings and
 reasons of errors."""
 
 from __future__ import annotations
@@ -9,18 +9,19 @@ from typing import Any
 
 from petrobot.coordinator.learning.learner import LearningSelector
 from petrobot.coordinator.learning.learning import Learning
-from petrobot.coordinator.learning.records import End, Record
+from petrobot.coordinator.learning.records import Record, RunEnd
 from petrobot.coordinator.run.recording import Step
 from petrobot.coordinator.run.timeline import Bar, Timeline
 from petrobot.coordinator.studies.report.action_pictures import (
+    Curves,
     Pictures,
     action_pictures,
     add_latencies,
     latency_svg,
     put,
+    recorded_curves,
     trial_pictures,
 )
-from petrobot.coordinator.studies.report.learning_curves import Curves, recorded_curves
 from petrobot.coordinator.studies.report.page import (
     apart,
     gallery,
@@ -37,9 +38,9 @@ from petrobot.coordinator.task import Status, Task
 
 ROW, LEFT, WIDTH = 26, 150, 1040
 SECOND = 10.0
-"""Pixels of a second at least, in a Gantt chart that is wider than the page then."""
+"""Least number of pixels per second; a long Gantt chart becomes wider than the page."""
 LONGEST = 600.0
-"""Seconds of a Gantt chart; what came later is in the table of firings."""
+"""Seconds shown in a Gantt chart; the table of firings lists the rest."""
 
 
 def report_html(
@@ -49,7 +50,7 @@ def report_html(
     pictures: Mapping[str, str] | None = None,
     measured: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
-    """The page. `result` is the mission's result; its lists of records become tables.
+    """Return the page. `result` is the mission's result; its lists of records become tables.
 
     SVG texts: `pictures`, the task's own by title; `measured`, those of its actions by heading.
     """
@@ -74,7 +75,8 @@ def report_html(
 
 
 def own_pictures(result: Mapping[str, Any]) -> dict[str, str]:
-    """The task's own pictures, from what its score declares (coordinator/studies/report/plots.py)."""
+    """Return the task's own pictures that its score declares
+    (coordinator/studies/report/plots.py)."""
     tables = {name: rows for name, rows in result.items() if is_table(rows)}
     longest = max((len(rows) for rows in tables.values()), default=0)
     rows: list[dict[str, Any]] = [{} for _ in range(longest)]
@@ -90,7 +92,8 @@ def own_pictures(result: Mapping[str, Any]) -> dict[str, str]:
 
 
 def gantt_svg(timeline: Timeline) -> str:
-    """Runs as bars over time, one row for each place (time axis in s since the mission began)."""
+    """Return runs as bars over time, one row for each place (time axis in s since the mission
+    began)."""
     bars = [bar for bar in timeline.bars.values() if bar.begun <= LONGEST]
     if not bars:
         return "<p>No run was started.</p>"
@@ -139,8 +142,8 @@ def _bar(bar: Bar, row: int, scale: float, end: float, left: int) -> str:
 
 
 def _letter(bar: Bar, x: float, row: int) -> str:
-    """What the colour says once more, on the bar, for runs that met no specification: F, E, or P
-    for a preempted one."""
+    """Repeat the colour's meaning as a letter on the bar, for runs that did not meet their
+    specification: F, E, or P for preempted."""
     if bar.status is Status.SUCCESS:
         return ""
     letter = bar.status.value[0].upper() if bar.status else "P"
@@ -197,12 +200,13 @@ def _firings(timeline: Timeline) -> str:
     return f"<details><summary>{len(timeline.firings)} firings</summary>{body}</details>"
 
 
-# What a recorded mission run says of its actions: the steps of its journal shown once more to the observer that learns from runs.
+# --- what a recorded run tells about its actions ---
 
 
 class ObservedRun:
-    """Observes the steps of a run. `learner`: the selector that learned in it, as it began; None:
-    nobody learned."""
+    """Replays the steps of a recorded run to an observer that learns, to show what the run tells
+    about its actions. `learner`: the selector that learned in the run, as it began; None: nothing
+    learned in it."""
 
     def __init__(self, task: Task, learner: LearningSelector | None = None) -> None:
         self._task = task
@@ -211,7 +215,7 @@ class ObservedRun:
         self._probability: dict[tuple[str, str], Curves] = {}
 
     def step(self, step: Step) -> None:
-        """See one stimulus and what came of it."""
+        """Observe one stimulus and its instructions."""
         seen = len(self._selector.records)
         self._selector.stimulus(step.time, step.stimulus)
         for instruction in step.instructions:
@@ -221,14 +225,14 @@ class ObservedRun:
             self._note(self._selector.records[seen:])
 
     def _note(self, records: Sequence[Record]) -> None:
-        """The probabilities after each trial that ended."""
+        """Record the probabilities after each trial that ended."""
         for record in records:
             selector = (
                 None
-                if not isinstance(record, End)
+                if not isinstance(record, RunEnd)
                 else self._selector.learning.selectors.get(record.primitive_task)
             )
-            if selector is None or not isinstance(record, End) or record.outcome.status is None:
+            if selector is None or not isinstance(record, RunEnd) or record.outcome.status is None:
                 continue
             curves = self._probability.setdefault((record.primitive_task, record.context), {})
             for action, p in selector.learned(record.context).items():
@@ -236,7 +240,7 @@ class ObservedRun:
                 points.append((len(points) + 1, p))
 
     def pictures(self) -> Pictures:
-        """Every picture that there are numbers for."""
+        """Return every picture for which there are numbers."""
         trials = recorded_curves(self._task, self._selector.records)
         for one in trials:
             one.probability = (
@@ -247,7 +251,7 @@ class ObservedRun:
         )
         latencies: dict[str, list[float]] = {}
         for record in self._selector.records:
-            if isinstance(record, End):
+            if isinstance(record, RunEnd):
                 add_latencies(latencies, record.action, record.outcome.values)
         if latencies:
             put(out, "latencies", "Times", latency_svg(latencies))

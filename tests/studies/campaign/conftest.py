@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from petrobot.coordinator.studies.campaign.block import Bench
+from petrobot.coordinator.studies.campaign.block import LoadedPlan
 from petrobot.coordinator.studies.campaign.conduct import Campaign
-from petrobot.coordinator.studies.campaign.plan import Plan, digest
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.worker import answer
 
 HERE = Path(__file__).parent
@@ -22,7 +22,7 @@ TASK, SERVICES = HERE / "toy" / "fetch.toml", HERE / "toy" / "services.toml"
 class InlinePool:
     """Does blocks in this process, one after the other; `fails_at` blocks in it is interrupted."""
 
-    def __init__(self, plan: Plan, fails_at: int | None = None) -> None:
+    def __init__(self, plan: CampaignPlan, fails_at: int | None = None) -> None:
         import json
 
         self.count, self.lost, self.done = 1, 0, 0
@@ -43,9 +43,9 @@ def _toy_actions(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def toy_plan() -> Plan:
-    """Twelve throws in two regimes, blocks of three."""
-    return Plan(
+def toy_plan() -> CampaignPlan:
+    """Twelve trials in two regimes, blocks of three."""
+    return CampaignPlan(
         str(TASK),
         str(SERVICES),
         runs=12,
@@ -57,16 +57,16 @@ def toy_plan() -> Plan:
 
 
 @pytest.fixture
-def bench(toy_plan: Plan) -> Bench:
+def bench(toy_plan: CampaignPlan) -> LoadedPlan:
     """The toy's files."""
-    return Bench.of(toy_plan)
+    return LoadedPlan.of(toy_plan)
 
 
 Conduct = Callable[..., Campaign]
 
 
 @pytest.fixture
-def conduct(tmp_path: Path, toy_plan: Plan) -> Iterator[Conduct]:
+def conduct(tmp_path: Path, toy_plan: CampaignPlan) -> Iterator[Conduct]:
     """Run a campaign of the toy in a folder of tmp_path; the plan's fields may be changed."""
 
     def run(name: str, fails_at: int | None = None, **changes: Any) -> Campaign:

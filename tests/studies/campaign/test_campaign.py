@@ -21,12 +21,12 @@ from petrobot.coordinator.cli.campaign import text_of
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.learning.objective import Question, compare
-from petrobot.coordinator.studies.campaign.conduct import Campaign, Progress
+from petrobot.coordinator.studies.campaign.conduct import Campaign, CampaignProgress
 from petrobot.coordinator.studies.campaign.observed import regime_of
 from petrobot.coordinator.studies.campaign.plan import (
     MANIFEST,
     CampaignError,
-    Plan,
+    CampaignPlan,
     digest,
     read_manifest,
     write_manifest,
@@ -44,7 +44,7 @@ def table(folder: Path) -> bytes:
     return (folder / TABLE).read_bytes()
 
 
-def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
+def test_blocks_cover_all_trials_whatever_their_size(toy_plan: CampaignPlan) -> None:
     """Regimes take turns and share their seeds; numbers and seeds come from the index alone."""
     for runs, block in ((1, 4), (7, 3), (12, 5), (20, 1)):
         blocks = replace(toy_plan, runs=runs, block=block).blocks
@@ -61,7 +61,7 @@ def test_blocks_cover_all_throws_whatever_their_size(toy_plan: Plan) -> None:
 
 
 def test_columns_come_from_task_and_score(conduct: Conduct) -> None:
-    """One row a throw, with what the toy's own score says and what each run did."""
+    """One row a trial, with what the toy's own score says and what each run did."""
     campaign = conduct("a")
     rows = list(campaign.table.rows())
     assert [row.n for row in rows] == list(range(1, 13))
@@ -155,14 +155,14 @@ def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int
     path = plan_cut_off(whole.folder.parent / "a", size)
     with pytest.raises(
         CampaignError,
-        match=r"campaign.json: .*empty, torn.*remove campaign.json and give the command again",
+        match=r"campaign.json: .*empty, incomplete.*remove campaign.json and give the command again",
     ):
         conduct("a")
     path.unlink()
     assert table(conduct("a").folder) == table(whole.folder)
     plan_cut_off(path.parent, size)
     with pytest.raises(
-        CampaignError, match=r"torn.*remove .*a to begin anew, or give another --out"
+        CampaignError, match=r"incomplete.*remove .*a to begin again, or give another --out"
     ):
         conduct("a")
 
@@ -172,12 +172,12 @@ def test_a_manifest_that_is_no_plan_is_refused(conduct: Conduct, text: str) -> N
     """Though it is JSON."""
     folder = conduct("a").folder
     (folder / MANIFEST).write_text(text, encoding="utf-8")
-    with pytest.raises(CampaignError, match="no plan"):
+    with pytest.raises(CampaignError, match="not a plan"):
         read_manifest(folder)
 
 
 def test_a_kill_while_the_manifest_is_written_leaves_the_old_one_or_the_new_one(
-    conduct: Conduct, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    conduct: Conduct, toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever had been written when the process died: before the file is on the disk it has
     another name."""
@@ -221,11 +221,11 @@ def test_round_robin_tries_every_combination(conduct: Conduct) -> None:
     assert len(seen) >= 5  # one of six may have been unseen
 
 
-def test_progress_counts_throws(tmp_path: Path, toy_plan: Plan) -> None:
+def test_progress_counts_trials(tmp_path: Path, toy_plan: CampaignPlan) -> None:
     """Up to the last one; a resumed campaign says how many it found."""
     from tests.studies.campaign.conftest import InlinePool
 
-    seen: list[Progress] = []
+    seen: list[CampaignProgress] = []
     campaign = Campaign(tmp_path / "a", toy_plan, seen.append)
     asyncio.run(campaign.run(InlinePool(toy_plan)))
     assert [p.done for p in seen] == [3, 6, 9, 12]
@@ -234,7 +234,7 @@ def test_progress_counts_throws(tmp_path: Path, toy_plan: Plan) -> None:
 
 @pytest.mark.processes
 def test_workers_in_any_number_and_a_killed_one_change_nothing(
-    conduct: Conduct, tmp_path: Path, toy_plan: Plan
+    conduct: Conduct, tmp_path: Path, toy_plan: CampaignPlan
 ) -> None:
     """kill -9 of a busy worker: its block is done again by another one."""
     alone = conduct("alone", selector="random")
@@ -258,7 +258,7 @@ def test_workers_in_any_number_and_a_killed_one_change_nothing(
 
 
 def test_nothing_of_a_block_is_there_when_the_next_one_begins(
-    toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker's memory stays flat although a mission refers to itself in circles and the collector
     has its own time."""
@@ -510,7 +510,7 @@ def test_a_cost_that_no_result_has_is_said(conduct: Conduct, tmp_path: Path) -> 
 
 @pytest.mark.processes
 async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
-    tmp_path: Path, toy_plan: Plan, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, toy_plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its child holds its output and its input open; it ends with it."""
     mark, program = tmp_path / "left", tmp_path / "worker"
@@ -521,7 +521,7 @@ async def test_what_a_dead_worker_has_left_running_does_not_hide_its_death(
     monkeypatch.setattr("sys.executable", str(program))
     order = {"block": toy_plan.blocks[0].to_plain(), "weights": []}
     async with asyncio.timeout(60.0), LocalPool(toy_plan, 1, tmp_path / "log") as pool:
-        with pytest.raises(CampaignError, match="ended 3 workers"):
+        with pytest.raises(CampaignError, match="3 workers ended"):
             await pool.run(order)
         assert pool.lost == 3
         left = int(mark.read_text())

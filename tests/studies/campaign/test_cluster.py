@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.coordinator.studies.campaign.cluster import ClusterPool
-from petrobot.coordinator.studies.campaign.conduct import Campaign, Progress
-from petrobot.coordinator.studies.campaign.plan import CampaignError, Plan
+from petrobot.coordinator.studies.campaign.conduct import Campaign, CampaignProgress
+from petrobot.coordinator.studies.campaign.plan import CampaignError, CampaignPlan
+from petrobot.coordinator.studies.campaign.pool import ClusterPool
 from petrobot.coordinator.studies.campaign.table import TABLE
 from tests.studies.campaign.conftest import HERE, Conduct
 from tests.waiting import beat
@@ -83,7 +83,7 @@ def test_a_killed_worker_of_a_real_cluster_changes_nothing(
 
 
 async def _conducted(
-    folder: Path, plan: Plan, where: Path, victim: subprocess.Popen[bytes]
+    folder: Path, plan: CampaignPlan, where: Path, victim: subprocess.Popen[bytes]
 ) -> None:
     """The campaign on the cluster; the victim dies after the second block that is done."""
     import json
@@ -94,7 +94,7 @@ async def _conducted(
         await beat(0)
     address = json.loads(where.read_text(encoding="utf-8"))["address"]
 
-    def watch(progress: Progress) -> None:
+    def watch(progress: CampaignProgress) -> None:
         if progress.done == 6:
             victim.kill()
 
@@ -105,7 +105,9 @@ async def _conducted(
         await campaign.run(pool)
 
 
-def test_without_dask_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch, toy_plan: Plan) -> None:
+def test_without_dask_the_remedy_is_named(
+    monkeypatch: pytest.MonkeyPatch, toy_plan: CampaignPlan
+) -> None:
     """One clear line."""
     monkeypatch.setitem(sys.modules, "distributed", None)
 

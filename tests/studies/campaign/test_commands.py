@@ -19,8 +19,12 @@ import pytest
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.campaign import text_of
-from petrobot.coordinator.studies.campaign.conduct import Progress
-from petrobot.coordinator.studies.campaign.progress import ProgressLine, clock, line
+from petrobot.coordinator.studies.campaign.conduct import (
+    CampaignProgress,
+    ProgressLine,
+    clock,
+    line,
+)
 from petrobot.coordinator.studies.campaign.table import held, times
 from tests.studies.campaign.conftest import HERE, SERVICES, TASK
 from tests.waiting import Limit
@@ -312,8 +316,8 @@ def _until(condition: Callable[[], bool]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["campaign", *TOY, "--selector", "oracle"], "choose among fixed, round_robin"),
-        (["campaign", *TOY, "--choose", "look=stare"], "choose among look_quick"),
+        (["campaign", *TOY, "--selector", "oracle"], "choose one of fixed, round_robin"),
+        (["campaign", *TOY, "--choose", "look=stare"], "choose one of look_quick"),
         (["campaign", *TOY, "--choose", "look"], "write NAME=VALUE"),
         (["campaign", *TOY, "--regime", "easy,easy"], "each regime once"),
         (["campaign", *TOY, "--seed", "-1"], "-1 is not a whole number of at least 0"),
@@ -328,11 +332,11 @@ def _until(condition: Callable[[], bool]) -> None:
         (["campaign", str(TASK)], "may not run with"),
         (["campaign", "--resume", "nowhere"], "holds no campaign"),
         (["campaign"], "give a TASK"),
-        (["campaign", *TOY, "--learned", "nowhere"], "no finished campaign"),
-        (["campaign", *TOY, "--check", "nowhere.json"], "nowhere.json is no forecast"),
+        (["campaign", *TOY, "--learned", "nowhere"], "not the result of a finished campaign"),
+        (["campaign", *TOY, "--check", "nowhere.json"], "nowhere.json is not a forecast"),
         (["forecast", str(TASK)], "--estimates CAMPAIGN"),
         (["forecast", str(TASK), "--estimates", "nowhere.db"], "holds no estimates"),
-        (["forecast", "--compare", "nowhere.json", "nowhere"], "is no forecast"),
+        (["forecast", "--compare", "nowhere.json", "nowhere"], "is not a forecast"),
     ],
 )
 def test_bad_input(
@@ -371,23 +375,23 @@ def test_two_at_once_do_not_write_one_table(
 
 def test_progress_line() -> None:
     """Bar, share that met its goal in this session, time to go from this session's speed."""
-    shown = line(Progress(60, 100, 20, 30, 80.0))
+    shown = line(CampaignProgress(60, 100, 20, 30, 80.0))
     assert "60/100" in shown and "75.0% met" in shown and "1:20 gone, 1:20 to go" in shown
-    assert line(Progress(0, 10, 0, 0, 0.0)).startswith("[....")
+    assert line(CampaignProgress(0, 10, 0, 0, 0.0)).startswith("[....")
     assert [clock(s) for s in (0, 59.6, 3600)] == ["0:00", "1:00", "1:00:00"]
 
 
 def test_progress_is_for_terminals(capsys: pytest.CaptureFixture[str]) -> None:
     """One line written over in a terminal, nothing elsewhere."""
     silent = ProgressLine(sys.stderr)
-    silent(Progress(1, 2, 0, 1, 1.0))
+    silent(CampaignProgress(1, 2, 0, 1, 1.0))
     silent.close()
     assert capsys.readouterr().err == ""
     ours, theirs = pty.openpty()
     with os.fdopen(theirs, "w") as terminal:
         shown = ProgressLine(terminal)
         for done in (1, 2):
-            shown(Progress(done, 2, 0, 1, float(done)))
+            shown(CampaignProgress(done, 2, 0, 1, float(done)))
         shown.close()
         told = b""
         limit = Limit("the end of the line")

@@ -1,4 +1,4 @@
-"""What is written down of a throw: by scripted missions of the shipped task, and rows there and
+"""What is written down of a trial: by scripted missions of the shipped task, and rows there and
 back."""
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from petrobot.coordinator.engine.instructions import Corrected
 from petrobot.coordinator.launch import Setting, lockstep_cell
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.studies.campaign.block import scores
-from petrobot.coordinator.studies.campaign.plan import Plan, identity
-from petrobot.coordinator.studies.campaign.rows import Row, cells, columns, read_row
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, identity
+from petrobot.coordinator.studies.campaign.rows import TrialRow, cells, columns, read_row
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial, TrialLog
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import load
@@ -30,7 +30,7 @@ TOY = load(TASK)
 
 
 def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[TrialLog, Mission]:
-    """Throws of catch_ball with scripted actions."""
+    """Trials of catch_ball with scripted actions."""
     task = load_task("catch_ball")
     cell, party = lockstep_cell(directory_for(task), Setting(task, runs=runs), scripts(task, lines))
     log = TrialLog(task, lambda record, values: record.seconds)
@@ -39,15 +39,15 @@ def logged(lines: dict[str, list[Line]], runs: int = 3) -> tuple[TrialLog, Missi
     return log, party.mission
 
 
-def test_a_throw_has_its_runs_and_what_took_them() -> None:
+def test_a_trial_has_its_runs_and_what_took_them() -> None:
     """Durations from the coming of the token; parallel runs both; the time ends when everything is
     back."""
     log, _ = logged(
         {"locate_ball": [Line(seconds=(0.4, 0.4), values={"ball": [0.0], "images": 20})]}
     )
     assert len(log.trials) == 3
-    throw = log.trials[0]
-    by_place = {run.place: run for run in throw.runs}
+    trial = log.trials[0]
+    by_place = {run.place: run for run in trial.runs}
     assert [by_place[p].taken for p in ("locate_ball", "track_ball", "move_to_point", "catch_ball", "return_home")] == [
         "located", "tracked", "in_place", "missed", "homed",
     ]  # fmt: skip
@@ -60,13 +60,13 @@ def test_a_throw_has_its_runs_and_what_took_them() -> None:
         == pytest.approx(by_place["locate_ball"].took)
     )
     home = by_place["return_home"]
-    assert throw.time == pytest.approx(home.begun + home.took)
-    assert throw.waits[0][0] == "start" and 0 <= throw.waits[0][1] <= 0.05
-    assert throw.fired["located"] == 1 and throw.completed and throw.all_success
+    assert trial.time == pytest.approx(home.begun + home.took)
+    assert trial.waits[0][0] == "start" and 0 <= trial.waits[0][1] <= 0.05
+    assert trial.fired["located"] == 1 and trial.completed and trial.all_success
 
 
-def test_an_error_branch_belongs_to_its_throw() -> None:
-    """Recovery is part of the throw that needed it; the next one is clean."""
+def test_an_error_branch_belongs_to_its_trial() -> None:
+    """Recovery is part of the trial that needed it; the next one is clean."""
     bad = Line(ActionStatus.ERROR, (0.1, 0.1), cause="unreachable", text="too far")
     log, _ = logged({"move_to_point": [bad, Line(seconds=(0.2, 0.2)), Line(seconds=(0.2, 0.2))]})
     first, second, _ = log.trials
@@ -76,8 +76,8 @@ def test_an_error_branch_belongs_to_its_throw() -> None:
     assert second.status == "success" and "recovered" not in second.fired
 
 
-def test_giving_up_leaves_throws_unbegun() -> None:
-    """The last throw was begun and not completed; those after it never were."""
+def test_giving_up_leaves_trials_unbegun() -> None:
+    """The last trial was begun and not completed; those after it never were."""
     dead = [Line(ActionStatus.ERROR, (0.1, 0.1), cause="drive_fault")]
     log, mission = logged({"move_to_point": dead, "recover_arm": dead}, runs=4)
     assert len(log.trials) == 1 < mission.runs
@@ -125,7 +125,7 @@ RUNS = st.builds(
     cost=st.none() | FINITE,
     values=st.dictionaries(TEXT, FINITE, max_size=2),
 )
-THROWS = st.builds(
+TRIALS = st.builds(
     Trial,
     k=st.integers(1, 99),
     begun=FINITE,
@@ -144,13 +144,13 @@ SCORES = st.dictionaries(
 )
 
 
-@given(THROWS | st.none(), SCORES, st.booleans())
+@given(TRIALS | st.none(), SCORES, st.booleans())
 def test_rows_come_back_as_they_were(
-    throw: Trial | None, score: dict[str, Any], known: bool
+    trial: Trial | None, score: dict[str, Any], known: bool
 ) -> None:
     """Through CSV, whatever texts hold; results that the first block did not have travel in
     `more`."""
-    row = Row(7, "easy", 1_000_000, throw.k if throw else 2, 1, 3.25, throw, score)
+    row = TrialRow(7, "easy", 1_000_000, trial.k if trial else 2, 1, 3.25, trial, score)
     names = columns(TOY, [row] if known else [])
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -172,7 +172,7 @@ def test_rows_come_back_as_they_were(
 
 def test_carriage_returns_do_not_break_the_table() -> None:
     """They become newlines, which CSV quotes."""
-    row = Row(1, "", 1, 1, 0, 1.0, Trial(1, 0.0, cause="one\rtwo\r\nthree"))
+    row = TrialRow(1, "", 1, 1, 0, 1.0, Trial(1, 0.0, cause="one\rtwo\r\nthree"))
     names = columns(TOY, [])
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([names, cells(TOY, row, names)])
@@ -180,16 +180,16 @@ def test_carriage_returns_do_not_break_the_table() -> None:
     assert record["cause"] == "one\ntwo\nthree"
 
 
-@given(THROWS)
-def test_throws_travel_as_plain_data(throw: Trial) -> None:
+@given(TRIALS)
+def test_trials_travel_as_plain_data(trial: Trial) -> None:
     """From a worker to the campaign."""
     import json
 
-    assert Trial.from_plain(json.loads(json.dumps(throw.to_plain()))) == throw
+    assert Trial.from_plain(json.loads(json.dumps(trial.to_plain()))) == trial
 
 
-def test_scores_go_to_the_throw_that_they_are_of() -> None:
-    """By `run` where there is one, else by `n`; plain values serve a single throw."""
+def test_scores_go_to_the_trial_that_they_are_of() -> None:
+    """By `run` where there is one, else by `n`; plain values serve a single trial."""
     score = {
         "balls": [
             {"n": 1, "run": 2, "x": 0.5},
@@ -207,7 +207,7 @@ def test_scores_go_to_the_throw_that_they_are_of() -> None:
     assert scores({"time_s": 4.0}, 2) == [{}, {}]
 
 
-def test_identity_is_of_what_runs_not_where_it_lies(toy_plan: Plan) -> None:
+def test_identity_is_of_what_runs_not_where_it_lies(toy_plan: CampaignPlan) -> None:
     """The same files elsewhere are the same campaign."""
     from dataclasses import replace
 

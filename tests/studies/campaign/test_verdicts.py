@@ -12,7 +12,7 @@ import pytest
 from petrobot.coordinator.learning.estimates_file import EstimatesFile
 from petrobot.coordinator.studies.campaign.conduct import Campaign
 from petrobot.coordinator.studies.campaign.observed import ESTIMATES
-from petrobot.coordinator.studies.campaign.plan import Plan, digest
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
 from petrobot.coordinator.studies.campaign.table import TABLE
 from tests.run.judged_parts import FOLDER, TRULY
 from tests.studies.campaign.conftest import InlinePool
@@ -22,22 +22,24 @@ BLOCKS = 3
 
 
 @pytest.fixture
-def plan() -> Plan:
+def plan() -> CampaignPlan:
     """Three blocks of six parts: of each, the first, third and fourth pick turn out bad."""
     digests = {"task": digest(TASK), "services": digest(SERVICES)}
-    return Plan(
+    return CampaignPlan(
         str(TASK), str(SERVICES), runs=6 * BLOCKS, block=6, batch=0, digests=digests, regimes=("",)
     )
 
 
-def conducted(folder: Path, plan: Plan, fails_at: int | None = None) -> Campaign:
+def conducted(folder: Path, plan: CampaignPlan, fails_at: int | None = None) -> Campaign:
     """The campaign in a folder."""
     campaign = Campaign(folder, plan)
     asyncio.run(campaign.run(InlinePool(plan, fails_at)))
     return campaign
 
 
-def test_the_table_and_the_estimates_hold_what_was_judged(tmp_path: Path, plan: Plan) -> None:
+def test_the_table_and_the_estimates_hold_what_was_judged(
+    tmp_path: Path, plan: CampaignPlan
+) -> None:
     campaign = conducted(tmp_path / "a", plan)
     rows = list(campaign.table.rows())
     assert len(rows) == 6 * BLOCKS
@@ -61,7 +63,7 @@ def test_the_table_and_the_estimates_hold_what_was_judged(tmp_path: Path, plan: 
     assert tally.reliability == 0.5
 
 
-def test_interrupted_and_resumed_it_is_the_same_table(tmp_path: Path, plan: Plan) -> None:
+def test_interrupted_and_resumed_it_is_the_same_table(tmp_path: Path, plan: CampaignPlan) -> None:
     whole = (conducted(tmp_path / "a", plan).folder / TABLE).read_bytes()
     with pytest.raises(KeyboardInterrupt):
         conducted(tmp_path / "b", plan, fails_at=1)

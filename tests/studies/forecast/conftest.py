@@ -1,4 +1,4 @@
-"""What the tests of forecasts share: throws of a small task that are drawn here, so that the truth
+"""What the tests of forecasts share: trials of a small task that are drawn here, so that the truth
 is known."""
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def pair() -> Task:
 
 
 @pytest.fixture
-def make_throws() -> Make:
-    """Throws in which a hidden difficulty (`dependence` 1) or chance (0) decides about both runs.
+def make_trials() -> Make:
+    """Trials in which a hidden difficulty (`dependence` 1) or chance (0) decides about both runs.
 
     first: error 5 %, else failure when it was hard; second: the signal comes after 2 - (duration of
     first) s, or it is missed.

@@ -16,7 +16,7 @@ from scipy.stats import binom
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.agreement import agreement, quantile_interval
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.distributions import Laws, dependences
+from petrobot.coordinator.studies.forecast.distributions import RunDistributions, dependences
 from petrobot.coordinator.studies.forecast.history import ForecastError, Training
 from petrobot.coordinator.studies.forecast.predict import Request, distance, figures, predict
 from petrobot.coordinator.studies.forecast.registered import read, register, write
@@ -32,19 +32,19 @@ from tests.studies.forecast.conftest import Make
 RUNS = 400
 
 
-def forecast(task: Task, throws: list[Trial], **given_: Any) -> dict[str, Any]:
-    """A forecast from throws with their own choices."""
-    training = Training.of(task, throws)
+def forecast(task: Task, trials: list[Trial], **given_: Any) -> dict[str, Any]:
+    """A forecast from trials with their own choices."""
+    training = Training.of(task, trials)
     return predict(
         training,
         Request(RUNS, given_.pop("choices", choices_of(training)), replicates=60, point=20_000),
     )
 
 
-def test_marginals_of_the_training_are_kept(pair: Task, make_throws: Make) -> None:
+def test_marginals_of_the_training_are_kept(pair: Task, make_trials: Make) -> None:
     """Whatever depends on whatever: the net composes the laws to what was measured."""
-    throws = make_throws(1500, np.random.default_rng(1))
-    found, own = forecast(pair, throws)["figures"], figures(measured(Training.of(pair, throws)))
+    trials = make_trials(1500, np.random.default_rng(1))
+    found, own = forecast(pair, trials)["figures"], figures(measured(Training.of(pair, trials)))
     for name in ("R_goal", "P_complete", "R_conj"):
         assert found[name]["value"] == pytest.approx(own[name], abs=0.015)
     for name in ("mean", "q90"):
@@ -52,18 +52,18 @@ def test_marginals_of_the_training_are_kept(pair: Task, make_throws: Make) -> No
 
 
 def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(
-    pair: Task, make_throws: Make
+    pair: Task, make_trials: Make
 ) -> None:
-    """Statuses of one throw depend on each other: the product of marginals is too small, the
+    """Statuses of one trial depend on each other: the product of marginals is too small, the
     contexts are not."""
-    throws = make_throws(1500, np.random.default_rng(2))
-    training = Training.of(pair, throws)
+    trials = make_trials(1500, np.random.default_rng(2))
+    training = Training.of(pair, trials)
     assert dependences(training)[0]["p"] < 1e-6
-    made = forecast(pair, throws)
+    made = forecast(pair, trials)
     assert ("second", "outcome", "outcome of first") in {
         (s["place"], s["of"], s["by"]) for s in made["splits"]
     }
-    new = {"": Training.of(pair, make_throws(RUNS, np.random.default_rng(3)))}
+    new = {"": Training.of(pair, make_trials(RUNS, np.random.default_rng(3)))}
     found = agreement({"regimes": {"": made}}, new)
     assert found["agrees"], found["rows"]
     (control,) = found["negative_control"]
@@ -71,23 +71,23 @@ def test_dependence_is_found_unfolded_and_the_product_is_not_the_truth(
     assert control["rejected"]
 
 
-def test_without_dependence_the_product_is_not_rejected(pair: Task, make_throws: Make) -> None:
+def test_without_dependence_the_product_is_not_rejected(pair: Task, make_trials: Make) -> None:
     """The control discriminates: independent statuses multiply."""
-    throws = make_throws(1500, np.random.default_rng(4), dependence=0.0)
-    assert dependences(Training.of(pair, throws))[0]["p"] > 0.01
+    trials = make_trials(1500, np.random.default_rng(4), dependence=0.0)
+    assert dependences(Training.of(pair, trials))[0]["p"] > 0.01
     found = agreement(
-        {"regimes": {"": forecast(pair, throws)}},
-        {"": Training.of(pair, make_throws(RUNS, np.random.default_rng(5), 0.0))},
+        {"regimes": {"": forecast(pair, trials)}},
+        {"": Training.of(pair, make_trials(RUNS, np.random.default_rng(5), 0.0))},
     )
     assert not found["negative_control"][0]["rejected"]
 
 
-def test_a_changed_world_is_not_agreed_with(pair: Task, make_throws: Make) -> None:
+def test_a_changed_world_is_not_agreed_with(pair: Task, make_trials: Make) -> None:
     """The comparison can fail: other times and other shares are told."""
-    made = forecast(pair, make_throws(1500, np.random.default_rng(6)))
+    made = forecast(pair, make_trials(1500, np.random.default_rng(6)))
     slower = [
         replace(t, time=t.time * 1.05 if t.time else None)
-        for t in make_throws(RUNS, np.random.default_rng(7))
+        for t in make_trials(RUNS, np.random.default_rng(7))
     ]
     found = agreement({"regimes": {"": made}}, {"": Training.of(pair, slower)})
     assert not found["agrees"]
@@ -95,36 +95,36 @@ def test_a_changed_world_is_not_agreed_with(pair: Task, make_throws: Make) -> No
     assert 0.75 < made["figures"]["R_goal"]["value"] < 0.85
     fewer = [
         replace(t, goals=t.goals * (i % 4 > 0))
-        for i, t in enumerate(make_throws(RUNS, np.random.default_rng(8)))
+        for i, t in enumerate(make_trials(RUNS, np.random.default_rng(8)))
     ]
     assert not agreement({"regimes": {"": made}}, {"": Training.of(pair, fewer)})["agrees"]
 
 
-def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_throws: Make) -> None:
+def test_unfolding_keeps_the_spread_of_the_time(pair: Task, make_trials: Make) -> None:
     """A long first run is followed by a short second one: independent draws would spread the time
     too far."""
-    throws = make_throws(1500, np.random.default_rng(9))
-    training = Training.of(pair, throws)
+    trials = make_trials(1500, np.random.default_rng(9))
+    training = Training.of(pair, trials)
     real = measured(training)
     met = real.goals > 0
     assert np.std(real.time[met]) < 0.05
-    made = forecast(pair, throws)
+    made = forecast(pair, trials)
     assert made["residual"][-1]["p"] > 0.001
-    new = Training.of(pair, make_throws(RUNS, np.random.default_rng(10)))
+    new = Training.of(pair, make_trials(RUNS, np.random.default_rng(10)))
     law = agreement({"regimes": {"": made}}, {"": new})["law"][0]
     assert law["agrees"]
 
 
-def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_throws: Make) -> None:
+def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_trials: Make) -> None:
     """What-if needs at least some runs of the action; with them it works."""
-    throws = make_throws(300, np.random.default_rng(11))
+    trials = make_trials(300, np.random.default_rng(11))
     other = {"first": {"first_b": 1.0}, "second": {"second_a": 1.0}}
     with pytest.raises(ValueError, match="first_b was never run"):
-        forecast(pair, throws, choices=other)
-    both = make_throws(1000, np.random.default_rng(12), actions=("first_a", "first_b"))
+        forecast(pair, trials, choices=other)
+    both = make_trials(1000, np.random.default_rng(12), actions=("first_a", "first_b"))
     alone = figures(
         measured(
-            Training.of(pair, make_throws(4000, np.random.default_rng(13), actions=("first_b",)))
+            Training.of(pair, make_trials(4000, np.random.default_rng(13), actions=("first_b",)))
         )
     )
     assert forecast(pair, both, choices=other)["figures"]["mean"]["value"] == pytest.approx(
@@ -132,18 +132,18 @@ def test_a_choice_that_was_never_measured_is_refused(pair: Task, make_throws: Ma
     )
 
 
-def test_predictive_intervals_cover(pair: Task, make_throws: Make) -> None:
+def test_predictive_intervals_cover(pair: Task, make_trials: Make) -> None:
     """Of 40 worlds with 95 % intervals for R_goal and the mean, nearly all hold (99.9 % binomial
     bound)."""
     inside = 0
     for seed in range(20):
         random = np.random.default_rng(100 + seed)
-        training = Training.of(pair, make_throws(250, random))
+        training = Training.of(pair, make_trials(250, random))
         made = predict(
             training, Request(200, choices_of(training), seed, replicates=40, point=8000)
         )
         found = agreement(
-            {"regimes": {"": made}}, {"": Training.of(pair, make_throws(200, random))}
+            {"regimes": {"": made}}, {"": Training.of(pair, make_trials(200, random))}
         )
         inside += sum(
             row["p"] >= 0.05 for row in found["rows"] if row["figure"] in ("R_goal", "mean")
@@ -159,8 +159,12 @@ def test_censored_runs_pass_their_weight_on(pair: Task) -> None:
         for took, status in ((1.0, "success"), (2.0, ""), (3.0, "failure"))
     ]
     law = next(
-        iter(Laws(Training.of(pair, [Trial(1, 0.0, runs=[run]) for run in runs])).contexts.values())
-    ).law
+        iter(
+            RunDistributions(
+                Training.of(pair, [Trial(1, 0.0, runs=[run]) for run in runs])
+            ).contexts.values()
+        )
+    ).ends
     assert law.took.tolist() == [1.0, 3.0]
     assert law.weight.tolist() == pytest.approx([1 / 3, 2 / 3])
 
@@ -224,44 +228,44 @@ def test_distance_is_kolmogorovs() -> None:
 
 
 def test_a_registered_forecast_stays_as_it_is(
-    pair: Task, make_throws: Make, tmp_path: Path
+    pair: Task, make_trials: Make, tmp_path: Path
 ) -> None:
     """Never written over; a changed one is refused."""
-    training = {"": Training.of(pair, make_throws(200, np.random.default_rng(1)))}
+    training = {"": Training.of(pair, make_trials(200, np.random.default_rng(1)))}
     request = {"": Request(100, choices_of(training[""]), replicates=20, point=2000)}
     made = register(pair, training, request, {"estimates": {"campaign": "c"}})
     path = tmp_path / "f.json"
     write(path, made)
     assert read(path) == made
-    with pytest.raises(ForecastError, match="stays as it is"):
+    with pytest.raises(ForecastError, match="never overwritten"):
         write(path, made)
     path.write_text(path.read_text().replace('"runs": 100', '"runs": 101'), encoding="utf-8")
     with pytest.raises(ForecastError, match="was changed"):
         read(path)
-    with pytest.raises(ForecastError, match="no throw of regime B"):
+    with pytest.raises(ForecastError, match="no trial of regime B"):
         register(pair, training, {"B": request[""]}, {})
 
 
-def test_the_same_seed_gives_the_same_forecast(pair: Task, make_throws: Make) -> None:
+def test_the_same_seed_gives_the_same_forecast(pair: Task, make_trials: Make) -> None:
     """All chance is seeded."""
-    throws = make_throws(300, np.random.default_rng(1))
-    assert forecast(pair, throws) == forecast(pair, throws)
+    trials = make_trials(300, np.random.default_rng(1))
+    assert forecast(pair, trials) == forecast(pair, trials)
 
 
-def test_the_stochastic_view_stands_beside(pair: Task, make_throws: Make) -> None:
+def test_the_stochastic_view_stands_beside(pair: Task, make_trials: Make) -> None:
     """It keeps shares and means exactly, but takes statuses for independent: its R_conj is the
     product, not the truth."""
     from petrobot.coordinator.studies.campaign.observed import estimates_of
-    from petrobot.coordinator.studies.campaign.rows import Row
+    from petrobot.coordinator.studies.campaign.rows import TrialRow
     from petrobot.coordinator.studies.forecast.registered import exact
 
-    throws = make_throws(1500, np.random.default_rng(14))
-    training = Training.of(pair, throws)
-    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
+    trials = make_trials(1500, np.random.default_rng(14))
+    training = Training.of(pair, trials)
+    rows = [TrialRow(i, "", i, 1, i, 1.0, trial) for i, trial in enumerate(trials)]
     found = exact(pair, estimates_of(pair, rows, "t"), "", choices_of(training))
     own = figures(measured(training))
     assert found["R_goal"] == pytest.approx(own["R_goal"], abs=1e-3)
     assert found["mean"] == pytest.approx(own["mean"] + 0.1, rel=0.01)  # with the wait for the tick
-    product = forecast(pair, throws)["product"]["R_conj"]
+    product = forecast(pair, trials)["product"]["R_conj"]
     assert found["R_conj"] == pytest.approx(product, abs=1e-3)
     assert found["R_conj"] < own["R_conj"] - 0.05

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.studies.campaign.plan import Plan, digest, write_manifest
-from petrobot.coordinator.studies.campaign.rows import Row
-from petrobot.coordinator.studies.campaign.table import Table
+from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest, write_manifest
+from petrobot.coordinator.studies.campaign.rows import TrialRow
+from petrobot.coordinator.studies.campaign.table import CampaignTable
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import misfit
 from petrobot.coordinator.studies.forecast.history import Training
@@ -31,26 +31,26 @@ BOTH = ("first_a", "first_b")
 
 @pytest.fixture
 def write_campaign(tmp_path: Path) -> Write:
-    """A campaign's folder with given throws of a task file."""
+    """A campaign's folder with given trials of a task file."""
 
-    def write(name: str, text: str, throws: list[Trial], seed: int = 1, **more: Any) -> Path:
+    def write(name: str, text: str, trials: list[Trial], seed: int = 1, **more: Any) -> Path:
         task = loads(text, "task.toml")
         path = tmp_path / f"{task.name}.toml"
         path.write_text(text, encoding="utf-8")
         folder = tmp_path / name
         folder.mkdir()
-        plan = Plan(
+        plan = CampaignPlan(
             str(path),
             "nowhere.toml",
-            len(throws),
+            len(trials),
             ("",),
             seed,
             digests={"task": digest(path)},
             **more,
         )
         write_manifest(folder, plan)
-        Table(folder, task).append(
-            [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws, 1)]
+        CampaignTable(folder, task).append(
+            [TrialRow(i, "", i, 1, i, 1.0, trial) for i, trial in enumerate(trials, 1)]
         )
         return folder
 
@@ -95,8 +95,8 @@ def test_a_doubtful_forecast_is_told_and_not_registered(
     assert main(told) == 1
     shown = capsys.readouterr()
     assert (
-        "DOUBTFUL: throws played with the training's own choices differ from the training's: goal"
-        in shown.out
+        "DOUBTFUL: simulated trials with the training's own choices differ from the measured "
+        "ones: goal" in shown.out
     )
     assert "DOUBTFUL" in shown.err and "--doubtful" in shown.err
     assert "registered" not in shown.out
@@ -110,16 +110,16 @@ def test_a_doubtful_forecast_is_told_and_not_registered(
 
 
 def test_a_what_if_is_compared_with_runs_that_choose_so(
-    write_campaign: Write, make_throws: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    write_campaign: Write, make_trials: Make, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Others are refused with the choices that fit; those that fit agree, their ways out of each
     place too."""
-    train = write_campaign("train", TASK, make_throws(900, np.random.default_rng(1), actions=BOTH))
+    train = write_campaign("train", TASK, make_trials(900, np.random.default_rng(1), actions=BOTH))
     out = tmp_path / "f.json"
     told = ["forecast", str(tmp_path / "pair.toml"), "--estimates", str(train), *QUICK]
     assert main([*told, "--choose", "first=first_b", "--out", str(out)]) == 0
     mixed = write_campaign(
-        "mixed", TASK, make_throws(300, np.random.default_rng(2), actions=BOTH), 2
+        "mixed", TASK, make_trials(300, np.random.default_rng(2), actions=BOTH), 2
     )
     capsys.readouterr()
     assert main(["forecast", "--compare", str(out), str(mixed)]) == 2
@@ -127,7 +127,7 @@ def test_a_what_if_is_compared_with_runs_that_choose_so(
     assert "it forecasts first=first_b; the campaign chooses first: first_" in said
     assert "--choose first=first_b" in said
     alone = write_campaign(
-        "alone", TASK, make_throws(300, np.random.default_rng(3), actions=("first_b",)), 3
+        "alone", TASK, make_trials(300, np.random.default_rng(3), actions=("first_b",)), 3
     )
     assert main(["forecast", "--compare", str(out), str(alone)]) == 0
     plain = tmp_path / "plain.json"
@@ -137,12 +137,12 @@ def test_a_what_if_is_compared_with_runs_that_choose_so(
     assert "the campaign chooses first=first_b" in capsys.readouterr().err
 
 
-def test_ways_out_of_places_are_those_of_the_chosen_actions(pair: Task, make_throws: Make) -> None:
-    """Throws with another action say nothing about the what-if."""
-    throws = make_throws(400, np.random.default_rng(5), actions=BOTH)
-    training = Training.of(pair, throws)
+def test_ways_out_of_places_are_those_of_the_chosen_actions(pair: Task, make_trials: Make) -> None:
+    """Trials with another action say nothing about the what-if."""
+    trials = make_trials(400, np.random.default_rng(5), actions=BOTH)
+    training = Training.of(pair, trials)
     for action in BOTH:
-        own = Training.of(pair, [t for t in throws if t.runs[0].action == action])
+        own = Training.of(pair, [t for t in trials if t.runs[0].action == action])
         choices = {"first": {action: 1.0}, "second": {"second_a": 1.0}}
         assert routing(training, choices) == routing(own)
     assert routing(training, {"first": dict.fromkeys(BOTH, 0.5)}) == routing(training)
@@ -165,7 +165,7 @@ def test_ways_out_of_places_are_those_of_the_chosen_actions(pair: Task, make_thr
 def test_misfits(
     choices: dict[str, float], more: dict[str, Any], run: dict[str, int], fits: bool
 ) -> None:
-    """Of 400 training throws: a mix by its shares, one action alone by the others' absence, unless
+    """Of 400 training trials: a mix by its shares, one action alone by the others' absence, unless
     it was hardly ever run."""
     said = {"choices": {"t": choices}, "training_trials": 400, **more}
     assert misfit(said, {"t": run, "of another forecast": {"x": 5}}) == ([] if fits else ["t"])
@@ -186,12 +186,12 @@ def test_bad_input(
     more: list[str],
     said: str,
     write_campaign: Write,
-    make_throws: Make,
+    make_trials: Make,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Exit code 2, and one line that names file, key and remedy."""
-    train = write_campaign("train", TASK, make_throws(60, np.random.default_rng(1), actions=BOTH))
+    train = write_campaign("train", TASK, make_trials(60, np.random.default_rng(1), actions=BOTH))
     path = tmp_path / "given.toml"
     path.write_text(ONE_WAY if change is None else TASK.replace(*change), encoding="utf-8")
     assert main(["forecast", str(path), "--estimates", str(train), *QUICK, *more]) == 2
@@ -208,7 +208,7 @@ def test_estimates_of_another_task_are_refused(
 
     random = np.random.default_rng(1)
     task = loads(ONE_WAY, "scan.toml")
-    rows = [Row(i, "", i, 1, i, 1.0, dependent(random)) for i in range(20)]
+    rows = [TrialRow(i, "", i, 1, i, 1.0, dependent(random)) for i in range(20)]
     path = write_estimates(tmp_path, estimates_of(task, rows, "t"), {}, "t")
     own = tmp_path / "pair.toml"
     own.write_text(TASK, encoding="utf-8")
@@ -216,4 +216,4 @@ def test_estimates_of_another_task_are_refused(
     assert "it holds estimates of locate, watch; pair has first, second" in capsys.readouterr().err
     own.write_text(ONE_WAY, encoding="utf-8")
     assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 0
-    assert "no throws to check against" in capsys.readouterr().out
+    assert "no trials to compare with" in capsys.readouterr().out

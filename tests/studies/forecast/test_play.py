@@ -10,7 +10,7 @@ import pytest
 
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.distributions import Drawer, Laws
+from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
@@ -52,7 +52,7 @@ def play(
     """Throws of a task played from what was measured."""
     training = Training.of(loads(HEAD.replace("{task}", task) + text, "net.toml"), throws)
     random = np.random.default_rng(1)
-    drawer = Drawer(Laws(training), training.waits, np.ones((1, len(throws))), random)
+    drawer = Drawer(RunDistributions(training), training.waits, np.ones((1, len(throws))), random)
     return Play(
         Structure.of(training.task), drawer, choices_of(training), np.zeros(n, np.int64)
     ).run()
@@ -233,7 +233,9 @@ out = ["end"]
     training = Training.of(
         loads(HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + text, "n"), throws
     )
-    found = {s["place"]: s["by"] for s in Laws(training).splits() if s["of"] == "outcome"}
+    found = {
+        s["place"]: s["by"] for s in RunDistributions(training).splits() if s["of"] == "outcome"
+    }
     assert found == {"a": "visits of a", "b": "visits of b"}
     assert play(text, throws).completed.all()
 

@@ -16,10 +16,10 @@ import pytest
 from petrobot.coordinator.analysis.time.stochastic import is_cause, stochastic_view
 from petrobot.coordinator.learning.propagation import incidences, propagate, unended
 from petrobot.coordinator.studies.campaign.observed import estimates_of
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
-from petrobot.coordinator.studies.forecast.distributions import Laws, with_weights
+from petrobot.coordinator.studies.forecast.distributions import RunDistributions, with_weights
 from petrobot.coordinator.studies.forecast.history import NONE, Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.predict import Request, figures, predict
@@ -111,7 +111,7 @@ out = ["idle"]
 
 
 def one_way(random: np.random.Generator, slow: float = 1.0) -> Trial:
-    """A throw of ONE_WAY: locating 0.5 to 1.5 s, watching exponential of `slow` s."""
+    """A trial of ONE_WAY: locating 0.5 to 1.5 s, watching exponential of `slow` s."""
     locate, watch = random.uniform(0.5, 1.5), random.exponential(slow)
     status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
     seen = "success" if random.random() < 0.8 else "failure"
@@ -130,7 +130,7 @@ def one_way(random: np.random.Generator, slow: float = 1.0) -> Trial:
 
 
 def both_ways(random: np.random.Generator) -> Trial:
-    """A throw of BOTH_WAYS with the same laws."""
+    """A trial of BOTH_WAYS with the same laws."""
     locate, watch = random.uniform(0.5, 1.5), random.exponential(1.0)
     status = ("success", "failure", "error")[int(random.choice(3, p=(0.6, 0.3, 0.1)))]
     if locate < watch:
@@ -167,8 +167,8 @@ def both_ways(random: np.random.Generator) -> Trial:
     )
 
 
-def throws_of(make: object, n: int, seed: int) -> list[Trial]:
-    """n throws."""
+def trials_of(make: object, n: int, seed: int) -> list[Trial]:
+    """n trials."""
     random = np.random.default_rng(seed)
     assert callable(make)
     return [make(random) for _ in range(n)]
@@ -191,10 +191,10 @@ integral of exp(-t)."""
 def test_what_another_end_preempts_is_forecast_as_it_happens(
     text: str, make: object, goal: float, conj: float
 ) -> None:
-    """Against closed forms, within what 3,000 training throws tell; and played throws do not differ
+    """Against closed forms, within what 3,000 training trials tell; and played trials do not differ
     from the training's."""
     task = loads(text, "scan.toml")
-    training = Training.of(task, throws_of(make, 3000, 1))
+    training = Training.of(task, trials_of(make, 3000, 1))
     made = predict(training, Request(400, choices_of(training), replicates=40, point=20_000))
     found, own = made["figures"], figures(measured(training))
     assert found["R_goal"]["value"] == pytest.approx(goal, abs=0.03)
@@ -218,7 +218,9 @@ def test_the_stochastic_view_preempts_when_the_other_has_ended(
     """It always completes, and what is preempted has not ended as it was drawn to; phase-type
     durations cost it some points."""
     task = loads(text, "scan.toml")
-    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws_of(make, 1500, 2))]
+    rows = [
+        TrialRow(i, "", i, 1, i, 1.0, trial) for i, trial in enumerate(trials_of(make, 1500, 2))
+    ]
     task = replace(task, runs_place="parts")
     found = propagate(task, estimates_of(task, rows, "t"))
     assert found.complete == pytest.approx(1.0, abs=1e-9)
@@ -229,14 +231,14 @@ def test_the_stochastic_view_preempts_when_the_other_has_ended(
 def test_a_watch_that_never_ends_by_itself_is_played_and_solved() -> None:
     """All its runs were cut off: it goes on until it is preempted, whatever the other one takes."""
     task = loads(ONE_WAY, "scan.toml")
-    throws = [one_way(np.random.default_rng(seed), 1e9) for seed in range(400)]
-    training = Training.of(task, throws)
+    trials = [one_way(np.random.default_rng(seed), 1e9) for seed in range(400)]
+    training = Training.of(task, trials)
     made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
     assert made["figures"]["P_complete"]["value"] == 1.0
     assert made["figures"]["R_goal"]["value"] == pytest.approx(
-        np.mean([t.goals for t in throws]), abs=0.02
+        np.mean([t.goals for t in trials]), abs=0.02
     )
-    rows = [Row(i, "", i, 1, i, 1.0, throw) for i, throw in enumerate(throws)]
+    rows = [TrialRow(i, "", i, 1, i, 1.0, trial) for i, trial in enumerate(trials)]
     assert propagate(task, estimates_of(task, rows, "t")).complete == pytest.approx(1.0, abs=1e-9)
 
 
@@ -260,7 +262,7 @@ out = ["idle"]
     )
     random = np.random.default_rng(1)
     runs = [(min(0.5, t), t < 0.5) for t in random.exponential(1.0, 300)]
-    throws = [
+    trials = [
         Trial(
             1,
             0.0,
@@ -271,7 +273,7 @@ out = ["idle"]
         )
         for t, ended in runs
     ]
-    training = Training.of(loads(text, "scan.toml"), throws)
+    training = Training.of(loads(text, "scan.toml"), trials)
     made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))
     assert any("watch" in doubt and "longer" in doubt for doubt in made["doubts"]), made["doubts"]
 
@@ -348,7 +350,7 @@ in = ["locate:error"]
 out = ["idle"]
 """
     ends = (("", 1.0, "rung"), ("success", 2.0, "found"))
-    throws = [
+    trials = [
         Trial(
             1,
             0.0,
@@ -359,9 +361,9 @@ out = ["idle"]
         )
         for status, took, taken in ends
     ] * 50
-    for throw in throws:
-        throw.runs[0].cancelled = throw.runs[0].taken == "rung"
-    training = Training.of(loads(text, "scan.toml"), throws)
+    for trial in trials:
+        trial.runs[0].cancelled = trial.runs[0].taken == "rung"
+    training = Training.of(loads(text, "scan.toml"), trials)
     made = predict(training, Request(100, choices_of(training), replicates=20, point=4000))[
         "figures"
     ]
@@ -382,9 +384,9 @@ after = 1.0
 """
     )
     random = np.random.default_rng(7)
-    throws = []
-    for throw in throws_of(both_ways, 1500, 8):
-        if throw.time is not None and throw.time > 1.02:
+    trials = []
+    for trial in trials_of(both_ways, 1500, 8):
+        if trial.time is not None and trial.time > 1.02:
             runs = [
                 RunEntry(
                     "locate",
@@ -401,9 +403,9 @@ after = 1.0
                 ),
             ]
             random.shuffle(runs)
-            throw = Trial(1, 0.0, 1.02, True, 0, runs=runs, fired={"next": 1, "dog": 1})
-        throws.append(throw)
-    training = Training.of(loads(text, "scan.toml"), throws)
+            trial = Trial(1, 0.0, 1.02, True, 0, runs=runs, fired={"next": 1, "dog": 1})
+        trials.append(trial)
+    training = Training.of(loads(text, "scan.toml"), trials)
     assert set(training.waits["dog"][0].round(9)) == {1.02}
     made = predict(training, Request(400, choices_of(training), replicates=20, point=20_000))
     own = figures(measured(training))
@@ -421,7 +423,7 @@ def test_weights_are_the_aalen_johansen_estimate() -> None:
     """Against the estimator of the stochastic view, and the rest beyond the longest run against
     Kaplan and Meier by hand."""
     random = np.random.default_rng(3)
-    training = Training.of(loads(BOTH_WAYS, "scan.toml"), throws_of(both_ways, 200, 4))
+    training = Training.of(loads(BOTH_WAYS, "scan.toml"), trials_of(both_ways, 200, 4))
     for place in (0, 1):
         runs = training.runs.of(training.runs.place == place)
         runs = runs.of(random.permutation(len(runs)))
@@ -442,7 +444,7 @@ def test_beyond_the_longest_run_by_hand() -> None:
     have left by 3 s."""
     task = loads(ONE_WAY, "scan.toml")
     runs = [("success", 1.0, ""), ("", 2.0, "found"), ("", 3.0, "found")]
-    throws = [
+    trials = [
         Trial(
             1,
             0.0,
@@ -452,10 +454,10 @@ def test_beyond_the_longest_run_by_hand() -> None:
         )
         for status, took, taken in runs
     ]
-    (context,) = Laws(Training.of(task, throws)).contexts.values()
-    assert context.law.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
-    assert context.law.beyond.tolist() == [False, True, True]
-    assert context.law.rate == pytest.approx(-math.log(2 / 3) / 3.0)
+    (context,) = RunDistributions(Training.of(task, trials)).contexts.values()
+    assert context.ends.weight.tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3])
+    assert context.ends.beyond.tolist() == [False, True, True]
+    assert context.ends.rate == pytest.approx(-math.log(2 / 3) / 3.0)
 
 
 def test_the_view_without_measurements_still_races(tmp_path: object) -> None:

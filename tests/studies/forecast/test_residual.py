@@ -11,7 +11,7 @@ from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.play import Played
 from petrobot.coordinator.studies.forecast.residual import doubts, measured, residuals, routing
 from petrobot.coordinator.task.file import loads
-from tests.studies.forecast.test_preempting import ONE_WAY, one_way, throws_of
+from tests.studies.forecast.test_preempting import ONE_WAY, one_way, trials_of
 
 NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bool_), np.zeros(0))
 
@@ -32,7 +32,7 @@ NOTHING = Played(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros(0, np.bo
 def test_doubts_need_chance_ruled_out_and_a_difference_that_matters(
     of: str, p: float, off: float, doubtful: bool
 ) -> None:
-    """With many throws any model differs somewhere by more than chance; with few, a large
+    """With many trials any model differs somewhere by more than chance; with few, a large
     difference may be chance."""
     said = doubts([{"of": of, "p": p, "p_holm": p, "off": off}], NOTHING, 1000)
     assert bool(said) == doubtful
@@ -40,9 +40,9 @@ def test_doubts_need_chance_ruled_out_and_a_difference_that_matters(
 
 
 def test_how_far_off_is_the_largest_difference_of_shares_and_the_relative_one_of_means() -> None:
-    """Throws played exactly as they were run, then some that miss a goal and all that last
+    """Trials played exactly as they were run, then some that miss a goal and all that last
     longer."""
-    training = Training.of(loads(ONE_WAY, "scan.toml"), throws_of(one_way, 1000, 3))
+    training = Training.of(loads(ONE_WAY, "scan.toml"), trials_of(one_way, 1000, 3))
     real = measured(training)
     same = replace(real, ways=routing(training))
     assert all(row["off"] == 0.0 and row["p_holm"] == 1.0 for row in residuals(training, same))

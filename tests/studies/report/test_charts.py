@@ -173,7 +173,7 @@ def test_a_picture_becomes_a_png_with_its_words() -> None:
     assert image[0, 0].tolist() == [255, 255, 255] and image.min() < 60
     rows, columns = np.nonzero(np.any(image != bare, axis=2))
     assert len(rows) > 100 and rows.max() < 60 and columns.min() > 100
-    with pytest.raises(raster.RasterError, match="no SVG"):
+    with pytest.raises(raster.RasterError, match="not an SVG"):
         raster.png("<svg")
 
 

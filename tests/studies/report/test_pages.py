@@ -11,11 +11,11 @@ import pytest
 from scipy.stats import binomtest
 
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.studies.campaign.rows import Row
+from petrobot.coordinator.studies.campaign.rows import TrialRow
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
+from petrobot.coordinator.studies.report.action_pictures import objective_curves
 from petrobot.coordinator.studies.report.campaign_page import CampaignReport, story, timeline_of
 from petrobot.coordinator.studies.report.comparing import Weighting, compare, cost_weight, paired
-from petrobot.coordinator.studies.report.learning_curves import objective_curves
 from petrobot.coordinator.studies.report.plots import declared, finished
 from petrobot.coordinator.studies.report.run_page import own_pictures
 from petrobot.coordinator.task.file import load
@@ -24,20 +24,22 @@ from tests.studies.campaign.conftest import HERE, SERVICES, TASK
 TOY = load(TASK)
 
 
-def row(k: int, action: str, status: str, seconds: float, goal: bool, regime: str = "easy") -> Row:
-    """A throw with one run of look."""
+def row(
+    k: int, action: str, status: str, seconds: float, goal: bool, regime: str = "easy"
+) -> TrialRow:
+    """A trial with one run of look."""
     run = RunEntry(
         "look", action, 0.0, seconds, status, seconds=seconds, cost=seconds, taken="seen"
     )
-    throw = Trial(1, 0.0, seconds, True, int(goal), status, "", [run])
-    return Row(
+    trial = Trial(1, 0.0, seconds, True, int(goal), status, "", [run])
+    return TrialRow(
         k,
         regime,
         1,
         k,
         0,
         1.0,
-        throw,
+        trial,
         {"parts.n": k, "parts.gripped": goal, "parts.x": 0.1 * k, "parts.y": seconds},
     )
 
@@ -85,7 +87,7 @@ def test_comparison_by_hand() -> None:
 
 
 def test_pairs_have_equal_seeds() -> None:
-    """Throws that only one of them has are left out and counted."""
+    """Trials that only one of them has are left out and counted."""
     one = [row(k, "look_quick", "success", 1.0, True) for k in range(4)]
     other = [row(k, "look_quick", "success", 1.0, True) for k in range(2, 8)]
     other[0].trial = None
@@ -179,7 +181,7 @@ def test_a_runs_own_pictures() -> None:
     assert list(own_pictures(result)) == ["Parts"]
 
 
-def test_a_throws_story_says_what_took_what() -> None:
+def test_a_trials_story_says_what_took_what() -> None:
     """In the order of ends, with reasons."""
     runs = [
         RunEntry("look", "look_quick", 0.0, 1.0, "success", taken="seen"),
@@ -191,7 +193,7 @@ def test_a_throws_story_says_what_took_what() -> None:
         == "1.00 s look_quick success, seen; 1.50 s grip_soft ERROR (jammed: stuck fast), stuck"
     )
     bars = timeline_of(
-        [Row(1, "", 1, 1, 0, 1.5, Trial(1, 2.0, 1.5, True, 0, "error", "", runs))]
+        [TrialRow(1, "", 1, 1, 0, 1.5, Trial(1, 2.0, 1.5, True, 0, "error", "", runs))]
     ).bars
     assert [(bar.begun, bar.ended) for bar in bars.values()] == [(2.0, 3.0), (3.0, 3.5)]
 
@@ -272,12 +274,12 @@ def test_learned_probabilities_are_derived_from_the_table(
     import asyncio
 
     from petrobot.coordinator.studies.campaign.conduct import Campaign
-    from petrobot.coordinator.studies.campaign.plan import Plan, digest
+    from petrobot.coordinator.studies.campaign.plan import CampaignPlan, digest
     from tests.studies.campaign.conftest import InlinePool
 
     monkeypatch.syspath_prepend(str(HERE))
     digests = {"task": digest(TASK), "services": digest(SERVICES)}
-    plan = Plan(
+    plan = CampaignPlan(
         str(TASK),
         str(SERVICES),
         40,
@@ -297,7 +299,7 @@ def test_learned_probabilities_are_derived_from_the_table(
 
 
 def test_combinations_by_hand() -> None:
-    """Two combinations judged with one rho; the lower J first; a throw that ended early counts for
+    """Two combinations judged with one rho; the lower J first; a trial that ended early counts for
     what was planned."""
     from petrobot.coordinator.studies.report.campaign_page import by_combination
 
