@@ -255,7 +255,7 @@ async def test_the_emergency_stop_goes_past_a_link_that_cannot_be_read(
     stage.feed.emit("marking", marking={"parts": 5})
     await expect(tab.get_by_role("alert")).to_contain_text("could not show")
     await tab.get_by_role("button", name="Emergency stop").click()
-    await expect(tab.locator(".toast", has_text="Emergency stop given")).to_be_visible()
+    await expect(tab.locator(".toast", has_text="Emergency stop sent")).to_be_visible()
     assert stage.feed.state["mission"]["state"] == "stopped"
 
 
