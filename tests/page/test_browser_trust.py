@@ -272,7 +272,7 @@ async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page)
     await context.route_web_socket("**/api/live", carry)
     tab = await context.new_page()
     await tab.goto(page.url)
-    await expect(tab.get_by_role("alert")).to_contain_text("No connection to the coordinator yet")
+    await expect(tab.get_by_role("alert")).to_contain_text("Not connected to the coordinator yet")
     shut.clear()
     await expect(tab.get_by_role("alert")).to_be_hidden()
 
@@ -299,7 +299,7 @@ async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
         again = await start_page(stage, tasks_folder=tasks, port=port)
     try:
         bar = tab.get_by_role("alert")
-        await expect(bar).to_contain_text("started again and has a new key")
+        await expect(bar).to_contain_text("restarted and has a new key")
         await expect(bar).not_to_contain_text("Trying again")
         await expect(bar.get_by_role("link")).to_be_visible()
         beside = await tab.context.new_page()

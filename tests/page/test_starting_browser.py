@@ -242,7 +242,7 @@ async def test_a_run_sets_out_from_a_point_of_another(
     await expect(about).to_contain_text(f"from {first}")
     await tab.get_by_role("button", name=f"Compare with {first}").click()
     await expect(about).to_contain_text(
-        "compared from there. The runs differ from firing 1: unseen here, seen there"
+        "compared from there on. The runs differ from firing 1 on: unseen here, seen there"
     )
     await tab.get_by_role("button", name="Go there").click()
     await tab.screenshot(path=shots / "compare-from.png")
