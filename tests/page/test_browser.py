@@ -539,7 +539,7 @@ async def test_the_stop_is_within_reach_of_every_dialog(
     await expect(dialog).to_be_visible()
     await tab.get_by_role("button", name="Emergency stop").click()
     await tab.keyboard.press("F9")
-    await toasted(tab, "Emergency stop given")
+    await toasted(tab, "Emergency stop sent")
     await dialog.get_by_role("button", name="Close").focus()
     await tab.keyboard.press("Escape")
     await expect(dialog).to_be_hidden()

@@ -292,11 +292,11 @@ async def test_verdicts_stand_beside_the_drawing(
     tab = await designer(browser, page)
     complaints = faults(tab)
     analysis = tab.get_by_role("region", name="Analysis")
-    await expect(analysis.get_by_role("status")).to_contain_text("nothing against it")
+    await expect(analysis.get_by_role("status")).to_contain_text("no problem found")
     field = tab.get_by_label("Ends when")
     await field.fill("parts == 0 and look == 1")
     await field.press("Enter")
-    await expect(analysis.get_by_role("status")).to_contain_text("6 against it")
+    await expect(analysis.get_by_role("status")).to_contain_text("6 problems found")
     refused = analysis.get_by_role(
         "button", name=re.compile("^Never stuck before its end: does not hold")
     )

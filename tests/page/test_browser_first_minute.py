@@ -261,7 +261,7 @@ async def test_the_safe_answer_has_the_focus(browser: Browser, page: Page, tasks
     (tasks / "corners.toml").write_text(theirs, encoding="utf-8")
     await tab.keyboard.press("Control+s")
     await expect(tab.get_by_role("dialog", name="Conflict")).to_be_visible()
-    await expect(tab.get_by_role("button", name="Go on editing")).to_be_focused()
+    await expect(tab.get_by_role("button", name="Keep editing")).to_be_focused()
     await tab.keyboard.press("Enter")
     await expect(tab.get_by_role("dialog")).to_have_count(0)
     assert (tasks / "corners.toml").read_text(encoding="utf-8") == theirs

@@ -255,7 +255,7 @@ async def test_the_emergency_stop_goes_past_a_link_that_cannot_be_read(
     stage.feed.emit("marking", marking={"parts": 5})
     await expect(tab.get_by_role("alert")).to_contain_text("could not show")
     await tab.get_by_role("button", name="Emergency stop").click()
-    await expect(tab.locator(".toast", has_text="Emergency stop given")).to_be_visible()
+    await expect(tab.locator(".toast", has_text="Emergency stop sent")).to_be_visible()
     assert stage.feed.state["mission"]["state"] == "stopped"
 
 
@@ -272,7 +272,7 @@ async def test_a_page_that_never_connected_says_so(browser: Browser, page: Page)
     await context.route_web_socket("**/api/live", carry)
     tab = await context.new_page()
     await tab.goto(page.url)
-    await expect(tab.get_by_role("alert")).to_contain_text("No connection to the coordinator yet")
+    await expect(tab.get_by_role("alert")).to_contain_text("Not connected to the coordinator yet")
     shut.clear()
     await expect(tab.get_by_role("alert")).to_be_hidden()
 
@@ -299,7 +299,7 @@ async def test_after_a_restart_with_another_key_old_windows_say_what_to_do(
         again = await start_page(stage, tasks_folder=tasks, port=port)
     try:
         bar = tab.get_by_role("alert")
-        await expect(bar).to_contain_text("started again and has a new key")
+        await expect(bar).to_contain_text("restarted and has a new key")
         await expect(bar).not_to_contain_text("Trying again")
         await expect(bar.get_by_role("link")).to_be_visible()
         beside = await tab.context.new_page()

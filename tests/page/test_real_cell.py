@@ -157,7 +157,7 @@ async def test_a_new_user_draws_a_task_and_runs_it_on_the_cell(
         await look_back(tab, shots)
         assert complaints == []
         assert await served.end() == 0
-        await expect(tab.get_by_role("alert")).to_contain_text("has ended in good order")
+        await expect(tab.get_by_role("alert")).to_contain_text("has shut down normally")
         await tab.screenshot(path=shots / "serve-goodbye.png")
 
 

@@ -84,7 +84,7 @@ async def test_everything_that_the_command_line_takes(
     await expect(dialog.get_by_label("speed")).to_have_value("0.5")
     await expect(dialog).to_contain_text("m/s")
     await dialog.get_by_label("Where").select_option("simulated, in lock step")
-    await dialog.get_by_label("Pace", exact=True).select_option("as fast as it goes")
+    await dialog.get_by_label("Pace", exact=True).select_option("as fast as possible")
     await dialog.get_by_label("Number of runs").fill("0")
     await dialog.get_by_role("button", name="Start").click()
     await expect(dialog.get_by_role("alert")).to_contain_text("runs: 0 is no whole number from 1")
@@ -137,9 +137,9 @@ async def learning_view(tab: Tab, shots: Path) -> None:
     await expect(
         panel.get_by_role("figure", name="look: probability of each alternative")
     ).to_have_count(0)
-    table = panel.get_by_role("table", name="What is known of the alternatives")
+    table = panel.get_by_role("table", name="What is known about the alternatives")
     await expect(table.get_by_role("row", name=re.compile("look at table"))).to_be_attached()
-    await expect(table).to_contain_text("least J")
+    await expect(table).to_contain_text("lowest J")
     look = element(tab, "^Action place look", "Task net")
     await expect(look).not_to_have_class(re.compile(r"\bhot\b"))
     await panel.get_by_role("button", name="Colour places by J").click()
@@ -222,8 +222,8 @@ async def test_a_run_sets_out_from_a_point_of_another(
     await tab.get_by_role("button", name="Next record").click()
     await here.click()
     dialog = tab.get_by_role("dialog", name="Simulate from here")
-    await dialog.get_by_label("Run in look").select_option("has ended: error")
-    await dialog.get_by_label("Pace", exact=True).select_option("as fast as it goes")
+    await dialog.get_by_label("Run in look").select_option("finished: error")
+    await dialog.get_by_label("Pace", exact=True).select_option("as fast as possible")
     await tab.screenshot(path=shots / "simulate-from.png")
     await dialog.get_by_role("button", name="Simulate").click()
     await expect(tab.get_by_role("tab", name="Live")).to_have_attribute("aria-selected", "true")
@@ -242,7 +242,7 @@ async def test_a_run_sets_out_from_a_point_of_another(
     await expect(about).to_contain_text(f"from {first}")
     await tab.get_by_role("button", name=f"Compare with {first}").click()
     await expect(about).to_contain_text(
-        "compared from there. The runs differ from firing 1: unseen here, seen there"
+        "compared from there on. The runs differ from firing 1 on: unseen here, seen there"
     )
     await tab.get_by_role("button", name="Go there").click()
     await tab.screenshot(path=shots / "compare-from.png")

@@ -24,6 +24,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 ROOT = Path(__file__).parents[2]
@@ -425,13 +426,13 @@ def page() -> str:
     told = "\n".join(TOLD)
     return (
         "# Figures: the analysis beside other tools\n\n"
-        "Made by `python -m tools.bench.analysis --write docs/figures-analysis.md`, all "
-        "tools in one run, each measurement in a\n"
-        "process of its own: CPU seconds without imports and compilation, and the peak "
-        "memory of that process. Ratios hold\n"
-        f"elsewhere, seconds do not ({machine}). SNAKES and pm4py are stopped after "
-        f"{SLOW_STATES:,} markings: their\n"
-        "rate counts.\n\n"
+        "How fast the analysis is, beside other tools for Petri nets. Made by\n"
+        "`python -m tools.bench.analysis --write docs/figures-analysis.md`, all tools in one run, "
+        "each\nmeasurement in a process of its own. Seconds are CPU seconds without imports and "
+        "compilation; MB is\nthe peak memory of the process. Ratios hold on other machines, "
+        "seconds do not. SNAKES and pm4py are\n"
+        f"stopped after {SLOW_STATES:,} markings: compare their rate.\n\n"
+        f"{fill(f'Machine: {machine}.', 100)}\n\n"
         f"```\n{told}\n```\n"
     )
 

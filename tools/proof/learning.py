@@ -210,7 +210,8 @@ def page(results: Mapping[str, Result], sizes: Sizes) -> str:
     """The tables, with the command that remakes them."""
     lines = [f"# Learning and forecasting, {sizes.task}: figures", ""]
     lines += [
-        "What is meant stands in [campaigns.md](campaigns.md) and [forecast.md](forecast.md).",
+        "What learning and forecasts achieve on the simulated cell. The terms are explained in",
+        "[campaigns.md](campaigns.md) and [forecast.md](forecast.md).",
         "",
     ]
     if "learn" in results:
@@ -250,16 +251,15 @@ def _told(found: Mapping[str, Any]) -> str:
     furthest = max(row["J beyond the best, upper 95 %"] for row in found["rows"])
     beyond = found["rows"][0]["J of the default"] - found["rows"][0]["J of the best"]
     return (
-        "Best fixed combination, chosen on other throws: "
-        f"{', '.join(found['best'].values())}; the default is "
-        f"{', '.join(found['default'].values())}.\n\n"
-        f"- J at most {CLOSE} beyond the best fixed combination's: {close} (at most "
+        "- Best fixed combination, chosen on other throws:\n"
+        f"  {', '.join(found['best'].values())}.\n"
+        f"- Default: {', '.join(found['default'].values())}.\n"
+        f"- J at most {CLOSE} above that of the best fixed combination: {close} (at most "
         f"{furthest:.4f}).\n"
-        f"- J below the default's: {ahead} (the default's is {beyond:.4f} beyond the best's).\n"
-        f"- Who chooses without knowledge: the {found['combinations']} combinations have J "
-        f"from {min(all_j):.3f} to "
-        f"{max(all_j):.3f}, {sum(all_j) / len(all_j):.3f} on average (100 throws each, "
-        "taking turns)."
+        f"- J below that of the default: {ahead} (the default is {beyond:.4f} above the best).\n"
+        f"- Choosing without knowledge: the {found['combinations']} combinations have J "
+        f"from {min(all_j):.3f} to {max(all_j):.3f}, {sum(all_j) / len(all_j):.3f} on average\n"
+        "  (100 throws each, taking turns)."
     )
 
 

@@ -9,9 +9,13 @@ from tools.proof.proof import Proof
 
 HEAD = """# Figures
 
-Written by `make proof`, which anyone can repeat: it resumes where it stopped and measures again what has changed since.
+What petrobot promises, and what was measured. `make proof` writes this page; anyone can repeat it.
+It resumes where it stopped, and measures again what has changed since.
 
-What came of faults that were injected on purpose: [figures-faults.md](figures-faults.md).
+`floor` is the least that is promised, `holds` says whether the measurement reaches it. `sources`
+identifies the measured code; `(older)` means that the code has changed since.
+
+How faults that were injected on purpose ended: [figures-faults.md](figures-faults.md).
 """
 
 

@@ -124,11 +124,11 @@ function settle(name, { yours, theirs }) {
     const near = rows.map((_, i) => rows.slice(Math.max(0, i - 2), i + 3).some((r) => r[2]));
     const cell = (line, changed, side) => h("td", { class: changed && line !== null ? side : "" }, line ?? "");
     const dialog = h("dialog", { class: "conflict", "aria-label": "Conflict" },
-      h("h2", {}, `${name} was changed by somebody else since you opened it`),
+      h("h2", {}, `${name} was changed elsewhere since you opened it`),
       h("p", { class: "muted" }, "Nothing has been written. These are the lines that differ."),
       h("div", { class: "sides" }, h("table", {}, h("thead", {}, h("tr", {}, h("th", {}, "On the server"), h("th", {}, "Yours"))), h("tbody", {}, rows.filter((_, i) => near[i]).map(([l, r, changed]) => h("tr", {}, cell(l, changed, "theirs"), cell(r, changed, "yours")))))),
       h("div", { class: "buttons" },
-        h("button", { type: "button", class: "small", onclick: () => done(null) }, "Go on editing"),
+        h("button", { type: "button", class: "small", onclick: () => done(null) }, "Keep editing"),
         h("button", { type: "button", class: "small", onclick: () => done("theirs") }, "Discard mine, load theirs"),
         h("button", { type: "button", class: "command danger", onclick: () => done("yours") }, "Replace theirs by mine")));
     dialog.addEventListener("cancel", () => done(null));

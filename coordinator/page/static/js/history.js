@@ -147,7 +147,7 @@ export class History {
     const { mission } = this.link.state;
     const seen = this.reel?.run.id === SESSION;
     const live = ["running", "paused", "stopping", "preparing"].includes(mission.state);
-    const why = !this.link.mayAct ? "Take the controls first, under Live" : seen ? "Open the recorded run in the list" : live ? "A run goes on; wait for its end" : "";
+    const why = !this.link.mayAct ? "First take the controls, under Live" : seen ? "Open the recorded run in the list" : live ? "A run is active. Wait until it has finished." : "";
     this.startHere.hidden = mission.starts === false;
     this.startHere.disabled = Boolean(why) || !this.reel?.run.task;
     attribute(this.startHere, "title", why || null);
@@ -254,10 +254,10 @@ export class History {
     const facts = [`${run.records.length} records`, `${this.reel.firings.length} firings`, run.seed !== undefined && run.seed !== null ? `seed ${run.seed}` : "", run.mode, from].filter(Boolean).join(", ");
     if (!this.other) return fill(this.about, run.fault ? h("span", {}, icon("warning"), ` ${run.fault}. `) : null, facts);
     const [first, shift] = [this.firstDifference(), this.shift];
-    const since = shift ? `One set out from the other and is compared from there. ` : "";
+    const since = shift ? `One run started from a record of the other; they are compared from there on. ` : "";
     if (!first) return fill(this.about, `${since}Both runs fired the same transitions in the same order.`);
-    const name = (firing) => (firing ? this.labelOf(firing.transition) : "nothing more");
-    return fill(this.about, `${since}The runs differ from firing ${first}: ${name(this.reel.firings[first - 1])} here, ${name(this.other.firings[first - 1 - shift])} there. `, h("button", { type: "button", class: "small", onclick: () => this.go(this.reel.atFirings(first)) }, "Go there"));
+    const name = (firing) => (firing ? this.labelOf(firing.transition) : "no further firing");
+    return fill(this.about, `${since}The runs differ from firing ${first} on: ${name(this.reel.firings[first - 1])} here, ${name(this.other.firings[first - 1 - shift])} there. `, h("button", { type: "button", class: "small", onclick: () => this.go(this.reel.atFirings(first)) }, "Go there"));
   }
 
   // ---- scrubbing ----------------------------------------------------------------------------------------------------

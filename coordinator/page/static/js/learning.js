@@ -52,7 +52,7 @@ export class Learning {
     this.bar.hidden = empty;
     this.measure.parentElement.hidden = !several;
     this.heat.disabled = !learned;
-    text(this.note, this.hot && learned ? "Pale is good, strong is costly or unreliable." : "");
+    text(this.note, this.hot && learned ? "Pale: good. Strong: costly or unreliable." : "");
     fill(this.notes, others.map(([name, r]) => h("article", {}, h("h3", {}, r.title ?? words(name)), h("p", {}, r.text ?? ""))),
       empty ? h("p", { class: "empty" }, "Nothing has been learned yet. Curves appear here when a run learns: Start with, Learning.") : null);
   }
@@ -78,13 +78,13 @@ export class Learning {
     const known = Object.entries(selectors).filter(([, s]) => (s.alternatives ?? []).some((a) => Number.isFinite(a.j)));
     this.table.hidden = !known.length;
     if (!known.length) return;
-    const head = ["Primitive task", "Alternative", "Chosen with", "R", "C", "J", ""].map((name) => h("th", { scope: "col" }, name));
+    const head = ["Primitive task", "Alternative", "Probability", "R", "C", "J", ""].map((name) => h("th", { scope: "col" }, name));
     const rows = known.flatMap(([name, selector]) => {
       const best = Math.min(...selector.alternatives.map((a) => a.j).filter(Number.isFinite));
       return selector.alternatives.map((a, i) => h("tr", {}, h("th", { scope: "row" }, i ? "" : words(name)), h("td", {}, words(a.action)),
         [a.probability, a.reliability, a.cost, a.j].map((value) => h("td", { class: "number" }, figure(value))),
-        h("td", {}, [a.action === selector.override ? "fixed by the operator" : "", a.j === best ? "least J" : ""].filter(Boolean).join(", "))));
+        h("td", {}, [a.action === selector.override ? "fixed by the operator" : "", a.j === best ? "lowest J" : ""].filter(Boolean).join(", "))));
     });
-    fill(this.table, h("caption", {}, "What is known of the alternatives (J = 1 − R + ρC, the least is best)"), h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows));
+    fill(this.table, h("caption", {}, "What is known about the alternatives (J = 1 − R + ρC, the lowest is best)"), h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows));
   }
 }

@@ -169,7 +169,7 @@ export class Live {
     const list = Object.values(this.link.state.runs);
     this.running.count(list.length || "");
     rows(this.running.content, list, (run) => run.id, (run) => this.runCard(run), (node, run) => this.updateCard(node, run));
-    if (!list.length) this.running.content.dataset.empty = "Nothing runs.";
+    if (!list.length) this.running.content.dataset.empty = "No action is running.";
     else delete this.running.content.dataset.empty;
   }
 

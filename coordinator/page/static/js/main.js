@@ -13,9 +13,9 @@ import { toast } from "./toast.js";
 const TICK_MS = 100;
 const PATIENCE_MS = 2000; // a page that has just been opened may still be on its way
 const LOST = "Connection to the coordinator lost. What you see is old. Trying again …";
-const NEVER = "No connection to the coordinator yet: nothing here says how it is. Trying again …";
-const ENDED = "This coordinator has ended in good order; its nodes and emergency stop are no longer reached from here. What you see is how it ended.";
-const REFUSED = "The coordinator was started again and has a new key, so it refuses this page. What you see is old. Open the address that it printed when it started, in this browser or here:";
+const NEVER = "Not connected to the coordinator yet. Nothing on this page shows its real state. Trying again …";
+const ENDED = "This coordinator has shut down normally. This page no longer reaches its nodes or their emergency stop. What you see is its last state.";
+const REFUSED = "The coordinator was restarted and has a new key, so it refuses this page. What you see is old. Open the address that it printed when it started, in this browser or here:";
 
 class App {
   constructor(root) {

@@ -9,8 +9,8 @@ import { toast } from "./toast.js";
 export const ESTOP_KEY = "F9";
 
 const DONE = {
-  start: "Started", pause: "Paused", resume: "Goes on", step: "One firing", abort: "Aborted", estop: "Emergency stop given",
-  add_tokens: "Token added", remove_tokens: "Token removed", raise_event: "Event raised", force_exit: "Exit forced",
+  start: "Started", pause: "Paused", resume: "Resumed", step: "Continued for one firing", abort: "Aborted", estop: "Emergency stop sent",
+  add_tokens: "Token added", remove_tokens: "Token removed", raise_event: "Event raised", force_exit: "Transition forced",
   take_controls: "You hold the controls", ask_controls: "Asked for the controls", release_controls: "Controls released",
   load: "Task loaded", clear_estop: "Emergency stop cleared", override_selector: "Selector set", breakpoint: "Breakpoint set",
 };
@@ -69,7 +69,7 @@ export class Operator {
     if (this.link.mayAct) return true;
     const { holder } = this.link.state.controls;
     if (holder === null) return (await this.give("take_controls", {}, true)).ok;
-    toast("error", `${holder} holds the controls: ask for them under Live`);
+    toast("error", `${holder} holds the controls. Ask for them under Live.`);
     return false;
   }
 
@@ -77,8 +77,8 @@ export class Operator {
     this.estop.classList.add("given");
     setTimeout(() => this.estop.classList.remove("given"), 1500);
     if (this.link.connected) await this.give("estop", {});
-    else if (await stopPastTheLink()) toast("ok", `${DONE.estop}; this page does not see what it did`);
-    else toast("error", "No connection to the coordinator: use the hardware's emergency stop.");
+    else if (await stopPastTheLink()) toast("ok", `${DONE.estop}; this page cannot see its effect`);
+    else toast("error", "No connection to the coordinator. Use the emergency stop of the hardware.");
   }
 
   /** Ask how the run is to go before it is started. */
@@ -171,7 +171,7 @@ export class Operator {
     if (this.holderKey === key || this.press.holds(() => this.showHolder(this.link.state))) return;
     this.holderKey = key;
     const mine = controls.holder === you;
-    const label = controls.holder === null ? "Nobody holds the controls" : mine ? "You hold the controls" : `${controls.holder} holds the controls`;
+    const label = controls.holder === null ? "The controls are free" : mine ? "You hold the controls" : `${controls.holder} holds the controls`;
     const asking = (controls.asking ?? []).filter((who) => who !== you);
     const actions = [];
     if (controls.holder === null) actions.push(this.small("Take controls", () => this.give("take_controls", {})));

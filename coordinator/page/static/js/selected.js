@@ -75,7 +75,7 @@ export class Selected {
     const facts = [];
     const text = caption(transition);
     if (text) facts.push(["Fires on", text]);
-    facts.push(["Now", this.missing(state, transition) || "may fire"]);
+    facts.push(["Now", this.missing(state, transition) || "can fire"]);
     const last = this.lastFiring(state);
     if (last) facts.push(["Last fired", `at ${seconds(last.at)}: ${last.cause ?? ""}`]);
     if (last?.reason?.text || last?.reason?.code) facts.push(["Reason", `${last.reason.text ?? ""}${last.reason.code ? ` [${last.reason.code}]` : ""}`]);
@@ -101,8 +101,8 @@ export class Selected {
     for (const arc of state.task.arcs.filter((a) => a.transition === transition.name)) {
       const tokens = state.marking[arc.place] ?? 0;
       if (arc.direction === "in" && tokens < arc.weight) waits.push(`a token in ${words(arc.place)}`);
-      else if (arc.direction === "in" && ["normal", "error"].includes(arc.end)) waits.push(`${words(arc.place)} to end${arc.end === "error" ? " in error" : ""}`);
-      else if (arc.direction === "inhibit" && tokens >= arc.weight) waits.push(`${words(arc.place)} to empty`);
+      else if (arc.direction === "in" && ["normal", "error"].includes(arc.end)) waits.push(`the end of the run in ${words(arc.place)}${arc.end === "error" ? " in error" : ""}`);
+      else if (arc.direction === "inhibit" && tokens >= arc.weight) waits.push(`${words(arc.place)} to hold ${arc.weight > 1 ? `fewer than ${arc.weight} tokens` : "no token"}`);
     }
     for (const event of transition.events ?? []) if (!state.events[event.name]?.armed) waits.push(`the event ${words(event.name)}`);
     return waits.length ? `waits for ${waits.join(", ")}` : "";

@@ -4,8 +4,8 @@ import { openDialog } from "./dialog.js";
 import { fill, h, words } from "./dom.js";
 
 const MODE_WORD = { realtime: "on the cell, in real time", lockstep: "simulated, in lock step" };
-const PACE = [["1", "as in real time"], ["10", "ten times as fast"], ["0", "as fast as it goes"]];
-const GOING = [["again", "begins again"], ["success", "has ended: success"], ["failure", "has ended: failure"], ["error", "has ended: error"]];
+const PACE = [["1", "real time"], ["10", "ten times as fast"], ["0", "as fast as possible"]];
+const GOING = [["again", "starts again"], ["success", "finished: success"], ["failure", "finished: failure"], ["error", "finished: error"]];
 
 const select = (label, options, chosen, onchange) =>
   h("select", { "aria-label": label, onchange }, options.map(([value, text]) => h("option", { value, selected: value === chosen }, text)));
@@ -14,7 +14,7 @@ const whole = (label, value, least) => h("input", { type: "number", step: 1, min
 
 /** A number field's value; undefined when it is empty. Throws what is wrong. */
 function numberIn(input, label) {
-  if (input.validity.badInput) throw new Error(`${label}: write a number`);
+  if (input.validity.badInput) throw new Error(`${label}: expected a number`);
   return input.value.trim() === "" ? undefined : Number(input.value);
 }
 
@@ -86,7 +86,7 @@ export function startDialog(about, task, send) {
   };
   const group = (name, list) => (list.length ? h("fieldset", {}, h("legend", {}, name), list) : null);
   return formDialog(`Start ${words(task)}`, "Start", [
-    h("div", { class: "two" }, field("Where", mode), paced), h("div", { class: "two" }, runs ? field("Number of runs", runs) : null, field("Seed of all chance", seed)),
+    h("div", { class: "two" }, field("Where", mode), paced), h("div", { class: "two" }, runs ? field("Number of runs", runs) : null, field("Random seed", seed)),
     group("Parameters of the task", parameters.map((p) => p.root)), learning.root,
   ], values, send);
 }
@@ -97,12 +97,12 @@ class LearningPart {
     this.file = h("input", { type: "text", "aria-label": "Estimates file", list: "estimates-known", value: about.estimates[0] ?? "learned" });
     this.selector = select("Selector", about.selectors.map((name) => [name, words(name)]), about.selector);
     this.target = h("input", { type: "number", min: 0, max: 1, step: "any", "aria-label": "Target reliability", placeholder: "none" });
-    this.contexts = h("input", { type: "text", "aria-label": "Learned apart by", value: about.contexts.join(", ") });
+    this.contexts = h("input", { type: "text", "aria-label": "Learn separately for each", value: about.contexts.join(", ") });
     this.frozen = h("input", { type: "checkbox" });
     this.inner = h("div", { class: "inner", hidden: true },
-      h("div", { class: "two" }, field("Estimates file", this.file, "a name; kept by the coordinator"), field("Selector", this.selector)),
-      h("div", { class: "two" }, field("Target reliability", this.target, "choose among what reaches it"), field("Learned apart by", this.contexts, "parameters, variables or conditions")),
-      h("label", { class: "tick" }, this.frozen, "Frozen: choose the best that was learned, learn nothing"),
+      h("div", { class: "two" }, field("Estimates file", this.file, "a name without a path; the coordinator keeps the file"), field("Selector", this.selector)),
+      h("div", { class: "two" }, field("Target reliability", this.target, "choose only among alternatives that reach it"), field("Learn separately for each", this.contexts, "parameters, variables or conditions")),
+      h("label", { class: "tick" }, this.frozen, "Frozen: use the best alternatives learned so far, learn nothing new"),
       h("datalist", { id: "estimates-known" }, about.estimates.map((name) => h("option", { value: name }))));
     this.root = h("fieldset", {}, h("legend", {}, "Learning"), h("label", { class: "tick" }, this.on, "Learn which actions are best"), this.inner);
   }
@@ -132,8 +132,8 @@ export function departDialog(run, record, going, labelOf, send) {
   });
   const told = record ? `after record ${record}` : "from its beginning";
   return formDialog("Simulate from here", "Simulate", [
-    h("p", { class: "muted" }, `The task of ${run.id} goes on in lock step ${told}: tokens, ended runs, variables and latched events are as they were then. The simulated world is prepared anew; it does not stand where it stood.`),
-    chosen.length ? h("fieldset", {}, h("legend", {}, "What went on then"), chosen.map(([place, box]) => field(labelOf(place), box))) : h("p", {}, "Nothing ran at that moment."),
+    h("p", { class: "muted" }, `A new run in lock step continues the task of ${run.id} ${told}. Tokens, finished actions, variables and latched events are as they were then. The simulated world is not: it starts from its usual beginning.`),
+    chosen.length ? h("fieldset", {}, h("legend", {}, "Actions that were running"), chosen.map(([place, box]) => field(labelOf(place), box))) : h("p", {}, "No action was running at that moment."),
     h("div", { class: "two" }, field("Seed of all chance", seed), field("Pace", pace)),
   ], values, send);
 }
@@ -142,6 +142,6 @@ export function departDialog(run, record, going, labelOf, send) {
 export function clearDialog(reason, send) {
   return formDialog("Clear the emergency stop?", "Clear the stop", [
     reason ? h("p", {}, reason) : null,
-    h("p", { class: "muted" }, "Devices take orders again; nothing moves by that alone. Make sure first that nobody is within their reach and that what caused the stop is mended. Who holds the controls may do it."),
+    h("p", { class: "muted" }, "Devices accept commands again; clearing the stop moves nothing by itself. First make sure that no one is within reach of the devices and that the cause of the stop is repaired. You must hold the controls."),
   ], () => ({}), send);
 }

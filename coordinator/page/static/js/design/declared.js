@@ -7,7 +7,7 @@ import { readValue, writeValue } from "./values.js";
 
 const NAME = /^[\p{L}_][\p{L}\p{N}_]*$/u;
 const TYPES = ["bool", "int", "float", "str", "any"].map((t) => [t, t]);
-const MEMORY = [["pulse", "pulse: for who is ready when it comes"], ["latched", "latched: a flag until it is used"]];
+const MEMORY = [["pulse", "pulse: only for transitions that are ready when it comes"], ["latched", "latched: stored until a firing uses it"]];
 
 /** A fieldset with a row for each entry of a table of the document, and one for a new name. */
 function table(form, title, key, row, fresh) {
@@ -16,7 +16,7 @@ function table(form, title, key, row, fresh) {
   const name = h("input", { placeholder: `new ${one}`, "aria-label": `New ${one}`, onkeydown: (e) => { keep(e); if (e.key === "Enter") add(); } });
   const add = () => {
     const wanted = name.value.trim().replaceAll(" ", "_");
-    if (!NAME.test(wanted)) return toast("warning", "A name begins with a letter and has letters, digits and _ only.");
+    if (!NAME.test(wanted)) return toast("warning", "A name must start with a letter and contain only letters, digits and _.");
     if (model.data[key]?.[wanted]) return toast("warning", `There is already a ${one} called ${wanted}.`);
     return model.edit(`add ${one}`, (data) => ((data[key] ??= {})[wanted] = { ...fresh }));
   };

@@ -197,7 +197,7 @@ export class Designer {
   group() {
     const made = this.model.group(this.selected.names);
     if (typeof made === "string") return toast("warning", made);
-    if (made.left.length) toast("info", `${made.left.map(words).join(", ")} ${made.left.length > 1 ? "stay" : "stays"} outside: joined to places that were not chosen.`);
+    if (made.left.length) toast("info", `${made.left.map(words).join(", ")} ${made.left.length > 1 ? "stay" : "stays"} outside: connected to places that were not selected.`);
     return this.choose(new Set([made.name]));
   }
 
@@ -213,7 +213,7 @@ export class Designer {
 
   redo() {
     const label = this.model.redo();
-    if (label) toast("info", `Done again: ${label}`);
+    if (label) toast("info", `Redone: ${label}`);
   }
 
   copy() {

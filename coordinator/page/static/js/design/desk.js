@@ -103,7 +103,7 @@ export class Desk {
     this.looking = false;
     if (now === null || name !== this.model.name || base !== this.model.base) return; // not known, or saved meanwhile
     const outside = now === base ? null : now;
-    if (outside && outside !== this.outside) toast("warning", `${name} was changed outside since it was opened here`);
+    if (outside && outside !== this.outside) toast("warning", `${name} was changed outside this page since you opened it`);
     this.outside = outside;
     this.designer.bar.paint();
   }

@@ -9,7 +9,7 @@ import { around, groups, within } from "./macros.js";
 import { readValue, writeValue } from "./values.js";
 
 const KINDS = ["action", "resource", "control", "macro"];
-const ENDS = { normal: "normal: the run is done", error: "error: the run ended in error", preempt: "preempt: end a run that still goes on", going: "going: only while the run goes on" };
+const ENDS = { normal: "normal: the run ended in success or failure", error: "error: the run ended in error", preempt: "preempt: cancel a run that is still active", going: "going: only while a run is active; it continues" };
 const COUNTS = ["success", "failure", "error", "none"];
 const VALUE_HINT = "a number, \"text\", true, or $variable";
 
@@ -245,9 +245,9 @@ export class Inspector {
     const ends = Object.entries(ENDS).filter(([key]) => kind === "action" || key === "normal" || key === "error");
     return [
       h("h2", {}, h("span", { class: "kind" }, arc.direction === "inhibit" ? "Inhibitor arc" : "Arc"), arc.direction === "out" ? `${words(arc.transition)} to ${words(arc.place)}` : `${words(arc.place)} to ${words(arc.transition)}`),
-      this.field(arc.direction === "inhibit" ? "Disables at tokens" : "Weight", this.number(arc.weight, (weight) => set({ weight: Math.max(1, weight || 1) }), { min: 1 })),
-      fromAction ? this.field("Takes the token", this.choice(arc.end ?? "normal", ends, (end) => set({ end, counts: end === "preempt" ? "success" : null }))) : null,
-      arc.end === "preempt" ? this.field("The ended run counts as", this.choice(arc.counts ?? "none", COUNTS.map((c) => [c, c]), (counts) => set({ counts }))) : null,
+      this.field(arc.direction === "inhibit" ? "Blocks from (tokens)" : "Weight", this.number(arc.weight, (weight) => set({ weight: Math.max(1, weight || 1) }), { min: 1 })),
+      fromAction ? this.field("Takes the token of", this.choice(arc.end ?? "normal", ends, (end) => set({ end, counts: end === "preempt" ? "success" : null }))) : null,
+      arc.end === "preempt" ? this.field("The cancelled run counts as", this.choice(arc.counts ?? "none", COUNTS.map((c) => [c, c]), (counts) => set({ counts }))) : null,
       h("div", { class: "buttons" }, h("button", { type: "button", class: "small", onclick: () => this.designer.removeChosen() }, icon("trash"), "Delete arc")),
     ];
   }
@@ -285,7 +285,7 @@ export class Inspector {
       h("h2", {}, h("span", { class: "kind" }, "Task"), words(task?.name ?? "")),
       this.findings(""),
       this.field("Name", this.input(task?.name, (v) => set("name", v))),
-      this.field("Goal", this.input(task?.goal, (v) => set("goal", v), { placeholder: "what counts as done well" })),
+      this.field("Goal", this.input(task?.goal, (v) => set("goal", v), { placeholder: "when a run of the task counts as good" })),
       this.field("Ends when", this.input(task?.final, (v) => set("final", v), { placeholder: "runs == 0 and arm_free == 1" }), "a condition on the tokens of places"),
       this.field("Gives up when", this.input(task?.final_error, (v) => set("final_error", v), { placeholder: "never" })),
       this.field("Remaining runs in", this.choice(task?.runs_place, [["", "no place"], ...controls], (v) => set("runs_place", v))),
@@ -304,8 +304,8 @@ export class Inspector {
     return [
       h("h2", {}, h("span", { class: "kind" }, "Subnet"), words(model.sheet)),
       this.field("Tokens enter", this.choice(model.net.entry, places, (v) => set("entry", v))),
-      this.field("Normal exit from", this.choice(model.net.normal, places, (v) => set("normal", v))),
-      this.field("Error exit from", this.choice(model.net.error, [["", "none"], ...places], (v) => set("error", v))),
+      this.field("Tokens leave after success or failure from", this.choice(model.net.normal, places, (v) => set("normal", v))),
+      this.field("Tokens leave after an error from", this.choice(model.net.error, [["", "none"], ...places], (v) => set("error", v))),
     ];
   }
 }

@@ -8,11 +8,11 @@ const STEP = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDo
 const TOOL = { v: "select", 1: "action", 2: "resource", 3: "control", 4: "macro", t: "transition", a: "arc", i: "inhibit" };
 
 const LIST = [
-  ["1 2 3 4", "tool for an action, resource, control or macro place; Enter puts one beside the selection"],
+  ["1 2 3 4", "tool for an action, resource, control or macro place; Enter adds one beside the selection"],
   ["T", "tool for a transition"], ["A, I", "arc or inhibitor arc from the selected element: go to the target with Ctrl and arrows, press Enter"],
   ["V, Esc", "back to the selection tool; Esc never deletes anything"],
   ["Ctrl + arrows", "select the nearest element in that direction"], ["[ and ]", "previous and next element"],
-  ["Ctrl G, Ctrl Shift G", "put the selection into a macro place; dissolve the macro place"], ["O, Backspace", "open the selected macro place; with nothing selected, back to what is around it"],
+  ["Ctrl G, Ctrl Shift G", "put the selection into a macro place; dissolve the macro place"], ["O, Backspace", "open the selected macro place; with nothing selected, leave the open one"],
   ["Arrows", "move the selection by one grid step; with Shift by five"], ["Enter", "properties of the selected element"],
   ["Delete", "delete the selection"], ["Ctrl Z, Ctrl Y", "undo, redo"], ["Ctrl C, X, V, D", "copy, cut, paste, duplicate"],
   ["Ctrl A", "select everything"], ["Ctrl S", "save"], ["Ctrl F", "find"], ["+ and -, 0", "zoom, whole net"],

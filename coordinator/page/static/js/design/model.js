@@ -169,11 +169,11 @@ export class Model {
   /** Draw an arc; a text says why it cannot be drawn, null that it was. */
   connect(from, to, inhibit = false) {
     const [a, b] = [this.place(from), this.place(to)];
-    if (from === to) return "An arc joins two different elements.";
-    if (a && b) return "An arc joins a place and a transition, never two places: put a transition between them.";
-    if (!a && !b) return "An arc joins a place and a transition, never two transitions: put a place between them.";
+    if (from === to) return "An arc connects two different elements.";
+    if (a && b) return "An arc connects a place and a transition, never two places. Put a transition between them.";
+    if (!a && !b) return "An arc connects a place and a transition, never two transitions. Put a place between them.";
     if (inhibit && !a) return "An inhibitor arc goes from a place to a transition.";
-    if (groups(a ?? b)) return "An arc goes to a place inside the macro place: put one into it first.";
+    if (groups(a ?? b)) return "An arc ends at a place inside the macro place. Put a place into it first.";
     const place = a ? from : to;
     const transition = this.transition(a ? to : from);
     const same = listed(a ? transition.in : transition.out).map(readArc).find((arc) => arc?.place === place && arc.inhibit === inhibit);
@@ -261,7 +261,7 @@ export class Model {
   /** Give an element another name, wherever it is named; a text says why not. */
   rename(from, to) {
     if (to === from) return null;
-    if (!NAME.test(to) || to === "__proto__") return "A name begins with a letter and has letters, digits and _ only.";
+    if (!NAME.test(to) || to === "__proto__") return "A name must start with a letter and contain only letters, digits and _.";
     if (this.has(to)) return `There is already something called ${to} here.`;
     this.edit("rename", (data, net) => {
       const kind = net.places[from] ? "places" : "transitions";
@@ -303,7 +303,7 @@ export class Model {
   /** Put the chosen elements into a new macro place: {name, left}, or a text that says why not. */
   group(names) {
     const chosen = members(this.net, names, this.inside);
-    if (!chosen.members.some((n) => this.place(n))) return "Choose the places that the macro place is to hold, with the transitions between them.";
+    if (!chosen.members.some((n) => this.place(n))) return "First select the places for the macro place, with the transitions between them.";
     const name = this.edit("group", (_, net) => {
       const macro = this.freeName("macro", net);
       group(net, chosen.members, macro, this.inside);

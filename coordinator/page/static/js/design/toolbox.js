@@ -11,7 +11,7 @@ const TOOLS = [
   ["control", "control", "Control place", "3"], ["macro", "macro", "Macro place", "4"], ["transition", "transition", "Transition", "T"],
   ["arc", "arc", "Arc", "A"], ["inhibit", "inhibitor", "Inhibitor arc", "I"],
 ];
-const SAID = { select: "", arc: "Drag from a place to a transition, or choose one after the other.", inhibit: "Drag from a place to the transition that its tokens stop." };
+const SAID = { select: "", arc: "Drag from a place to a transition, or choose one after the other.", inhibit: "Drag from a place to the transition that its tokens block." };
 
 export class Toolbox {
   constructor(designer) {
@@ -39,7 +39,7 @@ export class Toolbox {
     this.view.only("target", new Set());
     for (const [key, button] of Object.entries(this.buttons)) attribute(button, "aria-pressed", String(key === name));
     this.view.svg.dataset.tool = name;
-    this.tell(SAID[name] ?? "Click where it goes; Enter puts it in the middle.");
+    this.tell(SAID[name] ?? "Click where to put it, or press Enter to put it in the middle.");
   }
 
   tell(message) {

@@ -59,7 +59,7 @@ export class Verdicts {
       return;
     }
     const against = answer.verdicts.filter((v) => v.holds === false).length;
-    this.head.textContent = `${against ? `${against} against it` : "nothing against it"}, ${answer.markings} markings${answer.complete ? "" : " looked at, not all"}`;
+    this.head.textContent = `${against ? `${against} ${against === 1 ? "problem" : "problems"}` : "no problem"} found in ${answer.markings} markings${answer.complete ? "" : " (not all were examined)"}`;
     attribute(this.root, "data-state", against ? "error" : null);
     this.heat = answer.heat;
     this.heatButton.hidden = !Object.keys(answer.heat).length;
@@ -69,7 +69,7 @@ export class Verdicts {
   row(verdict) {
     const { witness } = verdict;
     const button = h("button", { type: "button", disabled: verdict.holds !== false || !witness, "aria-pressed": "false", onclick: () => this.show(verdict, button) },
-      icon(SIGN[verdict.holds]), h("strong", {}, `${verdict.words}: ${SAID[verdict.holds]}`), h("span", {}, verdict.reason, witness && verdict.holds === false ? `. By: ${witness.firings.join(", ") || "the initial marking"}.` : ""));
+      icon(SIGN[verdict.holds]), h("strong", {}, `${verdict.words}: ${SAID[verdict.holds]}`), h("span", {}, verdict.reason, witness && verdict.holds === false ? `. Example: ${witness.firings.join(", ") || "the initial marking"}.` : ""));
     return h("li", { class: verdict.holds === false ? "error" : "" }, button);
   }
 
