@@ -185,11 +185,11 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
     With the view `gspn` there is also the forecast: `heat` is the share of the time that each
     action place takes. Raises TaskFileError.
     """
-    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import analyse, heat
     from petrobot.coordinator.task.file import loads
 
-    limits = Limits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
+    limits = SearchLimits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
     analysis = analyse(loads(text, filename), view=view, limits=limits)
     space = analysis.qualitative.space
     verdicts = [

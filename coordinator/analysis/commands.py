@@ -16,15 +16,19 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.formats import read_net, written
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.formats.netfile import (
+    NetFile,
+    NetFileError,
+    read_rates,
+    unit_rates,
+)
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
-from petrobot.coordinator.analysis.net.space import EngineName, Limits, explore
+from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
 from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
-from petrobot.coordinator.analysis.time.rates import read_rates, unit_rates
 from petrobot.coordinator.analysis.time.simulate import (
-    Estimate,
+    IntervalEstimate,
     Simulation,
     goal_by_marking,
     simulate,
@@ -47,7 +51,7 @@ LoadTask = Callable[[Path], Task]
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CommandResult:
     """What a command gives back."""
 
     code: int
@@ -58,7 +62,7 @@ class Outcome:
 
 
 def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
-    """A task (`.toml`) or a net file. Raises FormatError, and whatever `load_task` raises."""
+    """A task (`.toml`) or a net file. Raises NetFileError, and whatever `load_task` raises."""
     return load_task(path) if path.suffix == ".toml" else read_net(path)
 
 
@@ -69,11 +73,11 @@ def analyse_command(
     view: str | None = None,
     rates: Path | str | None = None,
     stages: int = 8,
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
     engine: EngineName = "auto",
     structure: bool = True,
     changes: Sequence[str] = (),
-) -> Outcome:
+) -> CommandResult:
     """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for
     bad input.
 
@@ -98,15 +102,15 @@ def analyse_command(
 
         now = found(subject, None)
         then = found(*altered) if altered else now
-    except (FormatError, ValueError, OverflowError) as error:
-        return Outcome(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+    except (NetFileError, ValueError, OverflowError) as error:
+        return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     then, data, said = _told(then, structure)
     if wanted:
         what = [change.text for change in wanted]
         data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
         said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
     said += [f"note: {note}" for note in notes]
-    return Outcome(
+    return CommandResult(
         OK if then.ok else FAULT,
         "\n".join(said),
         data | {"notes": [*data["notes"], *notes]},
@@ -127,7 +131,9 @@ def _named(path: Path, error: Exception) -> str:
     """What is wrong, with the file's name once: readers of files name it themselves."""
     told = str(error)
     return (
-        told if isinstance(error, FormatError) or told.startswith(f"{path}:") else f"{path}: {told}"
+        told
+        if isinstance(error, NetFileError) or told.startswith(f"{path}:")
+        else f"{path}: {told}"
     )
 
 
@@ -185,7 +191,7 @@ def _subject(
                 "leave it out: a task's times are its `estimates` and `mean_wait`, and "
                 "--what-if changes them"
             )
-            raise FormatError(
+            raise NetFileError(
                 "--rates", str(rates), f"{model.name} is a task; rates are for net files", remedy
             )
         return model, model.name, ()
@@ -197,7 +203,7 @@ def _subject(
     if view != "gspn":
         return model.net, model.name, model.notes
     if model.gspn is None:
-        raise FormatError(
+        raise NetFileError(
             model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit"
         )
     return model.gspn, model.name, model.notes
@@ -207,7 +213,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise FormatError(str(path), "file", str(error), "give a readable file") from error
+        raise NetFileError(str(path), "file", str(error), "give a readable file") from error
 
 
 def simulate_command(
@@ -223,7 +229,7 @@ def simulate_command(
     stages: int = 64,
     changes: Sequence[str] = (),
     progress: Callable[[int, float], None] | None = None,
-) -> Outcome:
+) -> CommandResult:
     """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed
     there); `changes` as `whatif`."""
     try:
@@ -241,7 +247,7 @@ def simulate_command(
         assert isinstance(subject, Gspn)
         gspn = change_gspn(subject, wanted)
         if horizon is None:
-            raise FormatError(
+            raise NetFileError(
                 str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS"
             )
         seen = simulate(
@@ -254,17 +260,17 @@ def simulate_command(
             progress=progress,
         )
         return _simulated(name or path.stem, seen, notes)
-    except (FormatError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
+    except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
         told = (
             _named(path, error)
             if not isinstance(error, MemoryError)
             else f"{path}: out of memory: fewer --replicas"
         )
-        return Outcome(BAD_INPUT, told, {"error": told})
+        return CommandResult(BAD_INPUT, told, {"error": told})
 
 
-def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
-    def plain(one: Estimate) -> list[float | None]:
+def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> CommandResult:
+    def plain(one: IntervalEstimate) -> list[float | None]:
         return [x if isfinite(x) else None for x in (one.mean, one.low, one.high)]
 
     data: dict[str, Any] = {
@@ -292,16 +298,18 @@ def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
         )
     if seen.completed is None:
         lines += [f"  {t:24}{_interval(one)} /s" for t, one in seen.throughput.items()]
-    return Outcome(
+    return CommandResult(
         OK if seen.complete else FAULT, "\n".join([*lines, *(f"note: {n}" for n in notes)]), data
     )
 
 
-def _interval(one: Estimate) -> str:
+def _interval(one: IntervalEstimate) -> str:
     return f"{one.mean:.6g} [{one.low:.6g}, {one.high:.6g}]"
 
 
-def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: int = 8) -> Outcome:
+def convert_command(
+    source: Path, target: Path, load_task: LoadTask, *, stages: int = 8
+) -> CommandResult:
     """`petrobot convert`: read one format, write another by the ending; what the target cannot keep
     is listed."""
     try:
@@ -312,17 +320,17 @@ def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: 
             lost = list(model.notes)
         text, more = written(model, target)
         write_whole(target, text)
-    except (FormatError, NoEstimate, ValueError, OverflowError) as error:
-        return Outcome(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
+    except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
+        return CommandResult(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
     except OSError as error:
-        return Outcome(
+        return CommandResult(
             BAD_INPUT,
             f"{target}: {error.strerror or error}; name a file that can be written",
             {"error": str(error)},
         )
     lost += more
     lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
-    return Outcome(
+    return CommandResult(
         OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost}
     )
 
@@ -356,29 +364,29 @@ def graph_command(
     load_task: LoadTask,
     *,
     witness: tuple[str, ...] | None = None,
-    limits: Limits | None = None,
-) -> Outcome:
+    limits: SearchLimits | None = None,
+) -> CommandResult:
     """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the
     first deadlock's witness."""
     try:
         model = open_model(path, load_task)
         net, final = model.net, None
-        space = explore(net, limits=limits or Limits(states=10_000))
-    except (FormatError, ValueError, OverflowError) as error:
-        return Outcome(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+        space = explore(net, limits=limits or SearchLimits(states=10_000))
+    except (NetFileError, ValueError, OverflowError) as error:
+        return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     if isinstance(model, Task):
         final = space.where(OrdinaryView(model).is_end)
     stuck = [int(i) for i in space.dead if final is None or not final[i]]
     shown = witness if witness is not None else tuple(space.path(stuck[0])) if stuck else ()
     svg = graph_svg(space, witness=shown, final=final)
     partial = "" if space.complete else f" (partial: {space.reason})"
-    return Outcome(
+    return CommandResult(
         OK,
         f"{len(space)} markings, {space.edges} edges{partial}",
         {"svg": svg, "witness": list(shown)},
     )
 
 
-def limited(limits: Limits, progress: Callable[[int, int], None]) -> Limits:
+def limited(limits: SearchLimits, progress: Callable[[int, int], None]) -> SearchLimits:
     """The same limits with a progress callback (markings found, markings expanded)."""
     return replace(limits, progress=progress)

@@ -11,6 +11,12 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.deadlocks import (
+    PlaceSets,
+    controlled_siphons,
+    minimal_siphons,
+    minimal_traps,
+)
 from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
@@ -21,13 +27,13 @@ from petrobot.coordinator.analysis.net.robot import (
     judge,
     one_run_each,
 )
-from petrobot.coordinator.analysis.net.siphons import (
-    PlaceSets,
-    controlled_siphons,
-    minimal_siphons,
-    minimal_traps,
+from petrobot.coordinator.analysis.net.space import (
+    INTERRUPTED,
+    EngineName,
+    SearchLimits,
+    Space,
+    explore,
 )
-from petrobot.coordinator.analysis.net.space import INTERRUPTED, EngineName, Limits, Space, explore
 from petrobot.coordinator.analysis.net.structure import (
     Semiflows,
     conflict_sets,
@@ -38,7 +44,7 @@ from petrobot.coordinator.analysis.net.structure import (
     place_semiflows,
     transition_semiflows,
 )
-from petrobot.coordinator.analysis.net.verdict import Verdict
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
@@ -50,7 +56,7 @@ from petrobot.coordinator.task.net import Marking, Net
 
 
 @dataclass(frozen=True)
-class Structure:
+class StructureReport:
     """What the arcs alone say, computed when asked for."""
 
     net: Net
@@ -119,13 +125,13 @@ class Analysis:
     qualitative: Qualitative
     closed: Qualitative | None
     robot: RobotVerdicts | None
-    structure: Structure
+    structure: StructureReport
     run: LongRun | None
     forecast: Forecast | None
     notes: tuple[str, ...]
-    one_run_each: Verdict | None = None
+    one_run_each: PropertyVerdict | None = None
     """Of a task: whether no action place is entered while its run goes on."""
-    returned: Verdict | None = None
+    returned: PropertyVerdict | None = None
     """Of a task: whether each resource is there again at the end."""
     interrupted: bool = False
     """Whether Ctrl-C kept something from being found out."""
@@ -146,13 +152,13 @@ class Analysis:
         return first and single and not self.objections
 
     @property
-    def objections(self) -> dict[str, Verdict]:
+    def objections(self) -> dict[str, PropertyVerdict]:
         """What is known to speak against running it: it grows without bound, gets stuck, starts a
         run while its place is at work, cannot reach its end, goes on at its end, or ends without a
         resource. (A transition of no use is no objection.)
         """
         named = self.verdicts()
-        against: dict[str, Verdict] = {
+        against: dict[str, PropertyVerdict] = {
             name: named[name]
             for name in ("bounded", "deadlock_free", "one_run_each", "returned")
             if name in named
@@ -232,7 +238,7 @@ class Analysis:
             f = self.forecast
             goal = {} if f.goal_reliability is None else {"R_goal": f.goal_reliability}
             shape = (
-                {"90 % quantile of the time (s)": f.law().quantile(0.9)}
+                {"90 % quantile of the time (s)": f.completion_time().quantile(0.9)}
                 if f.completion_probability > 0
                 else {}
             )
@@ -246,7 +252,7 @@ class Analysis:
             return {f"throughput of {t} (1/s)": x for t, x in self.run.throughput.items()}
         return {"markings": len(self.qualitative.space)}
 
-    def verdicts(self) -> dict[str, Verdict]:
+    def verdicts(self) -> dict[str, PropertyVerdict]:
         """All verdicts by name, in robot words where the net is a task."""
         q, again = self.qualitative, self.progress
         out = {
@@ -334,7 +340,7 @@ def analyse(
     view: str = "ordinary",
     measured: Measured | None = None,
     stages: int = 8,
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
     engine: EngineName = "auto",
     ordinary: Net | None = None,
 ) -> Analysis:
@@ -360,7 +366,7 @@ def analyse(
         found,
         None,
         None,
-        Structure(net),
+        StructureReport(net),
         run,
         None,
         tuple(notes),
@@ -376,11 +382,11 @@ CUT = "Ctrl-C: a partial answer, what had been found by then"
 
 
 def _search(
-    net: Net, limits: Limits | None, engine: EngineName
+    net: Net, limits: SearchLimits | None, engine: EngineName
 ) -> tuple[Space, Coverability | None]:
     """The space within the limits; a net that proves to be unbounded is searched no further than
     LOOK."""
-    limits = limits or Limits()
+    limits = limits or SearchLimits()
     if limits.states is None or limits.states > LOOK:
         first = explore(net, limits=replace(limits, states=LOOK), engine=engine)
         if first.complete or len(first) < LOOK:
@@ -396,7 +402,7 @@ def _search(
 
 def _examined(
     net: Net,
-    limits: Limits | None,
+    limits: SearchLimits | None,
     engine: EngineName,
     notes: list[str],
     final: Callable[[Marking], bool] | None = None,
@@ -408,13 +414,13 @@ def _examined(
         if space.reason != INTERRUPTED:
             return examine(space, final=final, cover=cover)
     except KeyboardInterrupt:
-        space = space or explore(net, limits=Limits(states=1))
+        space = space or explore(net, limits=SearchLimits(states=1))
     notes.append(CUT)
     return examine(replace(space, complete=False, reason=INTERRUPTED), final=final, in_haste=True)
 
 
 def _long_run(
-    model: Gspn, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]
+    model: Gspn, space: Space, limits: SearchLimits | None, engine: EngineName, notes: list[str]
 ) -> LongRun | None:
     try:
         if model.net != space.net:
@@ -435,7 +441,7 @@ def _analyse_task(
     view: str,
     measured: Measured | None,
     stages: int,
-    limits: Limits | None,
+    limits: SearchLimits | None,
     engine: EngineName,
 ) -> Analysis:
     ordinary, notes = OrdinaryView(task), list[str]()
@@ -443,7 +449,7 @@ def _analyse_task(
     single = [
         p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None
     ]
-    alone, whole = one_run_each(found.space, single), Structure(ordinary.net)
+    alone, whole = one_run_each(found.space, single), StructureReport(ordinary.net)
     closed = robot = numbers = back = None
     try:
         if not notes:
@@ -492,7 +498,7 @@ def _uneven(space: Space, final: Mask) -> list[str]:
 def _closed(
     ordinary: OrdinaryView,
     space: Space,
-    limits: Limits | None,
+    limits: SearchLimits | None,
     engine: EngineName,
     notes: list[str],
 ) -> tuple[Qualitative | None, RobotVerdicts | None]:
@@ -509,7 +515,11 @@ def _closed(
 
 
 def _forecast(
-    task: Task, measured: Measured | None, stages: int, limits: Limits | None, notes: list[str]
+    task: Task,
+    measured: Measured | None,
+    stages: int,
+    limits: SearchLimits | None,
+    notes: list[str],
 ) -> Forecast | None:
     try:
         found = forecast(stochastic_view(task, measured, stages=stages), limits=limits)
@@ -542,7 +552,7 @@ def _word(holds: bool | None) -> str:
     return {True: "yes", False: "NO", None: "unknown"}[holds]
 
 
-def _verdict_lines(name: str, verdict: Verdict) -> list[str]:
+def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
     lines = [f"  {name.replace('_', ' '):15}{_word(verdict.holds):8} {verdict.reason}"]
     if verdict.witness is not None:
         firings = " ".join(verdict.witness.firings) or "(initial marking)"

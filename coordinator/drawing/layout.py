@@ -1,13 +1,220 @@
-"""Where the nodes stand: given positions are kept, missing ones come from layers along the flow of
-tokens."""
+"""Layers along the flow of tokens: circles cut, every node in a column, arcs as steps from column
+to column.
+
+The method is that of Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981): an arc over several
+columns is led by a way point in each column between, which takes part in the ordering like a node.
+
+Where the nodes stand: given positions are kept, missing ones come from layers along the flow of
+tokens.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from petrobot.coordinator.drawing.layers import Edge, Layers, Spot
+Edge = tuple[str, str]
+WayPoint = tuple[str, str, int]
+"""A way point of an arc: its two ends and its column."""
+Spot = str | WayPoint
+HUB = 14
+"""A node with more arcs than this is a hub: its long arcs are not led but run straight to it."""
+_SWEEPS = 10
+_TIGHTENINGS = 12
+
+
+class Layers:
+    """Columns of nodes and way points, in an order with few crossings.
+
+    `next` and `before` are the steps between columns; every spot that is led has them.
+    """
+
+    def __init__(self, names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> None:
+        kept = set(without_circles(names, edges, sources))
+        self.forward = [
+            (a, b) if (a, b) in kept else (b, a) for a, b in dict.fromkeys(edges) if a != b
+        ]
+        self.column = _columns(names, self.forward)
+        self.columns: list[list[Spot]] = [
+            [] for _ in range(max(self.column.values(), default=0) + 1)
+        ]
+        self.next: dict[Spot, list[Spot]] = {}
+        self.before: dict[Spot, list[Spot]] = {}
+        for name in names:
+            self._add(name, self.column[name])
+        degree = Counter(n for edge in self.forward for n in edge)
+        for a, b in dict.fromkeys(self.forward):
+            if max(degree[a], degree[b]) <= HUB or self.column[b] - self.column[a] == 1:
+                self._lead((a, b))
+        self._order()
+
+    def way(self, a: str, b: str) -> list[WayPoint]:
+        """The way points of an arc from a to b, in its own direction."""
+        columns = range(self.column[a] + 1, self.column[b])
+        points = [(a, b, c) for c in columns]
+        if self.column[a] > self.column[b]:
+            points = [(b, a, c) for c in range(self.column[a] - 1, self.column[b], -1)]
+        return points
+
+    def _add(self, spot: Spot, column: int) -> None:
+        self.columns[column].append(spot)
+        self.next[spot], self.before[spot] = [], []
+
+    def _lead(self, edge: Edge) -> None:
+        a, b = edge
+        last: Spot = a
+        for point in self.way(a, b):
+            self._add(point, point[2])
+            self._join(last, point)
+            last = point
+        self._join(last, b)
+
+    def _join(self, a: Spot, b: Spot) -> None:
+        self.next[a].append(b)
+        self.before[b].append(a)
+
+    def _order(self) -> None:
+        """Of orders that begin differently, the one with the fewest crossings."""
+        best, fewest = [list(c) for c in self.columns], self.crossings()
+        for start in ([list(c) for c in self.columns], [c[::-1] for c in self.columns]):
+            for first in (0, 1):
+                self.columns = [list(c) for c in start]
+                for sweep in range(_SWEEPS if fewest else 0):
+                    self._sweep(forward=(sweep + first) % 2 == 0)
+                    crossings = self.crossings()
+                    if crossings < fewest:
+                        best, fewest = [list(c) for c in self.columns], crossings
+        self.columns = best
+
+    def _sweep(self, forward: bool) -> None:
+        """Sort by the mean of neighbours, column by column, then exchange neighbours where that
+        helps."""
+        inward, columns = (
+            (self.before, self.columns[1:]) if forward else (self.next, self.columns[-2::-1])
+        )
+        for column in columns:
+            self._sort(column, inward)
+        self._exchange()
+
+    def _sort(self, column: list[Spot], inward: Mapping[Spot, Sequence[Spot]]) -> None:
+        row = self._rows()
+        mean = {
+            s: sum(row[n] for n in inward[s]) / len(inward[s]) if inward[s] else row[s]
+            for s in column
+        }
+        column.sort(key=lambda s: mean[s])
+
+    def _exchange(self) -> None:
+        """Exchange neighbours in a column as long as that takes crossings away."""
+        for _ in range(4):
+            better = False
+            row = self._rows()
+            for column in self.columns:
+                for i in range(len(column) - 1):
+                    a, b = column[i], column[i + 1]
+                    if self._gain(a, b, row) > 0:
+                        column[i], column[i + 1] = b, a
+                        row[a], row[b] = row[b], row[a]
+                        better = True
+            if not better:
+                return
+
+    def _gain(self, a: Spot, b: Spot, row: Mapping[Spot, int]) -> int:
+        """How many crossings go when b stands before a."""
+        gain = 0
+        for side in (self.before, self.next):
+            for m in side[a]:
+                for n in side[b]:
+                    gain += (row[m] > row[n]) - (row[m] < row[n])
+        return gain
+
+    def _rows(self) -> dict[Spot, int]:
+        return {spot: i for column in self.columns for i, spot in enumerate(column)}
+
+    def crossings(self) -> int:
+        """Crossings of steps between neighbouring columns."""
+        row = self._rows()
+        total = 0
+        for column in self.columns[:-1]:
+            seen: list[int] = []
+            for spot in column:
+                ends = sorted(row[n] for n in self.next[spot])
+                total += sum(len(seen) - bisect_left(seen, end + 1) for end in ends)
+                for end in ends:
+                    insort(seen, end)
+        return total
+
+
+def without_circles(
+    names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
+) -> list[Edge]:
+    """The edges without those that lead back to a node on the way (depth first, without
+    recursion)."""
+    following: dict[str, list[str]] = {n: [] for n in names}
+    for a, b in edges:
+        following[a].append(b)
+    kept: list[Edge] = []
+    state: dict[str, int] = {}
+    for root in [*sources, *names]:
+        if root in state:
+            continue
+        state[root] = 1
+        stack = [(root, iter(following[root]))]
+        while stack:
+            node, rest = stack[-1]
+            child = next(rest, None)
+            if child is None:
+                state[node] = 2
+                stack.pop()
+            elif state.get(child) != 1:
+                kept.append((node, child))
+                if child not in state:
+                    state[child] = 1
+                    stack.append((child, iter(following[child])))
+    return kept
+
+
+def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
+    """Columns by the longest way from the beginnings, then each node as near to its neighbours as
+    it can be."""
+    before: dict[str, list[str]] = {n: [] for n in names}
+    after: dict[str, list[str]] = {n: [] for n in names}
+    for a, b in edges:
+        before[b].append(a)
+        after[a].append(b)
+    column = _longest_ways(names, before, after)
+    for _ in range(_TIGHTENINGS):
+        moved = False
+        for name in names:
+            low = max((column[n] + 1 for n in before[name]), default=0)
+            high = min((column[n] - 1 for n in after[name]), default=column[name])
+            pull = len(after[name]) - len(before[name])
+            wanted = high if pull > 0 else low if pull < 0 and before[name] else column[name]
+            moved |= wanted != column[name]
+            column[name] = wanted
+        if not moved:
+            break
+    return column
+
+
+def _longest_ways(
+    names: Sequence[str], before: Mapping[str, Sequence[str]], after: Mapping[str, Sequence[str]]
+) -> dict[str, int]:
+    column = dict.fromkeys(names, 0)
+    waiting = {n: len(before[n]) for n in names}
+    ready = [n for n in names if not waiting[n]]
+    while ready:
+        node = ready.pop()
+        for child in after[node]:
+            column[child] = max(column[child], column[node] + 1)
+            waiting[child] -= 1
+            if not waiting[child]:
+                ready.append(child)
+    return column
+
 
 Point = tuple[float, float]
 
@@ -23,7 +230,7 @@ points."""
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class NodePositions:
     """A position for every node, and the points by which arcs over several columns are led."""
 
     at: Mapping[str, Point]
@@ -32,14 +239,14 @@ class Layout:
 
 def lay_out(
     wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]
-) -> Layout:
+) -> NodePositions:
     """A position for every node. `sources` are the nodes from which the flow begins (the marked
     places)."""
     given = {name: at for name, at in wanted.items() if at is not None}
     if len(given) == len(wanted):
-        return Layout(given)
+        return NodePositions(given)
     if 2 * len(given) >= len(wanted):
-        return Layout(_fill_in(list(wanted), given, edges))
+        return NodePositions(_fill_in(list(wanted), given, edges))
     return _layered(list(wanted), edges, sources)
 
 
@@ -84,7 +291,7 @@ def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
         ring += 1
 
 
-def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> Layout:
+def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> NodePositions:
     layers = Layers(names, edges, sources)
     row = _settled(layers)
     top = min(row.values(), default=0.0)
@@ -92,7 +299,7 @@ def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
     def at(spot: Spot, column: int) -> Point:
         return MARGIN + column * COLUMN, MARGIN + row[spot] - top
 
-    return Layout(
+    return NodePositions(
         {name: at(name, layers.column[name]) for name in names},
         {
             (a, b): [at(p, p[2]) for p in layers.way(a, b)]

@@ -11,7 +11,7 @@ from itertools import pairwise
 from math import hypot, inf
 
 from petrobot.coordinator.drawing.layout import Point
-from petrobot.coordinator.drawing.scene import RADIUS, Arc, Node, Scene
+from petrobot.coordinator.drawing.scene import RADIUS, Arc, DrawnNode, Scene
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom."""
@@ -29,7 +29,7 @@ _CHARACTER = 0.565
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class ArcPath:
     """A smooth curve from border to border, drawn to its control points: a quadratic B-spline.
 
     `bend` is how far a single control point is off the straight line.
@@ -73,20 +73,20 @@ class Way:
 class Words:
     """Lines of text at a place: where the first baseline begins and how the text is anchored."""
 
-    node: Node
+    node: DrawnNode
     x: float
     y: float
     anchor: str
     box: Box
 
 
-def route(scene: Scene) -> list[Way]:
+def route(scene: Scene) -> list[ArcPath]:
     """A way for each arc: as the layout leads it, else the least bent one that passes other nodes
     and ways of its two ends."""
     arcs = scene.arcs
     pairs: dict[frozenset[str], set[float]] = {}
     count = Counter(frozenset((a.source, a.target)) for a in arcs)
-    ways: list[Way] = []
+    ways: list[ArcPath] = []
     for arc in arcs:
         key = frozenset((arc.source, arc.target))
         used = pairs.setdefault(key, set())
@@ -97,7 +97,7 @@ def route(scene: Scene) -> list[Way]:
     return ways
 
 
-def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> Way:
+def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> ArcPath:
     """The way of least cost; the candidates come least bent first, so that the search ends as soon
     as none can be better."""
     led = scene.through.get((arc.source, arc.target), ())
@@ -123,15 +123,17 @@ def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> Way:
     return best
 
 
-def _way(nodes: Mapping[str, Node], arc: Arc, bend: float) -> Way:
+def _way(nodes: Mapping[str, DrawnNode], arc: Arc, bend: float) -> ArcPath:
     source, target = nodes[arc.source], nodes[arc.target]
     (x1, y1), (x2, y2) = source.at, target.at
     length = hypot(x2 - x1, y2 - y1) or 1.0
     control = ((x1 + x2) / 2 - (y2 - y1) / length * bend, (y1 + y2) / 2 + (x2 - x1) / length * bend)
-    return Way(arc, _border(source, control), (control,), _border(target, control), bend)
+    return ArcPath(arc, _border(source, control), (control,), _border(target, control), bend)
 
 
-def _led(nodes: Mapping[str, Node], arc: Arc, points: Sequence[Point], level: float = 0.0) -> Way:
+def _led(
+    nodes: Mapping[str, DrawnNode], arc: Arc, points: Sequence[Point], level: float = 0.0
+) -> ArcPath:
     """The way by the layout's points; what lies on a line between its neighbours is left out, so
     that straight is straight.
 
@@ -151,10 +153,10 @@ def _led(nodes: Mapping[str, Node], arc: Arc, points: Sequence[Point], level: fl
     if not kept:
         return _way(nodes, arc, 0.0)
     source, target = nodes[arc.source], nodes[arc.target]
-    return Way(arc, _border(source, kept[0]), tuple(kept), _border(target, kept[-1]), 0.0)
+    return ArcPath(arc, _border(source, kept[0]), tuple(kept), _border(target, kept[-1]), 0.0)
 
 
-def _border(node: Node, towards: Point) -> Point:
+def _border(node: DrawnNode, towards: Point) -> Point:
     """Where the line from the node's centre leaves it."""
     (x, y), (w, h) = node.at, node.half
     dx, dy = towards[0] - x, towards[1] - y
@@ -165,7 +167,7 @@ def _border(node: Node, towards: Point) -> Point:
     return x + dx * scale, y + dy * scale
 
 
-def _cost(nodes: Mapping[str, Node], way: Way, used: set[float], twins: bool) -> float:
+def _cost(nodes: Mapping[str, DrawnNode], way: ArcPath, used: set[float], twins: bool) -> float:
     ends = (way.arc.source, way.arc.target)
     points = way.points
     left, right = min(x for x, _ in points) - _REACH, max(x for x, _ in points) + _REACH
@@ -182,12 +184,12 @@ def _cost(nodes: Mapping[str, Node], way: Way, used: set[float], twins: bool) ->
     return 1000.0 * hits + 1500.0 * taken + abs(way.bend) - 0.5 * (not alone)
 
 
-def _near(node: Node, p: Point) -> bool:
+def _near(node: DrawnNode, p: Point) -> bool:
     w, h = node.half
     return abs(p[0] - node.at[0]) < w + _CLEARANCE and abs(p[1] - node.at[1]) < h + _CLEARANCE
 
 
-def place_words(nodes: Mapping[str, Node], ways: Sequence[Way]) -> list[Words]:
+def place_words(nodes: Mapping[str, DrawnNode], ways: Sequence[ArcPath]) -> list[Words]:
     """Words beside each node where they cover least: nodes and other words count most, then
     arcs."""
     solid = [_around(n) for n in nodes.values()]
@@ -206,7 +208,7 @@ def place_words(nodes: Mapping[str, Node], ways: Sequence[Way]) -> list[Words]:
     return placed
 
 
-def _region(node: Node) -> Box:
+def _region(node: DrawnNode) -> Box:
     """Where a node's words can stand."""
     (x, y), reach = node.at, _AROUND + max(map(text_width, node.lines), default=0.0)
     tall = _AROUND + LINE * len(node.lines)
@@ -221,7 +223,7 @@ def _holds(box: Box, p: Point) -> bool:
     return box[0] < p[0] < box[2] and box[1] < p[1] < box[3]
 
 
-def badge_spot(node: Node, ways: Sequence[Way]) -> Point:
+def badge_spot(node: DrawnNode, ways: Sequence[ArcPath]) -> Point:
     """The corner of a place that is farthest from the ends of its arcs."""
     ends = [w.start for w in ways if w.arc.source == node.name] + [
         w.end for w in ways if w.arc.target == node.name
@@ -240,7 +242,7 @@ def text_width(text: str) -> float:
     return len(text) * FONT * _CHARACTER
 
 
-def _spots(node: Node) -> Iterator[Words]:
+def _spots(node: DrawnNode) -> Iterator[Words]:
     """Candidate positions, the usual ones first."""
     width = max(map(text_width, node.lines), default=0.0)
     height = LINE * len(node.lines)
@@ -260,12 +262,14 @@ def _spots(node: Node) -> Iterator[Words]:
             yield _words(node, x - 0.8 * w, top, "end", width, height)
 
 
-def _words(node: Node, x: float, top: float, anchor: str, width: float, height: float) -> Words:
+def _words(
+    node: DrawnNode, x: float, top: float, anchor: str, width: float, height: float
+) -> Words:
     left = {"middle": x - width / 2, "start": x, "end": x - width}[anchor]
     return Words(node, x, top + FONT * 0.85, anchor, (left, top, left + width, top + height))
 
 
-def _around(node: Node) -> Box:
+def _around(node: DrawnNode) -> Box:
     (x, y), (w, h) = node.at, node.half
     return x - w - 2, y - h - 2, x + w + 2, y + h + 2
 

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from petrobot.coordinator.drawing.layers import Edge
-from petrobot.coordinator.drawing.layout import Point, lay_out
+from petrobot.coordinator.drawing.layout import Edge, Point, lay_out
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
 from petrobot.coordinator.task.macros import macros_around
 from petrobot.coordinator.task.net import Marking, Net
@@ -146,7 +145,7 @@ TURNS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class DrawnNode:
     """A place or a transition. `style` are its CSS classes; `lines` stand beside it, `hint` is its
     tooltip."""
 
@@ -183,7 +182,7 @@ class Overlay:
     path: Sequence[str] = ()
     legend: str = ""
 
-    def on(self, node: Node, shown: Mapping[str, str]) -> Node:
+    def on(self, node: DrawnNode, shown: Mapping[str, str]) -> DrawnNode:
         """The node with what is told of it; what lies inside a macro place (by `shown`) is told of
         that place."""
         heat = [h for name, h in self.heat.items() if node.name == shown.get(name, name)]
@@ -215,7 +214,7 @@ class Scene:
 
     title: str
     text: str
-    nodes: Mapping[str, Node]
+    nodes: Mapping[str, DrawnNode]
     arcs: tuple[Arc, ...] = field(default=())
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
     """Points by which an automatic layout leads an arc, by its two ends."""
@@ -289,11 +288,11 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
     )
     at = layout.at
     nodes = {
-        p: Node(p, True, at[p], "place resource", (p,), f"place {p}", n)
+        p: DrawnNode(p, True, at[p], "place resource", (p,), f"place {p}", n)
         for p, n in zip(net.places, tokens, strict=True)
     }
     nodes |= {
-        t: Node(
+        t: DrawnNode(
             t, False, at[t], "transition", (t,), f"transition {t}", upright=_upright(t, at, arcs)
         )
         for t in net.transitions
@@ -337,7 +336,7 @@ def _task_arcs(sheet: Sheet, t: Transition) -> Iterable[Arc]:
             yield Arc(t.name, shown[o.place], o.weight, "plain", style)
 
 
-def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
+def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
     task = sheet.task
     exits = [task.transitions[t] for t in sheet.folded & set(task.transitions)]
     inside = {
@@ -358,12 +357,14 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
     capacity = f", at most {p.capacity}" if p.capacity is not None else ""
     hint = f"{p.name}: {what}{capacity}"
     style = f"place {p.kind}" + (" error" if p.name in task.error_elements else "")
-    return Node(p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden)
+    return DrawnNode(
+        p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden
+    )
 
 
 def _transition_node(
     sheet: Sheet, t: Transition, at: Mapping[str, Point], arcs: Iterable[Arc]
-) -> Node:
+) -> DrawnNode:
     task = sheet.task
     style = "transition" + (" error" if t.name in task.error_elements else "")
     style += " outside" if t.name in sheet.border else ""
@@ -372,7 +373,7 @@ def _transition_node(
         hint += f", priority {t.priority}"
     if t.weight is not None:
         hint += f", weight {t.weight:g}"
-    return Node(
+    return DrawnNode(
         t.name,
         False,
         at[t.name],

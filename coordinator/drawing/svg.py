@@ -10,13 +10,13 @@ from petrobot.coordinator.drawing.layout import Point
 from petrobot.coordinator.drawing.routing import (
     FONT,
     LINE,
-    Way,
+    ArcPath,
     Words,
     badge_spot,
     place_words,
     route,
 )
-from petrobot.coordinator.drawing.scene import RADIUS, Node, Scene
+from petrobot.coordinator.drawing.scene import RADIUS, DrawnNode, Scene
 
 _MARGIN = 24.0
 _DOTS: dict[int, tuple[Point, ...]] = {
@@ -117,7 +117,7 @@ def _description(scene: Scene) -> str:
 
 
 def _frame(
-    scene: Scene, ways: Sequence[Way], words: Sequence[Words]
+    scene: Scene, ways: Sequence[ArcPath], words: Sequence[Words]
 ) -> tuple[float, float, float, float]:
     """Left, top, width and height that hold everything."""
     points = [
@@ -133,7 +133,7 @@ def _frame(
     return left, top, width, round(max(ys) + _MARGIN + (LINE if scene.legend else 0.0)) - top
 
 
-def _node(node: Node, badge: Point) -> Iterator[str]:
+def _node(node: DrawnNode, badge: Point) -> Iterator[str]:
     (x, y), (w, h) = node.at, node.half
     yield f'<g id="{escape(node.name, {chr(34): "&quot;"})}"><title>{escape(node.hint)}</title>'
     yield from _told(node)
@@ -155,7 +155,7 @@ def _node(node: Node, badge: Point) -> Iterator[str]:
     yield "</g>"
 
 
-def _told(node: Node) -> Iterator[str]:
+def _told(node: DrawnNode) -> Iterator[str]:
     """The overlay: a halo, and the turns at which a transition fires."""
     (x, y), (w, h) = node.at, node.half
     if node.heat is not None:
@@ -173,7 +173,7 @@ def _told(node: Node) -> Iterator[str]:
         yield from _text(node.turns, x + w + 8, y - h - 4, "start", "turn")
 
 
-def _tokens(node: Node) -> Iterator[str]:
+def _tokens(node: DrawnNode) -> Iterator[str]:
     x, y = node.at
     if node.tokens > 4:
         yield (
@@ -185,7 +185,7 @@ def _tokens(node: Node) -> Iterator[str]:
         yield f'<circle class="token" cx="{x + dx:g}" cy="{y + dy:g}" r="4.2"/>'
 
 
-def _badge(node: Node, spot: Point) -> Iterator[str]:
+def _badge(node: DrawnNode, spot: Point) -> Iterator[str]:
     if node.hidden:
         x, y = spot
         what = f"{node.hidden} error exit{'s' * (node.hidden > 1)} hidden"
@@ -196,7 +196,7 @@ def _badge(node: Node, spot: Point) -> Iterator[str]:
         )
 
 
-def _arc(way: Way) -> Iterator[str]:
+def _arc(way: ArcPath) -> Iterator[str]:
     (x1, y1), (cx, cy), (x2, y2) = way.start, way.controls[-1], way.end
     style = " ".join(filter(None, (way.arc.kind, way.arc.style)))
     direction = atan2(y2 - cy, x2 - cx)
@@ -215,7 +215,7 @@ def _arc(way: Way) -> Iterator[str]:
     yield f'<polygon class="head {style}" points="{points}"/>'
 
 
-def _pieces(way: Way, end: Point) -> Iterator[str]:
+def _pieces(way: ArcPath, end: Point) -> Iterator[str]:
     for (_, _), (cx, cy), (x, y) in way.pieces(end):
         yield f"Q{cx:.1f} {cy:.1f} {x:.1f} {y:.1f}"
 
@@ -226,7 +226,7 @@ def _words(words: Words) -> Iterator[str]:
         yield from _text(line, words.x, words.y + i * LINE, words.anchor, style)
 
 
-def _weight(way: Way) -> Iterator[str]:
+def _weight(way: ArcPath) -> Iterator[str]:
     x, y = way.point(0.5)
     (x1, y1), (x2, y2) = way.point(0.45), way.point(0.55)
     length = hypot(x2 - x1, y2 - y1) or 1.0

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import Analysis, analyse
 from petrobot.coordinator.cli.witnesses import picture, refused
 from petrobot.coordinator.task import End, Kind, Task, Transition
 from petrobot.coordinator.task.file import load
 
 TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
-LIMITS = Limits(states=20_000)
+LIMITS = SearchLimits(states=20_000)
 
 
 def _with(task: Task, transition: Transition) -> Task:

@@ -12,7 +12,7 @@ import pytest
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.robot import one_run_each
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.witnesses import draw_witnesses, refused
 from petrobot.coordinator.drawing import Overlay, draw
@@ -170,8 +170,8 @@ def test_a_part_of_the_space_promises_nothing() -> None:
     growing = Net.build(
         {"act": 0, "go": 1}, {"t": ({"go": 1}, {"go": 1, "act": 1}), "u": ({"act": 1}, {})}
     )
-    assert one_run_each(explore(growing, limits=Limits(states=2)), ["act"]).holds is None
-    seen = one_run_each(explore(growing, limits=Limits(states=20)), ["act"])
+    assert one_run_each(explore(growing, limits=SearchLimits(states=2)), ["act"]).holds is None
+    seen = one_run_each(explore(growing, limits=SearchLimits(states=20)), ["act"])
     assert seen.holds is False and seen.witness is not None and seen.witness.firings == ("t", "t")
 
 

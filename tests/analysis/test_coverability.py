@@ -6,7 +6,7 @@ from __future__ import annotations
 from hypothesis import assume, given, settings
 
 from petrobot.coordinator.analysis.net.coverability import coverability
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
@@ -29,7 +29,7 @@ def test_bounds_are_those_of_the_markings_reached(net: Net) -> None:
     if found.bounded is None:
         return
     if reached is None:
-        space = explore(net, limits=Limits(states=2000))
+        space = explore(net, limits=SearchLimits(states=2000))
         assert all(b is None or b >= top for b, top in zip(found.bounds, space.bounds, strict=True))
         return
     assert found.bounded and found.complete

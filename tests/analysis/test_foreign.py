@@ -15,10 +15,10 @@ from petrobot.coordinator.analysis.commands import (
     simulate_command,
 )
 from petrobot.coordinator.analysis.formats import read_net
-from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.coverability import coverability, find_pump
 from petrobot.coordinator.analysis.net.qualitative import examine
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
@@ -110,7 +110,7 @@ def test_a_file_says_its_own_encoding(tmp_path: Path, encoding: str) -> None:
     ],
 )
 def test_nets_of_other_types_are_refused(tmp_path: Path, kind: str) -> None:
-    with pytest.raises(FormatError, match="only P/T nets are read"):
+    with pytest.raises(NetFileError, match="only P/T nets are read"):
         read_net(pnml(tmp_path, LOOP, kind))
     assert main(["analyse", str(pnml(tmp_path, LOOP, kind)), "--json", "-"]) == 2
 
@@ -187,7 +187,7 @@ def test_a_pump_that_no_inhibitor_looks_at_is_enough() -> None:
         {"p": 0}, {"grow": ({}, {"p": 3}), "use": ({"p": 1}, {})}, inhibitors={"use": {"p": 2}}
     )
     assert coverability(net).bounded is None
-    found = examine(explore(net, limits=Limits(states=50)))
+    found = examine(explore(net, limits=SearchLimits(states=50)))
     assert (
         found.bounded.holds is False
         and found.bounded.witness is not None
@@ -205,7 +205,7 @@ def test_an_upper_bound_is_no_maximum() -> None:
     """Of a part of the space: invariants bound a place by 2, but nothing shows that it ever holds
     them."""
     net = philosophers(12)
-    part = examine(explore(net, limits=Limits(states=100)))
+    part = examine(explore(net, limits=SearchLimits(states=100)))
     assert part.bounded.holds is True and part.most == 1  # seen, and no place can hold more
     idle = Net.build(
         {
@@ -219,8 +219,8 @@ def test_an_upper_bound_is_no_maximum() -> None:
         | {f"t{i}": ({f"x{i}": 1}, {f"y{i}": 1}) for i in range(12)},
     )
     doubled = Net.build({"a": 1, "b": 0}, {"t": ({"a": 1}, {"b": 2}), "u": ({"b": 2}, {"a": 1})})
-    assert examine(explore(idle, limits=Limits(states=50))).most == 2
-    assert examine(explore(doubled, limits=Limits(states=1))).most is None
+    assert examine(explore(idle, limits=SearchLimits(states=50))).most == 2
+    assert examine(explore(doubled, limits=SearchLimits(states=1))).most is None
 
 
 def test_more_tokens_than_a_word_counts(tmp_path: Path) -> None:

@@ -11,11 +11,10 @@ from hypothesis import given, settings
 
 from petrobot.coordinator.analysis.formats import read_net, written
 from petrobot.coordinator.analysis.formats.greatspn import parse_pnpro
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
-from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
-from petrobot.coordinator.analysis.formats.pnml_writing import losses, write_pnml
+from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
+from petrobot.coordinator.analysis.formats.pnml import losses, parse_pnml, write_pnml
 from petrobot.coordinator.analysis.formats.tina import parse_tina, write_tina
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue
@@ -152,7 +151,7 @@ def test_test_arcs_look_and_leave(arc: str) -> None:
     ],
 )
 def test_unknown_arcs_are_refused_loudly(arc: str, extra: str) -> None:
-    with pytest.raises(FormatError, match=r"file\.pnml: arc a: an arc of the kind"):
+    with pytest.raises(NetFileError, match=r"file\.pnml: arc a: an arc of the kind"):
         parse_pnml(arc_file(arc, extra), "file.pnml")
 
 
@@ -182,9 +181,9 @@ def test_what_pipe_writes(empty: str) -> None:
 
 
 def test_coloured_tokens_and_other_net_types_are_refused() -> None:
-    with pytest.raises(FormatError, match="colour 'Red'"):
+    with pytest.raises(NetFileError, match="colour 'Red'"):
         parse_pnml(PIPE.format(empty="Default,0,Red,1"))
-    with pytest.raises(FormatError, match="only P/T nets"):
+    with pytest.raises(NetFileError, match="only P/T nets"):
         parse_pnml(
             '<pnml><net id="n" '
             'type="http://www.pnml.org/version-2009/grammar/symmetricnet"/></pnml>'
@@ -207,7 +206,7 @@ def test_coloured_tokens_and_other_net_types_are_refused() -> None:
     ],
 )  # fmt: skip
 def test_broken_files_say_where_and_what(text: str, said: str) -> None:
-    with pytest.raises(FormatError, match=said) as caught:
+    with pytest.raises(NetFileError, match=said) as caught:
         parse_pnml(text, "some.pnml")
     assert str(caught.value).startswith("some.pnml: ")
 
@@ -258,7 +257,7 @@ def test_greatspn_features_that_we_lack_are_refused(old: str, new: str, said: st
     text = PNPRO.replace(old, new).replace(
         "</text-box>", "</fluid>" if new == "<fluid" else "</text-box>"
     )
-    with pytest.raises(FormatError, match=said):
+    with pytest.raises(NetFileError, match=said):
         parse_pnpro(text)
 
 
@@ -292,12 +291,12 @@ def test_tina_nets() -> None:
     ],
 )
 def test_tina_lines_that_cannot_be_read(line: str, said: str) -> None:
-    with pytest.raises(FormatError, match=said):
+    with pytest.raises(NetFileError, match=said):
         parse_tina(line, "x.net")
 
 
 def test_priorities_that_are_no_levels_are_refused() -> None:
-    with pytest.raises(FormatError, match="between some pairs only"):
+    with pytest.raises(NetFileError, match="between some pairs only"):
         parse_tina("tr a p -> p\ntr b p -> p\ntr c p -> p\npr a > b\n")
 
 
@@ -326,9 +325,9 @@ def _in_order(net: Net, other: Net) -> tuple[object, ...]:
 def test_capacities_survive_as_inhibitors(net: Net) -> None:
     try:
         again = parse_tina(write_tina(NetFile(net))).net
-    except FormatError:
+    except NetFileError:
         return
-    one, two = (explore(n, limits=Limits(states=200)) for n in (net, again))
+    one, two = (explore(n, limits=SearchLimits(states=200)) for n in (net, again))
     assert len(one) == len(two) and one.edges == two.edges
 
 
@@ -342,15 +341,16 @@ def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:
         assert explore(read_net(path).net).edges == 6
         assert any("rates" in note for note in lost)
     for path, said in ((tmp_path / "a.txt", "ending"), (tmp_path / "missing.pnml", "No such file")):
-        with pytest.raises(FormatError, match=said):
+        with pytest.raises(NetFileError, match=said):
             read_net(path)
     with pytest.raises(
-        FormatError, match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml"
+        NetFileError,
+        match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml",
     ):
         written(model, Path("net.xyz"))
-    with pytest.raises(FormatError, match="net: file: no writer for a file without ending"):
+    with pytest.raises(NetFileError, match="net: file: no writer for a file without ending"):
         written(model, Path("net"))
-    with pytest.raises(FormatError, match=r"net\.drn: rates: .*give rates"):
+    with pytest.raises(NetFileError, match=r"net\.drn: rates: .*give rates"):
         written(NetFile(gspn.net), Path("net.drn"))
 
 
@@ -386,5 +386,5 @@ def test_entities_are_refused() -> None:
         'id="&a;"/></page></net></pnml>'
     )
     for form in (text, text.encode()):
-        with pytest.raises(FormatError, match="defines entities"):
+        with pytest.raises(NetFileError, match="defines entities"):
             parse_pnml(form)

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.analysis.formats.netfile import NetFile
-from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
+from petrobot.coordinator.analysis.formats.pnml import write_pnml
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.waiting import Limit

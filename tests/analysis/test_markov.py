@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.stats import erlang
 
 from petrobot.coordinator.analysis.net.graph import Mask
-from petrobot.coordinator.analysis.net.space import Limits
-from petrobot.coordinator.analysis.time.completion import completion, law
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time.completion import completion, completion_time
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, TimelessTrap, Values
 from petrobot.coordinator.analysis.time.linear import stationary
 from petrobot.coordinator.analysis.time.markov import (
@@ -83,7 +83,7 @@ def test_erlang_completion(k: int) -> None:
     assert done.mean == pytest.approx(k / rate, rel=1e-12) and done.variance == pytest.approx(
         k / rate**2, rel=1e-9
     )
-    shape = law(chain, goal)
+    shape = completion_time(chain, goal)
     exact = erlang(k, scale=1 / rate)
     for q in (0.05, 0.5, 0.9, 0.99):
         assert shape.quantile(q) == pytest.approx(float(exact.ppf(q)), rel=1e-9)
@@ -177,7 +177,7 @@ def test_completion_against_dense_matrices(gspn: Gspn, data: st.DataObject) -> N
         p @ second / whole - (p @ first / whole) ** 2, rel=1e-6, abs=1e-9
     )
     assert done.residual < 1e-12
-    shape, t = law(chain, goal), 1.3
+    shape, t = completion_time(chain, goal), 1.3
     frozen = Q.copy()
     frozen[~stay] = 0.0
     assert shape.cdf(t) == pytest.approx(
@@ -347,7 +347,7 @@ def test_what_cannot_be_is_refused_with_a_reason() -> None:
     with pytest.raises(ValueError, match="simulate instead"):
         Chain.of(
             Gspn.of(Net.build({"p": 1}, {"t": ({"p": 1}, {"p": 2})}), {"t": 1.0}),
-            limits=Limits(states=10),
+            limits=SearchLimits(states=10),
         )
 
 
@@ -362,7 +362,7 @@ def test_the_law_ends_where_rounding_begins() -> None:
     it ends all the same."""
     task = load(Path(__file__).parents[2] / "coordinator" / "tasks" / "follow_track.toml")
     found = forecast(stochastic_view(task, stages=8, timer_stages=8))
-    whole = law(found.chain, found.done.goal, left=1e-14, steps=60_000)
+    whole = completion_time(found.chain, found.done.goal, left=1e-14, steps=60_000)
     assert whole.quantile(0.5) < found.done.mean < whole.quantile(0.99)
     mean = float(np.sum(whole.probability - whole.absorbed) / whole.rate / whole.probability)
     assert mean == pytest.approx(found.done.mean, rel=1e-6)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.formats import written
 from petrobot.coordinator.analysis.formats.netfile import NetFile
-from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.formats.pnml import write_pnml
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.completion import completion
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import long_run
@@ -45,7 +45,7 @@ def storm() -> None:
 
 def ours(net: Net) -> tuple[set[tuple[int, ...]], int]:
     """Markings and number of edges that differ."""
-    space = explore(net, limits=Limits(states=10 * MOST))
+    space = explore(net, limits=SearchLimits(states=10 * MOST))
     assert space.complete
     edges = set(zip(space.source.tolist(), space.label.tolist(), strict=True))
     return {space.marking(i) for i in range(len(space))}, len(edges)

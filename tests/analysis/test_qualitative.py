@@ -11,10 +11,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.net.deadlocks import hunt_deadlock
 from petrobot.coordinator.analysis.net.graph import Graph, _tarjan
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.space import Limits, explore
-from petrobot.coordinator.analysis.net.stubborn import hunt_deadlock
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
@@ -121,7 +121,7 @@ def test_verdicts_on_thousands_of_nets(net: Net) -> None:
 @settings(max_examples=80, deadline=None)
 @given(nets(places=4, transitions=4), st.integers(5, 40))
 def test_a_partial_search_never_says_what_the_whole_one_denies(net: Net, states: int) -> None:
-    part = examine(explore(net, limits=Limits(states=states)))
+    part = examine(explore(net, limits=SearchLimits(states=states)))
     check_witnesses(net, part)
     found = brute_force(net, 120)
     assume(found is not None)
@@ -191,7 +191,7 @@ def test_an_unbounded_net_gets_a_pump_and_unknowns() -> None:
     net = Net.build(
         {"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})}
     )
-    result = examine(explore(net, limits=Limits(states=100)))
+    result = examine(explore(net, limits=SearchLimits(states=100)))
     assert result.bounded.holds is False and result.bounded.witness is not None
     assert result.bounded.witness.loop == ("grow",) and result.bounds == (1, None)
     assert (
@@ -200,7 +200,7 @@ def test_an_unbounded_net_gets_a_pump_and_unknowns() -> None:
 
 
 def test_a_partial_search_of_a_bounded_net_still_proves_it_bounded() -> None:
-    result = examine(explore(kanban(3), limits=Limits(states=500)))
+    result = examine(explore(kanban(3), limits=SearchLimits(states=500)))
     assert result.bounded.holds is True and result.bounds == (3,) * 16
     assert result.live.holds is None and not result.live.complete
 
@@ -248,7 +248,7 @@ def test_scipy_and_plain_components_agree(seed: int) -> None:
 def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
     """300 places, some 1e28 markings: the answer is honest and has a witness."""
     net = philosophers(60)
-    result = examine(explore(net, limits=Limits(states=2000)))
+    result = examine(explore(net, limits=SearchLimits(states=2000)))
     assert (
         result.deadlock_free.holds is False
         and result.live.holds is False
@@ -265,5 +265,5 @@ def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
 
 
 def test_stubborn_sets_prove_freedom_from_deadlock_of_a_partial_search() -> None:
-    result = examine(explore(kanban(4), limits=Limits(states=1000)))
+    result = examine(explore(kanban(4), limits=SearchLimits(states=1000)))
     assert result.deadlock_free.holds is True and "stubborn sets" in result.deadlock_free.reason

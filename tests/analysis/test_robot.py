@@ -9,8 +9,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.net.graph import Graph
-from petrobot.coordinator.analysis.net.robot import Flow, Recovery, Roles, judge, legal_exits
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.robot import (
+    Recovery,
+    Roles,
+    SpaceWithRoles,
+    judge,
+    legal_exits,
+)
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.random_nets import state_machines
 
@@ -161,7 +167,7 @@ def test_leaving_the_legal_set_is_shown_and_controllable_exits_are_not() -> None
 def test_a_part_of_the_space_promises_nothing() -> None:
     net = Net.build({"p": 1}, {"grow": ({"p": 1}, {"p": 2})})
     with pytest.raises(ValueError, match="all reachable markings"):
-        Flow(explore(net, limits=Limits(states=5)), Roles(lambda m: True))
+        SpaceWithRoles(explore(net, limits=SearchLimits(states=5)), Roles(lambda m: True))
 
 
 @settings(max_examples=60, deadline=None)

@@ -9,12 +9,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
 
-from petrobot.coordinator.analysis.time.completion import completion, law
+from petrobot.coordinator.analysis.time.completion import completion, completion_time
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import long_run, transient
 from petrobot.coordinator.analysis.time.phase_type import fit, fit_samples, gamma_quantile
 from petrobot.coordinator.analysis.time.simulate import (
-    Estimate,
+    IntervalEstimate,
     goal_by_marking,
     simulate,
     token_game,
@@ -67,7 +67,7 @@ def test_completion_lies_in_the_intervals() -> None:
     )
     assert seen.completed is not None and seen.time is not None
     assert seen.completed.covers(done.probability) and seen.time.covers(done.mean)
-    assert seen.quantile(0.9) == pytest.approx(law(chain, goal).quantile(0.9), rel=0.1)
+    assert seen.quantile(0.9) == pytest.approx(completion_time(chain, goal).quantile(0.9), rel=0.1)
     same = simulate(
         gspn, sure(2), replicas=4000, goal=goal_by_marking(lambda m: m[2] > 0), horizon=1e9
     )
@@ -157,12 +157,12 @@ def test_fitting_measured_durations() -> None:
 
 
 def test_estimates() -> None:
-    wide, narrow = (Estimate.share(k, 10 * k, 0.95) for k in (3, 300))
+    wide, narrow = (IntervalEstimate.share(k, 10 * k, 0.95) for k in (3, 300))
     assert wide.low < narrow.low < 0.1 < narrow.high < wide.high
-    assert Estimate.share(0, 10, 0.95).low == pytest.approx(0.0) and Estimate.share(
+    assert IntervalEstimate.share(0, 10, 0.95).low == pytest.approx(0.0) and IntervalEstimate.share(
         10, 10, 0.95
     ).high == pytest.approx(1.0)
-    assert Estimate.of(np.array([1.0]), 0.95).covers(1e9)
+    assert IntervalEstimate.of(np.array([1.0]), 0.95).covers(1e9)
 
 
 @settings(max_examples=15, deadline=None)
@@ -183,7 +183,7 @@ def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
         gspn, random, replicas=600, horizon=horizon, warmup=warmup, confidence=1 - 1e-9
     )
     for t, name in enumerate(gspn.net.transitions):
-        ours = Estimate.of(fires[:, t] / (horizon - warmup), 1 - 1e-9)
+        ours = IntervalEstimate.of(fires[:, t] / (horizon - warmup), 1 - 1e-9)
         assert (
             ours.low - 0.1 <= other.throughput[name].high
             and other.throughput[name].low <= ours.high + 0.1

@@ -11,17 +11,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.net import explore_compiled as explore_numba
-from petrobot.coordinator.analysis.net.explore import Engine, Explored, IntegerEngine
+from petrobot.coordinator.analysis.net.explore import ExplorationEngine, Explored, IntegerEngine
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
 from petrobot.coordinator.analysis.net.pack import Layout, TooManyTokens
-from petrobot.coordinator.analysis.net.space import EngineName, Limits, Space, explore
+from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, Space, explore
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 from tests.waiting import Limit
 
-ENGINES: dict[str, Callable[[Explored], Engine]] = {
+ENGINES: dict[str, Callable[[Explored], ExplorationEngine]] = {
     "integers": IntegerEngine,
     "numpy": NumpyEngine,
     "kernel": explore_numba.NumbaEngine,
@@ -143,7 +143,7 @@ def unbounded() -> Net:
 
 @pytest.mark.parametrize("engine", ["auto", "integers", "numpy"])
 def test_a_limit_of_states_gives_an_honest_part(engine: EngineName) -> None:
-    space = explore(unbounded(), engine=engine, limits=Limits(states=50))
+    space = explore(unbounded(), engine=engine, limits=SearchLimits(states=50))
     assert not space.complete and "50 states" in space.reason
     assert len(space) >= 50 > space.expanded - 1
     assert space.row[space.expanded] == space.row[-1] == len(space.target)
@@ -159,12 +159,12 @@ def ticking() -> Iterator[float]:
 
 def test_time_and_memory_limits() -> None:
     clock = ticking().__next__
-    space = explore(unbounded(), limits=Limits(seconds=3.0, clock=clock))
+    space = explore(unbounded(), limits=SearchLimits(seconds=3.0, clock=clock))
     assert not space.complete and "3 s" in space.reason
-    space = explore(kanban(3), engine="numpy", limits=Limits(memory=1_000_000))
+    space = explore(kanban(3), engine="numpy", limits=SearchLimits(memory=1_000_000))
     assert not space.complete and "memory" in space.reason
     with pytest.raises(ValueError, match="clock"):
-        Limits(seconds=1.0)
+        SearchLimits(seconds=1.0)
 
 
 @pytest.mark.parametrize("engine", ["integers", "numpy"])
@@ -180,10 +180,10 @@ def test_ctrl_c_leaves_a_consistent_part(engine: EngineName) -> None:
     space = explore(
         unbounded() if engine == "integers" else kanban(3),
         engine=engine,
-        limits=Limits(progress=progress),
+        limits=SearchLimits(progress=progress),
     )
     assert not space.complete and space.reason == "interrupted"
-    whole = explore(space.net, engine=engine, limits=Limits(states=len(space) + 2000))
+    whole = explore(space.net, engine=engine, limits=SearchLimits(states=len(space) + 2000))
     assert np.array_equal(whole.target[: len(space.target)], space.target)
 
 
@@ -237,7 +237,7 @@ def test_layout_round_trips_and_fields_stay_apart() -> None:
 def test_progress_is_told() -> None:
     told: list[tuple[int, int]] = []
     space: Space = explore(
-        kanban(2), limits=Limits(progress=lambda found, done: told.append((found, done)))
+        kanban(2), limits=SearchLimits(progress=lambda found, done: told.append((found, done)))
     )
     assert told == sorted(told) and told[-1][0] <= len(space)
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 
 from petrobot.coordinator.analysis.net import structure
-from petrobot.coordinator.analysis.net.siphons import (
+from petrobot.coordinator.analysis.net.deadlocks import (
     controlled_siphons,
     empty_siphon,
     largest_trap,

@@ -16,7 +16,7 @@ from petrobot.coordinator.analysis.net.booleans import boolean_view
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import examine
 from petrobot.coordinator.analysis.net.robot import judge
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
@@ -294,7 +294,7 @@ def tasks(draw: st.DrawFn) -> Task:
 @given(tasks())
 def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: Task) -> None:
     view = stochastic_view(task, stages=2, timer_stages=2)
-    space = explore(view.gspn.net, limits=Limits(states=1500))
+    space = explore(view.gspn.net, limits=SearchLimits(states=1500))
     net, gspn_net = task.net, view.gspn.net
     for i, t, j in zip(
         space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True
@@ -311,7 +311,7 @@ def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: 
 @given(tasks())
 def test_tokens_of_action_places_are_runs_that_go_on_or_have_ended(task: Task) -> None:
     view = stochastic_view(task, stages=2, timer_stages=2)
-    space = explore(view.gspn.net, limits=Limits(states=800))
+    space = explore(view.gspn.net, limits=SearchLimits(states=800))
     index = view.gspn.net.place_index
     for place in task.places.values():
         if place.kind is Kind.ACTION:
@@ -326,7 +326,7 @@ def test_the_operators_hand_is_there_on_request() -> None:
     view = OrdinaryView(task, operator=True)
     assert view.net.transitions[-2:] == ("put.idle", "take.idle")
     assert view.controllable == {"put.idle", "take.idle", "go"}
-    space = explore(view.net, limits=Limits(states=100))
+    space = explore(view.net, limits=SearchLimits(states=100))
     assert space.bounds[view.net.place_index["idle"]] == 2
     assert space.number((0,) * len(view.net.places)) is not None
 
@@ -383,7 +383,7 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
     twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
     leaking = replace(task.transitions["not_located"], outputs=twice)
     view = OrdinaryView(replace(task, transitions={**task.transitions, "not_located": leaking}))
-    leak = examine(explore(view.net, limits=Limits(states=3000)), final=view.is_end)
+    leak = examine(explore(view.net, limits=SearchLimits(states=3000)), final=view.is_end)
     assert (
         leak.bounded.holds is False
         and leak.bounded.witness is not None
@@ -400,7 +400,7 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
     view = OrdinaryView(
         replace(task, places=places, transitions={**task.transitions, "in_place": double})
     )
-    space = explore(view.net, limits=Limits(states=20_000))
+    space = explore(view.net, limits=SearchLimits(states=20_000))
     both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (
         space.tokens(view.net.place_index["catch_ball"]) > 0
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
-from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.stochastic import Measured
 from petrobot.coordinator.analysis.time.whatif import change_net, change_task, read_change
@@ -103,7 +103,7 @@ def test_nets_with_and_without_rates(tmp_path: Path) -> None:
     assert outcome.data["throughput"]["work"] == pytest.approx(12 / 13, rel=1e-9)
     assert outcome.data["as_it_is"]["throughput"]["work"] == pytest.approx(0.5)
     assert analyse_command(net, load, changes=["work.rate=3"]).code == 2
-    with pytest.raises(FormatError, match="no place c"):
+    with pytest.raises(NetFileError, match="no place c"):
         change_net(Net.build({"a": 1}, {}), [read_change("c=1")])
 
 

@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from petrobot.coordinator.drawing.layout import Point
-from petrobot.coordinator.drawing.routing import Box, Way, Words, place_words, route
-from petrobot.coordinator.drawing.scene import Node, Scene, scene_of_net, scene_of_task
+from petrobot.coordinator.drawing.routing import ArcPath, Box, Words, place_words, route
+from petrobot.coordinator.drawing.scene import DrawnNode, Scene, scene_of_net, scene_of_task
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
 from tests.drawing.conftest import random_task
@@ -23,7 +23,7 @@ SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 SEEDS = range(300, 316)
 
 
-def crossings(ways: list[Way]) -> int:
+def crossings(ways: list[ArcPath]) -> int:
     """Pairs of arcs that cross, but for those that meet at one end anyway."""
     apart = [
         (a, b)
@@ -57,7 +57,7 @@ def inside(p: Point, box: Box, margin: float = 0.0) -> bool:
     return box[0] - margin < p[0] < box[2] + margin and box[1] - margin < p[1] < box[3] + margin
 
 
-def box_of(node: Node) -> Box:
+def box_of(node: DrawnNode) -> Box:
     """What a node covers."""
     (x, y), (w, h) = node.at, node.half
     return x - w, y - h, x + w, y + h
@@ -68,7 +68,7 @@ def covers(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def through_nodes(scene: Scene, ways: list[Way]) -> Iterator[tuple[Way, str]]:
+def through_nodes(scene: Scene, ways: list[ArcPath]) -> Iterator[tuple[ArcPath, str]]:
     """Arcs that run over a node that is not theirs."""
     for way in ways:
         for node in scene.nodes.values():
@@ -78,13 +78,13 @@ def through_nodes(scene: Scene, ways: list[Way]) -> Iterator[tuple[Way, str]]:
                 yield way, node.name
 
 
-def through_words(words: list[Words], ways: list[Way]) -> int:
+def through_words(words: list[Words], ways: list[ArcPath]) -> int:
     """Texts with an arc through their middle, where it would be read through."""
     cores = [(w.box[0], w.box[1] + 4, w.box[2], w.box[3] - 4) for w in words]
     return sum(any(inside(p, core) for p in way.points) for core in cores for way in ways)
 
 
-def drawn(scene: Scene) -> tuple[list[Way], list[Words]]:
+def drawn(scene: Scene) -> tuple[list[ArcPath], list[Words]]:
     """Its arcs and words."""
     ways = route(scene)
     return ways, place_words(scene.nodes, ways)

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from petrobot.coordinator.analysis.formats import dot, pnml_writing, storm, tina
+from petrobot.coordinator.analysis.formats import exports, pnml, tina
 from petrobot.coordinator.analysis.formats.greatspn import parse_pnpro
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
-from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
+from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
+from petrobot.coordinator.analysis.formats.pnml import parse_pnml
 from petrobot.coordinator.analysis.time.gspn import Chain
 
 READ: dict[str, Callable[[bytes, str], NetFile]] = {
@@ -24,16 +24,16 @@ WRITE = (".pnml", ".net", ".dot", ".drn")
 
 
 def read_net(path: Path) -> NetFile:
-    """The net in a file. Raises FormatError, also for a file that cannot be opened."""
+    """The net in a file. Raises NetFileError, also for a file that cannot be opened."""
     reader = READ.get(path.suffix.lower())
     if reader is None:
-        raise FormatError(
+        raise NetFileError(
             str(path), "file", f"{path.suffix or 'no'} ending", f"known are {', '.join(READ)}"
         )
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise FormatError(
+        raise NetFileError(
             str(path), "file", error.strerror or str(error), "give a readable file"
         ) from error
     return reader(text, str(path))
@@ -43,28 +43,28 @@ def _utf8(text: bytes, file: str) -> str:
     try:
         return text.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FormatError(file, "file", str(error), "give a UTF-8 file") from error
+        raise NetFileError(file, "file", str(error), "give a UTF-8 file") from error
 
 
 def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
     """(text of the net in the format of the target's ending, what that format does not keep).
-    Raises FormatError."""
+    Raises NetFileError."""
     match target.suffix.lower():
         case ".pnml":
-            return pnml_writing.write_pnml(model), pnml_writing.losses(model)
+            return pnml.write_pnml(model), pnml.losses(model)
         case ".net":
             return tina.write_tina(model), tina.losses(model)
         case ".dot":
-            return dot.write_dot(model), ["a drawing: priorities, capacities and rates"]
+            return exports.write_dot(model), ["a drawing: priorities, capacities and rates"]
         case ".drn":
             if model.gspn is None:
-                raise FormatError(
+                raise NetFileError(
                     str(target), "rates", "the net has none", "give rates: a CTMC needs them"
                 )
-            return storm.write_drn(Chain.of(model.gspn)), [
+            return exports.write_drn(Chain.of(model.gspn)), [
                 "the net itself: only its chain is written"
             ]
     ending = f"the ending {target.suffix}" if target.suffix else "a file without ending"
-    raise FormatError(
+    raise NetFileError(
         str(target), "file", f"no writer for {ending}", f"end its name in {', '.join(WRITE)}"
     )

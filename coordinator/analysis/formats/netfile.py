@@ -1,21 +1,27 @@
 """What a foreign net file holds, and the one error that any reader or writer of such files raises.
 
-Nothing is lost in silence: what our nets cannot express is refused (FormatError) if it changes
+Nothing is lost in silence: what our nets cannot express is refused (NetFileError) if it changes
 behaviour, and listed in `notes` if it does not.
+
+Rates for a net that has none of its own: a file of rates, weights and servers by transition, or
+one rate for all.
 """
 
 from __future__ import annotations
 
 import ast
+import json
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 from xml.etree.ElementTree import Element
 
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.task.net import Net
 
 
-class FormatError(ValueError):
+class NetFileError(ValueError):
     """A file that cannot be read or a net that cannot be written: names the file, the element and
     the remedy."""
 
@@ -62,10 +68,10 @@ class NetDraft:
         self.notes: list[str] = []
 
     def place(self, name: str, tokens: int, capacity: int | None = None) -> None:
-        """A place. Raises FormatError if the id is taken."""
+        """A place. Raises NetFileError if the id is taken."""
         self._fresh(name)
         if tokens < 0:
-            raise FormatError(
+            raise NetFileError(
                 self.file, f"place {name}", f"{tokens} tokens", "a marking counts from 0"
             )
         self.places[name] = tokens
@@ -73,14 +79,14 @@ class NetDraft:
             self.capacity[name] = capacity
 
     def transition(self, name: str, priority: int = 0) -> None:
-        """A transition. Raises FormatError if the id is taken."""
+        """A transition. Raises NetFileError if the id is taken."""
         self._fresh(name)
         self.transitions[name] = priority
         self.consume[name], self.produce[name], self.inhibit[name] = {}, {}, {}
 
     def _fresh(self, name: str) -> None:
         if name in self.places or name in self.transitions:
-            raise FormatError(
+            raise NetFileError(
                 self.file, name, "this id stands there twice", "ids are unique in a file"
             )
 
@@ -92,13 +98,17 @@ class NetDraft:
         place, transition = (source, target) if source in self.places else (target, source)
         if place not in self.places or transition not in self.transitions:
             remedy = "an arc joins a place and a transition of the file"
-            raise FormatError(self.file, element, f"it leads from {source!r} to {target!r}", remedy)
+            raise NetFileError(
+                self.file, element, f"it leads from {source!r} to {target!r}", remedy
+            )
         if weight < 1:
-            raise FormatError(self.file, element, f"a weight of {weight}", "a weight counts from 1")
+            raise NetFileError(
+                self.file, element, f"a weight of {weight}", "a weight counts from 1"
+            )
         into = source == place
         if what == "inhibitor":
             if not into:
-                raise FormatError(
+                raise NetFileError(
                     self.file,
                     element,
                     "an inhibitor arc out of a transition",
@@ -125,7 +135,7 @@ class NetDraft:
                 table[place] = table.get(place, 0) + missing
 
     def net(self) -> Net:
-        """The net. Raises FormatError for one that is malformed."""
+        """The net. Raises NetFileError for one that is malformed."""
         try:
             return Net.build(
                 self.places,
@@ -135,7 +145,7 @@ class NetDraft:
                 priority=self.transitions,
             )
         except ValueError as error:
-            raise FormatError(self.file, "net", str(error)) from error
+            raise NetFileError(self.file, "net", str(error)) from error
 
     def gspn(self, net: Net) -> Gspn | None:
         """The stochastic net if the file said any rate or weight."""
@@ -144,16 +154,16 @@ class NetDraft:
         try:
             return Gspn.of(net, self.rates, weights=self.weights, servers=self.servers)
         except ValueError as error:
-            raise FormatError(self.file, "rates", str(error)) from error
+            raise NetFileError(self.file, "rates", str(error)) from error
 
 
 def arithmetic(file: str, element: str, text: str, names: Mapping[str, float]) -> float:
-    """The value of an expression of numbers, names, + - * / and parentheses. Raises FormatError."""
+    """The value of an expression of numbers, names, + - * / and parentheses. Raises NetFileError."""
     try:
         return _value(ast.parse(text.strip(), mode="eval").body, names)
     except (SyntaxError, KeyError, TypeError, ZeroDivisionError) as error:
         remedy = "use numbers and declared constants with + - * / ( )"
-        raise FormatError(file, element, f"{text!r} has no value", remedy) from error
+        raise NetFileError(file, element, f"{text!r} has no value", remedy) from error
 
 
 def _value(node: ast.expr, names: Mapping[str, float]) -> float:
@@ -178,10 +188,126 @@ def _value(node: ast.expr, names: Mapping[str, float]) -> float:
 def whole_number(
     file: str, element: str, text: str, names: Mapping[str, float] | None = None
 ) -> int:
-    """A whole number, also by an expression. Raises FormatError."""
+    """A whole number, also by an expression. Raises NetFileError."""
     value = arithmetic(file, element, text, names or {})
     if value != int(value):
-        raise FormatError(
+        raise NetFileError(
             file, element, f"{text!r} is no whole number", "tokens and weights are counted"
         )
     return int(value)
+
+
+TABLES = {"rates", "weights", "servers", "default_rate"}
+
+
+def unit_rates(model: NetFile) -> Gspn:
+    """Every transition with rate 1/s and one server."""
+    return Gspn.of(model.net, dict.fromkeys(model.net.transitions, 1.0))
+
+
+def read_rates(text: str, file: str, model: NetFile) -> Gspn:
+    """A GSPN from a rates file. Raises NetFileError.
+
+    TOML: `[rates]` transition = 1/s, `[weights]` of immediate transitions, `[servers]` (a number or
+    "infinite"), and `default_rate`; or just `transition = rate` at the top. JSON of the same form
+    is read as well. A transition that is not named keeps what the net file says of it, else it gets
+    `default_rate`, or 1/s.
+    """
+    said = _sorted_in(_tables(text, file), file, model)
+    rates, weights = (_numbers(said.get(key, {}), file, key) for key in ("rates", "weights"))
+    servers = _servers(said.get("servers", {}), file)
+    default = _numbers({"default_rate": said.get("default_rate", 1.0)}, file, "default_rate")[
+        "default_rate"
+    ]
+    for given in (rates, weights, servers):
+        for name in given:
+            if name not in model.net.transition_index:
+                raise NetFileError(
+                    file,
+                    name,
+                    "no transition of the net has this id",
+                    "name transitions by their ids",
+                )
+    for name in rates:
+        if name in weights:
+            raise NetFileError(
+                file,
+                name,
+                "it has a rate and a weight",
+                "a rate makes it timed, a weight immediate",
+            )
+    _fill_in(model, rates, weights, servers, default)
+    try:
+        return Gspn.of(model.net, rates, weights=weights, servers=servers)
+    except (ValueError, TypeError) as error:
+        raise NetFileError(file, "rates", str(error)) from error
+
+
+def _tables(text: str, file: str) -> dict[str, Any]:
+    try:
+        said = json.loads(text) if text.lstrip().startswith("{") else tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+        raise NetFileError(
+            file, "TOML", str(error), "write [rates] and TRANSITION = NUMBER below it"
+        ) from error
+    return dict(said)
+
+
+def _sorted_in(said: dict[str, Any], file: str, model: NetFile) -> dict[str, Any]:
+    """Rates that stand at the top of the file, put where they belong. Raises NetFileError for any
+    other key."""
+    loose = {key: value for key, value in said.items() if key not in TABLES}
+    for key in loose:
+        if key not in model.net.transition_index:
+            raise NetFileError(
+                file,
+                key,
+                "an unknown key, and no transition",
+                f"known are {', '.join(sorted(TABLES))}",
+            )
+    rest = {key: value for key, value in said.items() if key in TABLES}
+    return rest | {"rates": {**rest.get("rates", {}), **loose}} if loose else rest
+
+
+def _numbers(table: Any, file: str, key: str) -> dict[str, float]:
+    good = isinstance(table, dict) and all(
+        isinstance(value, int | float) and not isinstance(value, bool) for value in table.values()
+    )
+    if not good:
+        raise NetFileError(
+            file, key, "no table of numbers", f"write [{key}] and TRANSITION = NUMBER below it"
+        )
+    return {name: float(value) for name, value in table.items()}
+
+
+def _servers(table: Any, file: str) -> dict[str, int | None]:
+    if not isinstance(table, dict):
+        raise NetFileError(
+            file, "servers", "no table", "write [servers] and TRANSITION = NUMBER below it"
+        )
+    for name, n in table.items():
+        if n != "infinite" and (not isinstance(n, int) or isinstance(n, bool)):
+            raise NetFileError(
+                file, f"servers.{name}", f"{n!r} servers", 'give a whole number, or "infinite"'
+            )
+    return {name: None if n == "infinite" else n for name, n in table.items()}
+
+
+def _fill_in(
+    model: NetFile,
+    rates: dict[str, float],
+    weights: dict[str, float],
+    servers: dict[str, int | None],
+    default: float,
+) -> None:
+    """What the file leaves open: as the net file says, else the default rate."""
+    for t, name in enumerate(model.net.transitions):
+        if name in rates or name in weights:
+            continue
+        if model.gspn is None:
+            rates[name] = default
+        elif (rate := model.gspn.rate[t]) is not None:
+            rates[name] = rate
+            servers.setdefault(name, model.gspn.servers[t])
+        else:
+            weights[name] = model.gspn.weight[t]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetDraft, NetFile
+from petrobot.coordinator.analysis.formats.netfile import NetDraft, NetFile, NetFileError
 from petrobot.coordinator.task.net import Net
 
 TOKEN = re.compile(r"\{(?:\\.|[^}\\])*\}|->|[^\s{]+")
@@ -19,11 +19,11 @@ ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>\d+[KMGT]?)\Z")
 
 
 def parse_tina(text: str, file: str = "net") -> NetFile:
-    """The net in a TINA text. Raises FormatError."""
-    return _Reading(text, file).result()
+    """The net in a TINA text. Raises NetFileError."""
+    return _TinaReading(text, file).result()
 
 
-class _Reading:
+class _TinaReading:
     def __init__(self, text: str, file: str) -> None:
         self.file = file
         self.name = ""
@@ -63,7 +63,7 @@ class _Reading:
             case "nt":
                 self.notes.append(f"{at}: a note")
             case other:
-                raise FormatError(
+                raise NetFileError(
                     self.file,
                     at,
                     f"a line that begins with {other!r}",
@@ -72,7 +72,7 @@ class _Reading:
 
     def _transition(self, words: list[str], at: str) -> None:
         if not words:
-            raise FormatError(self.file, at, "a transition without a name")
+            raise NetFileError(self.file, at, "a transition without a name")
         name = _bare(words[0])
         self.transitions.append(name)
         rest = words[1:]
@@ -80,7 +80,7 @@ class _Reading:
             self.labels[name], rest = _bare(rest[1]), rest[2:]
         if rest and rest[0][0] in "[]":
             if rest[0] not in ("[0,w[", "[0,inf["):
-                raise FormatError(
+                raise NetFileError(
                     self.file,
                     at,
                     f"a time interval {rest[0]}",
@@ -88,7 +88,7 @@ class _Reading:
                 )
             rest = rest[1:]
         if "->" not in rest:
-            raise FormatError(
+            raise NetFileError(
                 self.file, at, "no -> in a transition", "write tr NAME INPUTS -> OUTPUTS"
             )
         arrow = rest.index("->")
@@ -103,7 +103,7 @@ class _Reading:
         if suffix:
             found = ARC.match(suffix)
             if found is None or found["kind"][0] == "!" or (found["kind"] != "*" and not into):
-                raise FormatError(
+                raise NetFileError(
                     self.file, at, f"an arc {word!r}", "arcs are p, p*2, p?2 and p?-2"
                 )
             kind = {"*": "normal", "?": "test", "?-": "inhibitor"}[found["kind"]]
@@ -120,7 +120,7 @@ class _Reading:
             self.labels[name], rest = _bare(rest[1]), rest[2:]
         for word in rest:
             if not re.fullmatch(r"\(\d+[KMGT]?\)", word):
-                raise FormatError(
+                raise NetFileError(
                     self.file, at, f"{word!r} behind a place", "write pl NAME (TOKENS)"
                 )
             self.tokens[name] += _number(word[1:-1])
@@ -152,7 +152,7 @@ class _Reading:
         implied = {(a, b) for a in level for b in level if level[a] > level[b]}
         if implied - pairs - {(a, d) for a, b in pairs for c, d in pairs if b == c}:
             remedy = "only priorities that form levels over all transitions are read"
-            raise FormatError(self.file, "pr", "priorities between some pairs only", remedy)
+            raise NetFileError(self.file, "pr", "priorities between some pairs only", remedy)
         return level
 
 
@@ -210,7 +210,7 @@ def write_tina(model: NetFile) -> str:
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
         below = sorted(thresholds(net, t).items())
         if any(k < 1 for _, k in below):
-            raise FormatError(
+            raise NetFileError(
                 "net", f"transition {name}", "its capacity can never be kept", "raise the capacity"
             )
         need = [_quoted(net.places[p]) + (f"*{w}" if w > 1 else "") for p, w in net.consume[t]]

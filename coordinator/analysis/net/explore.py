@@ -55,7 +55,7 @@ class Explored:
         return Explored(self.net, layout, self.keep_edges, words, self.row, self.target, self.label)
 
 
-class Engine(Protocol):
+class ExplorationEngine(Protocol):
     """Expands markings in order. After an interruption at any point `explored()` still gives a
     consistent search."""
 

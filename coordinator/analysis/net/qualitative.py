@@ -16,13 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.deadlocks import (
+    Hunt,
+    controlled_siphons,
+    empty_siphon,
+    hunt_deadlock,
+)
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.pack import thresholds
-from petrobot.coordinator.analysis.net.siphons import controlled_siphons, empty_siphon
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
-from petrobot.coordinator.analysis.net.stubborn import Hunt, hunt_deadlock
-from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.task.net import Marking, Net
 
 SAFETY = ""
@@ -62,20 +66,20 @@ class Qualitative:
     """Proven; by place. They are reached where the space is complete."""
     most: int | None
     """The most tokens that any place ever holds; None if unknown or without end."""
-    bounded: Verdict
-    safe: Verdict
-    deadlock_free: Verdict
+    bounded: PropertyVerdict
+    safe: PropertyVerdict
+    deadlock_free: PropertyVerdict
     deadlocks: tuple[Deadlock, ...]
     dead_markings: int
     """Among the markings found."""
-    quasi_live: Verdict
-    live: Verdict
+    quasi_live: PropertyVerdict
+    live: PropertyVerdict
     levels: tuple[int | None, ...]
     """Liveness level 0 to 4 of each transition (2 never appears: see above); None if unknown."""
-    reversible: Verdict
+    reversible: PropertyVerdict
     home_states: int | None
     """Number of markings that can be reached from every reachable marking."""
-    sound: Verdict | None
+    sound: PropertyVerdict | None
     """Only with a `final` predicate."""
 
     @property
@@ -144,19 +148,19 @@ def witness(space: Space, i: int, loop: tuple[str, ...] = ()) -> Witness:
     return Witness(tuple(space.path(i)), marked, loop)
 
 
-def _unknown(space: Space, question: str = "") -> Verdict:
+def _unknown(space: Space, question: str = "") -> PropertyVerdict:
     text = f"not known: the search stopped early ({space.reason})"
-    return Verdict(None, f"{text}; {question}" if question else text, complete=False)
+    return PropertyVerdict(None, f"{text}; {question}" if question else text, complete=False)
 
 
 def _boundedness(
     space: Space, cover: Coverability | None
-) -> tuple[tuple[int | None, ...], Verdict, Verdict, Coverability | None]:
+) -> tuple[tuple[int | None, ...], PropertyVerdict, PropertyVerdict, Coverability | None]:
     """(bounds, bounded, safe, the coverability result that was used, if any)."""
     if space.complete:
         bounds: tuple[int | None, ...] = space.bounds
         most = max(space.bounds, default=0)
-        bounded = Verdict(
+        bounded = PropertyVerdict(
             True,
             f"no place ever holds more than {most} token{'s' * (most != 1)}",
             assumption=SAFETY,
@@ -164,7 +168,7 @@ def _boundedness(
         return bounds, bounded, _safe(space, True), None
     proven = place_bounds(space.net)
     if all(b is not None for b in proven):
-        bounded = Verdict(
+        bounded = PropertyVerdict(
             True,
             f"bounded by invariants and capacities, although {space.reason}",
             assumption=SAFETY,
@@ -185,9 +189,14 @@ def _boundedness(
             f"{', '.join(grows)} can grow without end: {' '.join(again)} can be repeated for ever"
         )
         settled = known if cover.complete else tuple(proven)
-        return settled, Verdict(False, reason, shown), Verdict(False, reason, shown), cover
+        return (
+            settled,
+            PropertyVerdict(False, reason, shown),
+            PropertyVerdict(False, reason, shown),
+            cover,
+        )
     if cover.bounded:
-        bounded = Verdict(
+        bounded = PropertyVerdict(
             True, f"bounded by the coverability tree, although {space.reason}", assumption=SAFETY
         )
         return known, bounded, _safe(space, max((b or 0 for b in known), default=0) <= 1), cover
@@ -204,14 +213,14 @@ def _marked(net: Net, firings: tuple[str, ...]) -> dict[str, int]:
     return {p: n for p, n in zip(net.places, last, strict=True) if n}
 
 
-def _safe(space: Space, proven: bool) -> Verdict:
+def _safe(space: Space, proven: bool) -> PropertyVerdict:
     for p, most in enumerate(space.bounds):
         if most > 1:
             first = int(np.argmax(space.tokens(p) > 1))
             reason = f"{space.net.places[p]} can hold {most} tokens"
-            return Verdict(False, reason, witness(space, first), complete=space.complete)
+            return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     if proven:
-        return Verdict(
+        return PropertyVerdict(
             True,
             "no place ever holds more than one token",
             assumption=SAFETY,
@@ -232,21 +241,21 @@ def _hunted(net: Net, hunt: Hunt | None) -> tuple[Deadlock, ...]:
 
 def _deadlock_free(
     space: Space, dead: NDArray[np.int64], has_final: bool, hunt: Hunt | None
-) -> Verdict:
+) -> PropertyVerdict:
     other = " that is not a designed end" if has_final else ""
     if len(dead):
         first = int(dead[0])
         reason = f"nothing can happen any more in {space.net.describe(space.marking(first))}"
-        return Verdict(False, reason, witness(space, first), complete=space.complete)
+        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     for found in _hunted(space.net, hunt):
         reason = (
             f"nothing can happen any more with {', '.join(found.marked) or 'nothing'} "
             "marked (found by stubborn sets)"
         )
-        return Verdict(False, reason, found.witness, complete=False)
+        return PropertyVerdict(False, reason, found.witness, complete=False)
     always = _never_barred(space.net)
     if not space.complete and always is not None:
-        return Verdict(
+        return PropertyVerdict(
             True,
             f"{always} needs nothing and nothing bars it: it can always fire",
             assumption=FAIRNESS,
@@ -256,16 +265,16 @@ def _deadlock_free(
             "every siphon holds a trap that is marked at first, so some transition is "
             "always enabled"
         )
-        return Verdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIRNESS)
     if hunt is not None and hunt.complete:
         reason = (
             f"no reachable marking{other} is dead: {hunt.states} markings along "
             "stubborn sets stand for all"
         )
-        return Verdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIRNESS)
     if not space.complete:
         return _unknown(space, f"no dead marking{other} among the {space.expanded} looked at")
-    return Verdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
+    return PropertyVerdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
 
 
 def _never_barred(net: Net) -> str | None:
@@ -322,20 +331,20 @@ def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int
 
 def _quasi_live(
     space: Space, levels: tuple[int | None, ...], cover: Coverability | None
-) -> Verdict:
+) -> PropertyVerdict:
     fired = np.bincount(space.label, minlength=len(levels)) > 0
     if fired.all():
-        return Verdict(
+        return PropertyVerdict(
             True, "every transition can fire", assumption=FAIRNESS, complete=space.complete
         )
     idle = [space.net.transitions[t] for t in np.flatnonzero(~fired)]
     dead = [name for name, level in zip(space.net.transitions, levels, strict=True) if level == 0]
     if not space.complete and dead:
-        return Verdict(
+        return PropertyVerdict(
             False, f"can never fire: {', '.join(dead)} (by the coverability tree)", complete=False
         )
     if not space.complete and cover is not None and cover.exact:
-        return Verdict(
+        return PropertyVerdict(
             True,
             "every transition can fire (by the coverability tree)",
             assumption=FAIRNESS,
@@ -343,13 +352,15 @@ def _quasi_live(
         )
     if not space.complete:
         return _unknown(space, f"not seen to fire so far: {', '.join(idle)}")
-    return Verdict(False, f"can never fire: {', '.join(idle)}")
+    return PropertyVerdict(False, f"can never fire: {', '.join(idle)}")
 
 
-def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None) -> Verdict:
+def _live(
+    space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None
+) -> PropertyVerdict:
     names = space.net.transitions
     for found in _hunted(space.net, hunt):
-        return Verdict(
+        return PropertyVerdict(
             False,
             "a dead marking is reachable (found by stubborn sets)",
             found.witness,
@@ -358,10 +369,10 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
     if len(space.dead) and names:
         first = int(space.dead[0])
         reason = f"nothing can fire any more in {space.net.describe(space.marking(first))}"
-        return Verdict(False, reason, witness(space, first), complete=space.complete)
+        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     useless = [name for name, level in zip(names, levels, strict=True) if level == 0]
     if useless and not space.complete:
-        return Verdict(
+        return PropertyVerdict(
             False,
             f"can never fire: {', '.join(useless)} (by the coverability tree)",
             complete=False,
@@ -370,7 +381,7 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
         return _unknown(space)
     lost = [t for t, level in enumerate(levels) if level != 4]
     if not lost:
-        return Verdict(
+        return PropertyVerdict(
             True, "from every marking every transition can fire again", assumption=FAIRNESS
         )
     ours = graph.components[space.source]
@@ -382,15 +393,15 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
             reason = (
                 f"after {space.net.describe(space.marking(first))} never again: {', '.join(never)}"
             )
-            return Verdict(False, reason, witness(space, first))
+            return PropertyVerdict(False, reason, witness(space, first))
     raise AssertionError("a transition that is not live is missing in some bottom component")
 
 
-def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
+def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> PropertyVerdict:
     if not space.complete:
         for found in _hunted(space.net, hunt):
             if found.witness.firings:
-                return Verdict(
+                return PropertyVerdict(
                     False,
                     "a dead marking never returns to the start",
                     found.witness,
@@ -399,7 +410,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
         stuck = space.dead[space.dead > 0]
         if len(stuck):
             first = int(stuck[0])
-            return Verdict(
+            return PropertyVerdict(
                 False,
                 "a dead marking never returns to the start",
                 witness(space, first),
@@ -408,7 +419,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
         return _unknown(space)
     away = np.flatnonzero(~graph.backward([0]))
     if not len(away):
-        return Verdict(
+        return PropertyVerdict(
             True, "the initial marking can be reached again from everywhere", assumption=FAIRNESS
         )
     first = int(away[0])
@@ -416,7 +427,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
         f"from {space.net.describe(space.marking(first))} the initial marking is never "
         "reached again"
     )
-    return Verdict(False, reason, witness(space, first))
+    return PropertyVerdict(False, reason, witness(space, first))
 
 
 def _home_states(space: Space, graph: Graph) -> int | None:
@@ -426,7 +437,9 @@ def _home_states(space: Space, graph: Graph) -> int | None:
     return int((graph.components == bottoms[0]).sum()) if len(bottoms) == 1 else 0
 
 
-def _sound(space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...]) -> Verdict:
+def _sound(
+    space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...]
+) -> PropertyVerdict:
     """Sound: from every marking an end is reached, nothing goes on at an end, and every transition
     is of use."""
     busy = np.flatnonzero(ends[: space.expanded] & (np.diff(space.row[: space.expanded + 1]) > 0))
@@ -437,19 +450,19 @@ def _sound(space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...
             f"left over at the end {space.net.describe(space.marking(first))}: "
             f"{goes_on} can still fire"
         )
-        return Verdict(False, reason, witness(space, first), complete=space.complete)
+        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     if not space.complete:
         return _unknown(space)
     lost = np.flatnonzero(~graph.backward(ends))
     if len(lost):
         first = int(lost[0])
         reason = f"from {space.net.describe(space.marking(first))} no designed end can be reached"
-        return Verdict(False, reason, witness(space, first))
+        return PropertyVerdict(False, reason, witness(space, first))
     useless = [t for t, level in zip(space.net.transitions, levels, strict=True) if level == 0]
     if useless:
-        return Verdict(False, f"of no use, never fires: {', '.join(useless)}")
+        return PropertyVerdict(False, f"of no use, never fires: {', '.join(useless)}")
     reason = (
         "an end can be reached from everywhere, nothing is left over there, every "
         "transition is of use"
     )
-    return Verdict(True, reason, assumption=FAIRNESS)
+    return PropertyVerdict(True, reason, assumption=FAIRNESS)

@@ -32,7 +32,7 @@ from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask
 from petrobot.coordinator.analysis.net.qualitative import FAIRNESS, witness
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import Lyapunov, lyapunov
-from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.task.net import Marking
 
 
@@ -60,8 +60,8 @@ class Recovery:
     """What follows an error exit. Counts and verdicts are over all markings just after it."""
 
     error_exit: str
-    possible: Verdict
-    almost_sure: Verdict
+    possible: PropertyVerdict
+    almost_sure: PropertyVerdict
     kappa: int | None
     """Further errors that are survived for certain; None: any number. -1 if G is not even reached
     without any."""
@@ -76,16 +76,16 @@ class Recovery:
 class RobotVerdicts:
     """The three notions for one closed net."""
 
-    stable: Verdict
+    stable: PropertyVerdict
     lyapunov: Lyapunov | None
-    attracted: Verdict
+    attracted: PropertyVerdict
     recoveries: tuple[Recovery, ...]
-    controllable: Verdict
+    controllable: PropertyVerdict
     unforced: tuple[str, ...]
     """Action places that cannot be forced to start from everywhere."""
 
 
-def one_run_each(space: Space, places: Sequence[str]) -> Verdict:
+def one_run_each(space: Space, places: Sequence[str]) -> PropertyVerdict:
     """Whether no action place is entered while its run goes on: each of `places` holds one token at
     most (design: 1-safe)."""
     for name in places:
@@ -96,13 +96,13 @@ def one_run_each(space: Space, places: Sequence[str]) -> Verdict:
                 f"{name} is entered while its run still goes on: {shown.marking[name]} "
                 "tokens, one run at a time"
             )
-            return Verdict(False, reason, shown, complete=space.complete)
+            return PropertyVerdict(False, reason, shown, complete=space.complete)
     if not space.complete:
-        return Verdict(None, f"the search stopped: {space.reason}", complete=False)
-    return Verdict(True, "no action place is entered while its run goes on")
+        return PropertyVerdict(None, f"the search stopped: {space.reason}", complete=False)
+    return PropertyVerdict(True, "no action place is entered while its run goes on")
 
 
-def all_returned(space: Space, final: Mask, resources: Sequence[str]) -> Verdict:
+def all_returned(space: Space, final: Mask, resources: Sequence[str]) -> PropertyVerdict:
     """Whether every resource place holds at each final marking what it began with: none was lost,
     none appeared."""
     for name in resources:
@@ -116,13 +116,13 @@ def all_returned(space: Space, final: Mask, resources: Sequence[str]) -> Verdict
             left = shown.marking.get(name, 0)
             word = "lost" if left < began else "made"
             reason = f"{name} is {word} on the way: {began} at the beginning, {left} at the end"
-            return Verdict(False, reason, shown, complete=space.complete)
+            return PropertyVerdict(False, reason, shown, complete=space.complete)
     if not space.complete:
-        return Verdict(None, f"the search stopped: {space.reason}", complete=False)
-    return Verdict(True, "every resource is there again at the end, none was lost or made")
+        return PropertyVerdict(None, f"the search stopped: {space.reason}", complete=False)
+    return PropertyVerdict(True, "every resource is there again at the end, none was lost or made")
 
 
-class Flow:
+class SpaceWithRoles:
     """A complete space seen through its roles: masks over markings and edges."""
 
     def __init__(self, space: Space, roles: Roles) -> None:
@@ -170,10 +170,12 @@ def judge(space: Space, roles: Roles, open_space: Space | None = None) -> RobotV
     `space` is that of the closed net, in which progress is judged; `open_space` that of the net
     itself (by default the same), which gives kappa and the Lyapunov function.
     """
-    flow = Flow(space, roles)
+    flow = SpaceWithRoles(space, roles)
     open_space = open_space or space
     alone = (
-        Flow(open_space, replace(roles, renewals=frozenset())) if open_space is not space else flow
+        SpaceWithRoles(open_space, replace(roles, renewals=frozenset()))
+        if open_space is not space
+        else flow
     )
     function = lyapunov(open_space.net)
     attracted = _attracted(flow)
@@ -188,7 +190,7 @@ def judge(space: Space, roles: Roles, open_space: Space | None = None) -> RobotV
     )
 
 
-def _stable(space: Space, function: Lyapunov | None, attracted: Verdict) -> Verdict:
+def _stable(space: Space, function: Lyapunov | None, attracted: PropertyVerdict) -> PropertyVerdict:
     if attracted.holds is False:
         return attracted
     if function is not None:
@@ -197,7 +199,7 @@ def _stable(space: Space, function: Lyapunov | None, attracted: Verdict) -> Verd
             for p, w in function.weights.items()
         )
         how = "stays the same" if function.conserved else "never grows"
-        return Verdict(
+        return PropertyVerdict(
             True,
             f"{terms} {how}, and the nominal flow is always reached again",
             assumption=attracted.assumption,
@@ -206,10 +208,10 @@ def _stable(space: Space, function: Lyapunov | None, attracted: Verdict) -> Verd
         "bounded from this initial marking (not from every one), and the nominal flow "
         "is always reached again"
     )
-    return Verdict(True, reason, assumption=attracted.assumption)
+    return PropertyVerdict(True, reason, assumption=attracted.assumption)
 
 
-def _attracted(flow: Flow) -> Verdict:
+def _attracted(flow: SpaceWithRoles) -> PropertyVerdict:
     space, components = flow.space, flow.graph.components
     met = np.zeros(len(flow.graph.bottom), dtype=np.bool_)
     met[components[flow.nominal]] = True
@@ -218,16 +220,16 @@ def _attracted(flow: Flow) -> Verdict:
         reason = (
             "wherever the task ends up for good, it passes through the nominal flow again and again"
         )
-        return Verdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIRNESS)
     first = int(np.argmax(lost[components]))
     reason = (
         "the task can get caught for good outside its nominal flow: "
         f"{space.net.describe(space.marking(first))}"
     )
-    return Verdict(False, reason, witness(space, first))
+    return PropertyVerdict(False, reason, witness(space, first))
 
 
-def recoveries(flow: Flow, alone: Flow | None = None) -> tuple[Recovery, ...]:
+def recoveries(flow: SpaceWithRoles, alone: SpaceWithRoles | None = None) -> tuple[Recovery, ...]:
     """Every error exit that can occur, in transition order; kappa and strategy from `alone`, the
     flow of the open net."""
     alone = alone or flow
@@ -243,7 +245,7 @@ def recoveries(flow: Flow, alone: Flow | None = None) -> tuple[Recovery, ...]:
     return tuple(found)
 
 
-def _outside(flow: Flow) -> Mask:
+def _outside(flow: SpaceWithRoles) -> Mask:
     """Markings of bottom components that never meet G."""
     components = flow.graph.components
     met = np.zeros(len(flow.graph.bottom), dtype=np.bool_)
@@ -253,8 +255,8 @@ def _outside(flow: Flow) -> Mask:
 
 
 def _recovery(
-    flow: Flow,
-    alone: Flow,
+    flow: SpaceWithRoles,
+    alone: SpaceWithRoles,
     name: str,
     edges: Index,
     nested: list[Mask],
@@ -282,7 +284,9 @@ def _recovery(
     )
 
 
-def _kappa(alone: Flow, name: str, nested: list[Mask]) -> tuple[int | None, tuple[str, ...]]:
+def _kappa(
+    alone: SpaceWithRoles, name: str, nested: list[Mask]
+) -> tuple[int | None, tuple[str, ...]]:
     """(index of an error exit, shortest way back inside the set that it guarantees)."""
     edges = np.flatnonzero(alone.fires(frozenset({name})))
     first = edges[alone.nominal[alone.space.source[edges]]]
@@ -297,14 +301,14 @@ def _kappa(alone: Flow, name: str, nested: list[Mask]) -> tuple[int | None, tupl
     return kappa, tuple(alone.space.net.transitions[alone.space.label[e]] for e in path)
 
 
-def _every(flow: Flow, edges: Index, good: Mask, yes: str, no: str) -> Verdict:
+def _every(flow: SpaceWithRoles, edges: Index, good: Mask, yes: str, no: str) -> PropertyVerdict:
     bad = edges[~good[flow.space.target[edges]]]
     if not len(bad):
-        return Verdict(True, yes, assumption=FAIRNESS)
+        return PropertyVerdict(True, yes, assumption=FAIRNESS)
     edge = int(bad[0])
     shown = _through(flow.space, edge)
     after = flow.space.net.describe(flow.space.marking(int(flow.space.target[edge])))
-    return Verdict(False, f"{no} to the nominal flow from {after}", shown)
+    return PropertyVerdict(False, f"{no} to the nominal flow from {after}", shown)
 
 
 def _through(space: Space, edge: int) -> Witness:
@@ -318,7 +322,7 @@ def _through(space: Space, edge: int) -> Witness:
     return Witness((*before, space.net.transitions[int(space.label[edge])]), marked)
 
 
-def _resumed(flow: Flow, after: Index) -> bool | None:
+def _resumed(flow: SpaceWithRoles, after: Index) -> bool | None:
     """Whether from every marking after the error a goal can be met before a new run is taken or the
     task is renewed."""
     if not flow.roles.goals or not flow.roles.run_starts:
@@ -330,7 +334,7 @@ def _resumed(flow: Flow, after: Index) -> bool | None:
     return bool(flow.graph.backward(before_goal, same_run)[after].all())
 
 
-def _controllable(flow: Flow) -> tuple[Verdict, tuple[str, ...]]:
+def _controllable(flow: SpaceWithRoles) -> tuple[PropertyVerdict, tuple[str, ...]]:
     """Whether every action can be forced to start from every reachable marking."""
     unforced, first = [], None
     nowhere = np.zeros(flow.graph.n, dtype=np.bool_)
@@ -344,30 +348,32 @@ def _controllable(flow: Flow) -> tuple[Verdict, tuple[str, ...]]:
             "from every reachable marking each action can be forced to start by the "
             "starts and the operator's means"
         )
-        return Verdict(True, reason, assumption=FAIRNESS), ()
+        return PropertyVerdict(True, reason, assumption=FAIRNESS), ()
     place, i = first
     reason = (
         f"from {flow.space.net.describe(flow.space.marking(i))} nothing forces {place} "
         "to start ever again"
     )
-    return Verdict(False, reason, witness(flow.space, i), assumption=FAIRNESS), tuple(unforced)
+    return PropertyVerdict(False, reason, witness(flow.space, i), assumption=FAIRNESS), tuple(
+        unforced
+    )
 
 
-def legal_exits(space: Space, roles: Roles, legal: Callable[[Marking], bool]) -> Verdict:
+def legal_exits(space: Space, roles: Roles, legal: Callable[[Marking], bool]) -> PropertyVerdict:
     """Whether no uncontrollable transition leads from a legal marking to an illegal one
     (controllability of the legal set)."""
-    flow = Flow(space, roles)
+    flow = SpaceWithRoles(space, roles)
     inside = space.where(legal)
     leaving = np.flatnonzero(inside[space.source] & ~inside[space.target] & ~flow.free)
     if not len(leaving):
-        return Verdict(
+        return PropertyVerdict(
             True,
             "only controllable transitions leave the legal markings, and these can be withheld",
         )
     edge = int(leaving[0])
     name = space.net.transitions[int(space.label[edge])]
     before = space.net.describe(space.marking(int(space.source[edge])))
-    return Verdict(
+    return PropertyVerdict(
         False,
         f"{name} leaves the legal markings from {before} and cannot be withheld",
         _through(space, edge),

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.explore import (
-    Engine,
+    ExplorationEngine,
     Explored,
     IntegerEngine,
     Labels,
@@ -38,7 +38,7 @@ little."""
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class SearchLimits:
     """When a search stops early; None means without limit.
 
     `memory` is in bytes and counts what the engine itself holds. `seconds` needs a `clock` (s),
@@ -169,7 +169,7 @@ def explore(
     net: Net,
     *,
     engine: EngineName = "auto",
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
     edges: bool = True,
     bounds: Sequence[int | None] | None = None,
 ) -> Space:
@@ -181,7 +181,7 @@ def explore(
     Raises TooManyTokens if the initial marking has such a place and ImportError if numba is asked
     for and not installed.
     """
-    limits = limits or Limits()
+    limits = limits or SearchLimits()
     started = limits.clock() if limits.clock else 0.0
     if engine in ("auto", "integers"):
         layout = Layout.for_net(net, bounds, NARROW)
@@ -208,14 +208,14 @@ INTERRUPTED = "interrupted"
 """Reason of a search that Ctrl-C ended."""
 
 
-def _plain_engine(net: Net, layout: Layout, edges: bool) -> Engine:
+def _plain_engine(net: Net, layout: Layout, edges: bool) -> ExplorationEngine:
     return IntegerEngine(Explored.start(net, layout, edges))
 
 
 _HAND_OVER = "hand over"
 
 
-def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> Engine:
+def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> ExplorationEngine:
     """An engine of machine words that goes on from what was begun, in a layout as narrow as is
     known to suffice."""
     seen = begun.layout.unpack_many(begun.words).max(axis=0).tolist()
@@ -242,7 +242,9 @@ def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> 
     return NumpyEngine(begun)
 
 
-def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> str:
+def _run(
+    engine: ExplorationEngine, limits: SearchLimits, started: float, budget: int | None
+) -> str:
     """Expand until done; gives the reason why it stopped early, or an empty text. Lets
     KeyboardInterrupt through."""
     cap = min((n for n in (limits.states, budget) if n is not None), default=None)

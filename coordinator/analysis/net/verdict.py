@@ -27,7 +27,7 @@ class Witness:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class PropertyVerdict:
     """`holds` is True, False or None (unknown); `reason` says why in words for people.
 
     `assumption` is what it takes for the verdict on the ordinary net to hold for the executed task

@@ -15,7 +15,7 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import Plan, solve
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import Generator, poisson_weights
 
 
@@ -25,7 +25,7 @@ class Completion:
 
     chain: Chain
     goal: Mask
-    plan: Plan = field(repr=False)
+    plan: SolveOrder = field(repr=False)
     h: Values = field(repr=False)
     """Probability of completing, from each marking."""
     y: Values = field(repr=False)
@@ -54,7 +54,7 @@ class Completion:
 def completion(chain: Chain, goal: Mask) -> Completion:
     """Time and probability of reaching a marking of `goal` (shape (n,)) for the first time."""
     inside = chain.graph.backward(goal) & ~goal
-    plan = Plan.of(chain.graph, inside)
+    plan = SolveOrder.of(chain.graph, inside)
     open_ = inside[chain.source]
     value = np.where(open_ & inside[chain.target], chain.probability, 0.0)
     direct = open_ & goal[chain.target]
@@ -89,7 +89,7 @@ LOOK = 16
 
 
 @dataclass(frozen=True)
-class Law:
+class CompletionTime:
     """The distribution of the time to completion: after k uniform jumps at `rate` the goal is
     reached with absorbed[k]."""
 
@@ -118,7 +118,9 @@ class Law:
         return 0.5 * (low + high)
 
 
-def law(chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000) -> Law:
+def completion_time(
+    chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000
+) -> CompletionTime:
     """The law of the time to completion. `left` is the share of completing runs still under way
     where it is cut off.
 
@@ -141,7 +143,7 @@ def law(chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000
             )
         p = made.matrix @ p
         absorbed.append(float(p[reached].sum()))
-    return Law(made.rate, np.array(absorbed), whole.probability)
+    return CompletionTime(made.rate, np.array(absorbed), whole.probability)
 
 
 def _open_edges(

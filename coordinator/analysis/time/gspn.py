@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, sum_by
-from petrobot.coordinator.analysis.net.space import Limits, Space, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
 from petrobot.coordinator.task.net import Marking, Net
 
 Values = NDArray[np.float64]
@@ -160,7 +160,7 @@ class Chain:
         gspn: Gspn,
         *,
         space: Space | None = None,
-        limits: Limits | None = None,
+        limits: SearchLimits | None = None,
         absorbing: Callable[[Marking], bool] | None = None,
     ) -> Chain:
         """The chain behind a GSPN; its space is explored unless given.

@@ -29,7 +29,7 @@ class NotConverged(ArithmeticError):  # noqa: N818 - a fact about an iteration
 
 
 @dataclass(frozen=True)
-class Plan:
+class SolveOrder:
     """The order in which the components of a graph are solved: successors first. Built once, used
     for many sides."""
 
@@ -39,7 +39,7 @@ class Plan:
     numbers."""
 
     @classmethod
-    def of(cls, graph: Graph, inside: Mask | None = None) -> Plan:
+    def of(cls, graph: Graph, inside: Mask | None = None) -> SolveOrder:
         """The plan for the vertices marked `inside` (all by default); others count as known
         zeros."""
         keep = np.ones(graph.n, dtype=np.bool_) if inside is None else inside
@@ -92,7 +92,7 @@ def _split(
     return waves
 
 
-def solve(plan: Plan, value: Values, b: Values) -> Values:
+def solve(plan: SolveOrder, value: Values, b: Values) -> Values:
     """x = b + A x with A given by `value` on the plan's edges; b and x have shape (n,) or (n,
     k)."""
     graph = plan.graph

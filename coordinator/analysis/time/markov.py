@@ -18,7 +18,7 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Graph, Index, sum_by
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import Plan, solve, stationary
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def visits_before(chain: Chain, transient: Any, start: Values | None = None) -> 
     begin[0] = 1.0
     inside = transient[chain.source[order]] & transient[chain.target[order]]
     value = np.where(inside, chain.probability[order], 0.0)
-    return solve(Plan.of(backward, transient), value, begin if start is None else start)
+    return solve(SolveOrder.of(backward, transient), value, begin if start is None else start)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ STAGES = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Branch:
+class ErlangBranch:
     """With `probability`, `stages` exponential phases of `rate` (1/s) one after the other."""
 
     probability: float
@@ -33,7 +33,7 @@ class PhaseType:
     """A duration: `shift` (s) and then one of the branches. A Markov chain can only hold laws with
     shift 0."""
 
-    branches: tuple[Branch, ...]
+    branches: tuple[ErlangBranch, ...]
     shift: float = 0.0
 
     @property
@@ -104,13 +104,15 @@ def fit(mean: float, variance: float, *, stages: int = STAGES, shift: float = 0.
     cv2 = variance / rest**2
     if cv2 > 1:
         p = 0.5 * (1 + sqrt((cv2 - 1) / (cv2 + 1)))
-        return PhaseType((Branch(p, 1, 2 * p / rest), Branch(1 - p, 1, 2 * (1 - p) / rest)), shift)
+        return PhaseType(
+            (ErlangBranch(p, 1, 2 * p / rest), ErlangBranch(1 - p, 1, 2 * (1 - p) / rest)), shift
+        )
     wanted = ceil(1 / cv2 - 1e-9) if cv2 * stages >= 1 else stages
     if cv2 * stages < 1 or abs(cv2 * wanted - 1) < 1e-9:
-        return PhaseType((Branch(1.0, wanted, wanted / rest),), shift)
+        return PhaseType((ErlangBranch(1.0, wanted, wanted / rest),), shift)
     p = (wanted * cv2 - sqrt(wanted * (1 + cv2) - wanted**2 * cv2)) / (1 + cv2)
     rate = (wanted - p) / rest
-    return PhaseType((Branch(p, wanted - 1, rate), Branch(1 - p, wanted, rate)), shift)
+    return PhaseType((ErlangBranch(p, wanted - 1, rate), ErlangBranch(1 - p, wanted, rate)), shift)
 
 
 def fit_samples(

@@ -27,7 +27,7 @@ Stop = Callable[[Tokens], Mask]
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class IntervalEstimate:
     """A simulated number with its confidence interval."""
 
     mean: float
@@ -35,7 +35,7 @@ class Estimate:
     high: float
 
     @classmethod
-    def of(cls, sample: Values, confidence: float) -> Estimate:
+    def of(cls, sample: Values, confidence: float) -> IntervalEstimate:
         """Normal interval for the mean of independent observations."""
         mean = float(sample.mean())
         if len(sample) < 2:
@@ -44,7 +44,7 @@ class Estimate:
         return cls(mean, mean - half, mean + half)
 
     @classmethod
-    def share(cls, hits: int, n: int, confidence: float) -> Estimate:
+    def share(cls, hits: int, n: int, confidence: float) -> IntervalEstimate:
         """Wilson interval for a probability."""
         z, p = _z(confidence), hits / n
         middle, half = p + z * z / (2 * n), z * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
@@ -74,10 +74,10 @@ class Simulation:
 
     replicas: int
     firings: int
-    throughput: dict[str, Estimate]
-    mean_tokens: dict[str, Estimate]
-    completed: Estimate | None
-    time: Estimate | None
+    throughput: dict[str, IntervalEstimate]
+    mean_tokens: dict[str, IntervalEstimate]
+    completed: IntervalEstimate | None
+    time: IntervalEstimate | None
     """Mean time to the goal of the replicas that reached it (s)."""
     times: Values
     """Their times, sorted (s)."""
@@ -251,10 +251,13 @@ def _summed(
         replicas,
         fired,
         {
-            name: Estimate.of(row, confidence)
+            name: IntervalEstimate.of(row, confidence)
             for name, row in zip(net.transitions, rates, strict=True)
         },
-        {name: Estimate.of(row, confidence) for name, row in zip(net.places, tokens, strict=True)},
+        {
+            name: IntervalEstimate.of(row, confidence)
+            for name, row in zip(net.places, tokens, strict=True)
+        },
         None,
         None,
         np.zeros(0),
@@ -347,10 +350,10 @@ class _Play:
         judged = self.count - len(self.alive)
         return replace(
             bare,
-            completed=Estimate.share(len(times), judged, confidence)
+            completed=IntervalEstimate.share(len(times), judged, confidence)
             if self.goal is not None and judged
             else None,
-            time=Estimate.of(times, confidence) if len(times) else None,
+            time=IntervalEstimate.of(times, confidence) if len(times) else None,
             times=times,
         )
 

@@ -18,10 +18,15 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.net.space import Limits
-from petrobot.coordinator.analysis.time.completion import Completion, Law, completion, law
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time.completion import (
+    Completion,
+    CompletionTime,
+    completion,
+    completion_time,
+)
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import Plan, solve
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.sensitivity import (
     Slope,
@@ -119,7 +124,7 @@ class Forecast:
         value = np.where(open_ & self.transient[self.chain.target], self.chain.probability, 0.0)
         direct = open_ & self.done.goal[self.chain.target]
         arrive = sum_by(self.chain.source[direct], self.chain.probability[direct], self.chain.n)
-        return float(solve(Plan.of(self.chain.graph, self.transient), value, arrive)[0])
+        return float(solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)[0])
 
     @property
     def _spoiling(self) -> list[int]:
@@ -215,7 +220,7 @@ class Forecast:
         inside = self.transient[chain.source]
         value = np.where(inside & self.transient[chain.target], chain.probability, 0.0)
         gain = sum_by(chain.source, np.where(inside & hits, chain.probability, 0.0), chain.n)
-        g = solve(Plan.of(chain.graph, self.transient), value, gain)
+        g = solve(SolveOrder.of(chain.graph, self.transient), value, gain)
         ahead = np.where(self.transient[chain.target], g[chain.target], 0.0)
         by_edge = self.flow * (hits + ahead - g[chain.source])
         return slopes_of(chain, by_edge, float(g[0]))
@@ -232,13 +237,13 @@ class Forecast:
         able = (back.h > 0) & ~nominal
         return float(np.max(back.y[able] / back.h[able], initial=0.0))
 
-    def law(self) -> Law:
+    def completion_time(self) -> CompletionTime:
         """The distribution of the time to completion."""
-        return law(self.chain, self.done.goal)
+        return completion_time(self.chain, self.done.goal)
 
     def to_json(self, quantiles: tuple[float, ...] = (0.5, 0.9, 0.99)) -> dict[str, Any]:
         """Plain data. Quantiles take a pass of uniformisation; give none to leave them out."""
-        shape = self.law() if quantiles and self.completion_probability > 0 else None
+        shape = self.completion_time() if quantiles and self.completion_probability > 0 else None
         return {
             "P_complete": self.completion_probability,
             "R_goal": self.goal_reliability,
@@ -260,7 +265,7 @@ class Forecast:
         }  # fmt: skip
 
 
-def forecast(view: StochasticView, *, limits: Limits | None = None) -> Forecast:
+def forecast(view: StochasticView, *, limits: SearchLimits | None = None) -> Forecast:
     """Solve a stochastic view. Raises ValueError if its space is not complete within the limits
     (simulate instead)."""
     chain = Chain.of(view.gspn, limits=limits)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.stochastic import Measured
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
@@ -43,32 +43,32 @@ class Change:
         """As it is written."""
         return f"{'.'.join(self.subject)}={self.value:g}"
 
-    def fault(self, problem: str, remedy: str = FORM) -> FormatError:
+    def fault(self, problem: str, remedy: str = FORM) -> NetFileError:
         """The error about this change."""
-        return FormatError("what if", self.text, problem, remedy)
+        return NetFileError("what if", self.text, problem, remedy)
 
     def count(self) -> int:
-        """The value as a number of tokens. Raises FormatError."""
+        """The value as a number of tokens. Raises NetFileError."""
         if self.value < 0 or self.value != int(self.value):
             raise self.fault("tokens are counted", "give a whole number, 0 or more")
         return int(self.value)
 
 
 def read_change(text: str) -> Change:
-    """A change from its text. Raises FormatError."""
+    """A change from its text. Raises NetFileError."""
     subject, sign, value = text.partition("=")
     try:
         number = float(value)
     except ValueError:
         number = float("nan")
     if not sign or not subject.strip() or not abs(number) < float("inf"):
-        raise FormatError("what if", text, "no change of one number", FORM)
+        raise NetFileError("what if", text, "no change of one number", FORM)
     return Change(tuple(part.strip() for part in subject.split(".")), number)
 
 
 def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tuple[Task, Measured]:
     """The task with other tokens, and what is known of its runs with other estimates. Raises
-    FormatError."""
+    NetFileError."""
     runs: Runs = dict(measured.runs)
     for change in changes:
         if len(change.subject) == 1:
@@ -127,7 +127,7 @@ def _altered(
 
 
 def change_net(net: Net, changes: Sequence[Change]) -> Net:
-    """The net with other initial tokens. Raises FormatError."""
+    """The net with other initial tokens. Raises NetFileError."""
     initial = list(net.initial)
     for change in changes:
         name = ".".join(change.subject)
@@ -142,7 +142,7 @@ def _rates_hint(name: str) -> str:
 
 
 def change_gspn(gspn: Gspn, changes: Sequence[Change]) -> Gspn:
-    """The GSPN with other initial tokens, rates and weights. Raises FormatError."""
+    """The GSPN with other initial tokens, rates and weights. Raises NetFileError."""
     for change in changes:
         name, _, key = ".".join(change.subject).rpartition(".")
         try:
@@ -152,7 +152,7 @@ def change_gspn(gspn: Gspn, changes: Sequence[Change]) -> Gspn:
                 gspn = gspn.changed(**{f"{key}s": {name: change.value}})
             else:
                 gspn = replace(gspn, net=change_net(gspn.net, [change]))
-        except FormatError:
+        except NetFileError:
             raise
         except ValueError as error:
             raise change.fault(str(error)) from error
