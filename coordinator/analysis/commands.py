@@ -1,8 +1,7 @@
-"""What the commands analyse, simulate, convert and show --graph do, as plain functions: (exit code,
-text, plain data).
+"""The commands analyse, simulate, convert and show --graph as functions: exit code, text, data.
 
-Paths of tasks are opened by the caller (`load_task`), since this room knows tasks, not task files.
-Clocks and random seeds come from the caller, too.
+The caller passes `load_task`, because this package knows tasks but not task files. Clocks and
+random generators come from the caller as well.
 """
 
 from __future__ import annotations
@@ -52,17 +51,17 @@ LoadTask = Callable[[Path], Task]
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """What a command gives back."""
+    """The result of a command: exit code, text for the terminal, plain data."""
 
     code: int
     text: str
     data: dict[str, Any]
     analysis: Analysis | None = None
-    """What `analyse` found, for pictures of its witnesses."""
+    """The analysis itself, to draw its witnesses; only from `analyse_command`."""
 
 
 def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
-    """A task (`.toml`) or a net file. Raises NetFileError, and whatever `load_task` raises."""
+    """Open a task (`.toml`) or a net file. Raises NetFileError and the errors of `load_task`."""
     return load_task(path) if path.suffix == ".toml" else read_net(path)
 
 
@@ -78,12 +77,11 @@ def analyse_command(
     structure: bool = True,
     changes: Sequence[str] = (),
 ) -> CommandResult:
-    """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for
-    bad input.
+    """Run `petrobot analyse`: code 0 if `Analysis.ok`, 1 if not (or unknown), 2 for bad input.
 
-    `rates` is a rates file, or "unit". Without a `view` a net with rates, given here or found in
-    its file, is analysed as "gspn", all else as "ordinary". `changes` (see `whatif`) are judged
-    beside the file as it is: the code and the text are those of what would be.
+    `rates` is a rates file, or "unit". Without a `view`, a net with rates (passed here or in its
+    file) is analysed as "gspn", everything else as "ordinary". `changes` (see `whatif`) are
+    compared with the file as it is; code and text are those of the changed model.
     """
     try:
         model = open_model(path, load_task)
@@ -97,8 +95,16 @@ def analyse_command(
             tokens = plain and (
                 change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain
             )
-            return analyse(one, name=name or path.stem, view=view, measured=measured, stages=stages, limits=limits,
-                           engine=engine, ordinary=tokens)  # fmt: skip
+            return analyse(
+                one,
+                name=name or path.stem,
+                view=view,
+                measured=measured,
+                stages=stages,
+                limits=limits,
+                engine=engine,
+                ordinary=tokens,
+            )
 
         now = found(subject, None)
         then = found(*altered) if altered else now
@@ -119,7 +125,7 @@ def analyse_command(
 
 
 def _view(model: Task | NetFile, rates: Path | str | None) -> str:
-    """What is asked for where nobody says: numbers wherever there are rates."""
+    """Return the default view: "gspn" for a net with rates, else "ordinary"."""
     return (
         "gspn"
         if isinstance(model, NetFile) and (rates is not None or model.gspn is not None)
@@ -128,7 +134,7 @@ def _view(model: Task | NetFile, rates: Path | str | None) -> str:
 
 
 def _named(path: Path, error: Exception) -> str:
-    """What is wrong, with the file's name once: readers of files name it themselves."""
+    """Return the error message, prefixed by the file unless the message names it already."""
     told = str(error)
     return (
         told
@@ -138,13 +144,15 @@ def _named(path: Path, error: Exception) -> str:
 
 
 def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
-    """The changes that concern tokens."""
+    """Return the changes that concern tokens."""
     return [change for change in changes if ".".join(change.subject) in net.place_index]
 
 
 def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
-    """The analysis with its data and text; Ctrl-C leaves out what the arcs alone say, then the
-    numbers."""
+    """Return the analysis with its data and text.
+
+    Structure and forecast are computed only now, so Ctrl-C may arrive here: then both are left out.
+    """
     try:
         return found, found.to_json(structure=structure), [found.text()]
     except KeyboardInterrupt:
@@ -166,7 +174,7 @@ def _changed(subject: Subject, changes: Sequence[Change]) -> tuple[Subject, Meas
 
 
 def _compared(now: Analysis, then: Analysis) -> list[str]:
-    """A table of what a change alters: verdicts, then numbers."""
+    """Return a table of what the changes alter: verdicts, then numbers."""
     words = {True: "yes", False: "NO", None: "unknown"}
     rows = [
         (name.replace("_", " "), words[before.holds], words[after.holds])
@@ -184,7 +192,7 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
 def _subject(
     model: Task | NetFile, rates: Path | str | None, view: str
 ) -> tuple[Subject, str, tuple[str, ...]]:
-    """(what to analyse, its name, notes)."""
+    """Return (what to analyse, its name, notes). Raises NetFileError for rates that do not fit."""
     if isinstance(model, Task):
         if rates is not None:
             remedy = (
@@ -204,7 +212,10 @@ def _subject(
         return model.net, model.name, model.notes
     if model.gspn is None:
         raise NetFileError(
-            model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit"
+            model.name or "net",
+            "rates",
+            "the file has none",
+            "give --rates FILE, or --rates unit",
         )
     return model.gspn, model.name, model.notes
 
@@ -230,8 +241,10 @@ def simulate_command(
     changes: Sequence[str] = (),
     progress: Callable[[int, float], None] | None = None,
 ) -> CommandResult:
-    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed
-    there); `changes` as `whatif`."""
+    """Run `petrobot simulate`: a task until it is final or dead, a net until `horizon` (s).
+
+    A net needs a horizon; for a task it is optional. `changes` as in `whatif`.
+    """
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         if isinstance(model, Task):
@@ -240,15 +253,23 @@ def simulate_command(
             view = stochastic_view(model, measured, stages=stages, timer_stages=stages)
             ends = OrdinaryView(model)
             goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
-            seen = simulate(view.gspn, random, replicas=replicas, horizon=horizon or np.inf, warmup=warmup, goal=goal,
-                            firings=firings, progress=progress)  # fmt: skip
+            seen = simulate(
+                view.gspn,
+                random,
+                replicas=replicas,
+                horizon=horizon or np.inf,
+                warmup=warmup,
+                goal=goal,
+                firings=firings,
+                progress=progress,
+            )
             return _simulated(model.name, seen, view.assumptions)
         subject, name, notes = _subject(model, rates, "gspn")
         assert isinstance(subject, Gspn)
         gspn = change_gspn(subject, wanted)
         if horizon is None:
             raise NetFileError(
-                str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS"
+                str(path), "horizon", "a net has no final marking", "give --horizon SECONDS"
             )
         seen = simulate(
             gspn,
@@ -264,7 +285,7 @@ def simulate_command(
         told = (
             _named(path, error)
             if not isinstance(error, MemoryError)
-            else f"{path}: out of memory: fewer --replicas"
+            else f"{path}: out of memory; use fewer --replicas"
         )
         return CommandResult(BAD_INPUT, told, {"error": told})
 
@@ -284,7 +305,7 @@ def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> CommandRe
     }
     lines = [
         f"{name}: {seen.replicas} replicas, {seen.firings} firings"
-        + ("" if seen.complete else " (cut short)")
+        + ("" if seen.complete else " (stopped early)")
     ]
     if seen.completed is not None:
         data["completed"] = plain(seen.completed)
@@ -310,8 +331,7 @@ def _interval(one: IntervalEstimate) -> str:
 def convert_command(
     source: Path, target: Path, load_task: LoadTask, *, stages: int = 8
 ) -> CommandResult:
-    """`petrobot convert`: read one format, write another by the ending; what the target cannot keep
-    is listed."""
+    """Run `petrobot convert`: formats follow from the file endings; losses are listed."""
     try:
         model = open_model(source, load_task)
         if isinstance(model, Task):
@@ -336,8 +356,10 @@ def convert_command(
 
 
 def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]]:
-    """A task as a net file: its stochastic view where rates are needed (.drn), else its ordinary
-    net."""
+    """Return a task as a net file, and what is lost.
+
+    For `.drn` this is its stochastic view, because that format needs rates; else its ordinary net.
+    """
     if target.suffix == ".drn":
         view = stochastic_view(task, stages=stages, timer_stages=stages)
         return NetFile(view.gspn.net, task.name, view.gspn), list(view.assumptions)
@@ -346,7 +368,7 @@ def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]
 
 
 def net_file_of(task: Task) -> NetFile:
-    """The ordinary net of a task with its labels and positions."""
+    """Return the ordinary net of a task with its labels and positions."""
     flat = task.flat
     positions: dict[str, tuple[float, float]] = {}
     labels: dict[str, str] = {}
@@ -366,8 +388,10 @@ def graph_command(
     witness: tuple[str, ...] | None = None,
     limits: SearchLimits | None = None,
 ) -> CommandResult:
-    """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the
-    first deadlock's witness."""
+    """Run `petrobot show --graph`: the reachability graph as SVG in data["svg"].
+
+    By default the path to the first deadlock is highlighted.
+    """
     try:
         model = open_model(path, load_task)
         net, final = model.net, None
@@ -388,5 +412,5 @@ def graph_command(
 
 
 def limited(limits: SearchLimits, progress: Callable[[int, int], None]) -> SearchLimits:
-    """The same limits with a progress callback (markings found, markings expanded)."""
+    """Return the limits with a progress callback (markings found, markings expanded)."""
     return replace(limits, progress=progress)

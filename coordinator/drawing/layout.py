@@ -1,11 +1,13 @@
-"""Layers along the flow of tokens: circles cut, every node in a column, arcs as steps from column
-to column.
+"""Positions of nodes: given ones are kept, missing ones come from layers along the token flow.
 
-The method is that of Sugiyama, Tagawa and Toda (IEEE Trans. SMC 11, 1981): an arc over several
-columns is led by a way point in each column between, which takes part in the ordering like a node.
+Layered drawing after K. Sugiyama, S. Tagawa, M. Toda, Methods for visual understanding of
+hierarchical system structures, IEEE Trans. SMC 11 (1981), in four steps:
 
-Where the nodes stand: given positions are kept, missing ones come from layers along the flow of
-tokens.
+1. Reverse arcs that close a cycle.
+2. Put every node into a column, so that all arcs lead to the right.
+3. Give an arc over several columns a way point in each column between, and order each column so
+   that few arcs cross.
+4. Choose heights that make arcs as level as the minimum distances allow.
 """
 
 from __future__ import annotations
@@ -20,16 +22,20 @@ Edge = tuple[str, str]
 WayPoint = tuple[str, str, int]
 """A way point of an arc: its two ends and its column."""
 Spot = str | WayPoint
+"""What takes up room in a column: a node, by its name, or a way point."""
 HUB = 14
-"""A node with more arcs than this is a hub: its long arcs are not led but run straight to it."""
+"""A node with more arcs than this is a hub: its long arcs get no way points and run straight,
+because so many way points would push the columns apart."""
 _SWEEPS = 10
+"""Sweeps over the columns for each starting order."""
 _TIGHTENINGS = 12
+"""Passes that move nodes closer to their neighbours' columns."""
 
 
 class Layers:
     """Columns of nodes and way points, in an order with few crossings.
 
-    `next` and `before` are the steps between columns; every spot that is led has them.
+    `next` and `before` hold the neighbours of each spot in the columns to its right and left.
     """
 
     def __init__(self, names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> None:
@@ -51,8 +57,8 @@ class Layers:
                 self._lead((a, b))
         self._order()
 
-    def way(self, a: str, b: str) -> list[WayPoint]:
-        """The way points of an arc from a to b, in its own direction."""
+    def way_points(self, a: str, b: str) -> list[WayPoint]:
+        """Return the way points of an arc from a to b, in its own direction."""
         columns = range(self.column[a] + 1, self.column[b])
         points = [(a, b, c) for c in columns]
         if self.column[a] > self.column[b]:
@@ -66,7 +72,7 @@ class Layers:
     def _lead(self, edge: Edge) -> None:
         a, b = edge
         last: Spot = a
-        for point in self.way(a, b):
+        for point in self.way_points(a, b):
             self._add(point, point[2])
             self._join(last, point)
             last = point
@@ -77,7 +83,11 @@ class Layers:
         self.before[b].append(a)
 
     def _order(self) -> None:
-        """Of orders that begin differently, the one with the fewest crossings."""
+        """Try four starts and keep the order with the fewest crossings.
+
+        The barycentre heuristic ends in local optima, so it starts from the given and the reversed
+        order, and from the left and from the right.
+        """
         best, fewest = [list(c) for c in self.columns], self.crossings()
         for start in ([list(c) for c in self.columns], [c[::-1] for c in self.columns]):
             for first in (0, 1):
@@ -90,8 +100,7 @@ class Layers:
         self.columns = best
 
     def _sweep(self, forward: bool) -> None:
-        """Sort by the mean of neighbours, column by column, then exchange neighbours where that
-        helps."""
+        """Sort each column by the mean row of its neighbours (barycentre), then swap neighbours."""
         inward, columns = (
             (self.before, self.columns[1:]) if forward else (self.next, self.columns[-2::-1])
         )
@@ -108,7 +117,7 @@ class Layers:
         column.sort(key=lambda s: mean[s])
 
     def _exchange(self) -> None:
-        """Exchange neighbours in a column as long as that takes crossings away."""
+        """Swap neighbours in a column as long as that removes crossings."""
         for _ in range(4):
             better = False
             row = self._rows()
@@ -123,7 +132,7 @@ class Layers:
                 return
 
     def _gain(self, a: Spot, b: Spot, row: Mapping[Spot, int]) -> int:
-        """How many crossings go when b stands before a."""
+        """Return how many crossings disappear if b comes before a."""
         gain = 0
         for side in (self.before, self.next):
             for m in side[a]:
@@ -135,7 +144,7 @@ class Layers:
         return {spot: i for column in self.columns for i, spot in enumerate(column)}
 
     def crossings(self) -> int:
-        """Crossings of steps between neighbouring columns."""
+        """Count the crossings between neighbouring columns: the inversions among the arcs' ends."""
         row = self._rows()
         total = 0
         for column in self.columns[:-1]:
@@ -151,8 +160,7 @@ class Layers:
 def without_circles(
     names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
 ) -> list[Edge]:
-    """The edges without those that lead back to a node on the way (depth first, without
-    recursion)."""
+    """Return the edges except those that close a cycle (depth-first search without recursion)."""
     following: dict[str, list[str]] = {n: [] for n in names}
     for a, b in edges:
         following[a].append(b)
@@ -178,14 +186,17 @@ def without_circles(
 
 
 def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
-    """Columns by the longest way from the beginnings, then each node as near to its neighbours as
-    it can be."""
+    """Return the column of each node.
+
+    First its longest distance from a node without incoming edges. Then each node moves towards the
+    side on which it has more neighbours, as far as its edges allow, which shortens arcs.
+    """
     before: dict[str, list[str]] = {n: [] for n in names}
     after: dict[str, list[str]] = {n: [] for n in names}
     for a, b in edges:
         before[b].append(a)
         after[a].append(b)
-    column = _longest_ways(names, before, after)
+    column = _longest_paths(names, before, after)
     for _ in range(_TIGHTENINGS):
         moved = False
         for name in names:
@@ -200,7 +211,7 @@ def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
     return column
 
 
-def _longest_ways(
+def _longest_paths(
     names: Sequence[str], before: Mapping[str, Sequence[str]], after: Mapping[str, Sequence[str]]
 ) -> dict[str, int]:
     column = dict.fromkeys(names, 0)
@@ -225,13 +236,13 @@ _BESIDE_NODE = 58.0
 _BESIDE_ARC = 24.0
 _SETTLINGS = 20
 _STRAIGHT = (1.0, 3.0, 9.0)
-"""How much a step wants to be level: between nodes, from a node to a way point, between way
-points."""
+"""Weights of level arcs: between nodes, from a node to a way point, between way points. Bends
+between way points look worst, so these weigh most."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodePositions:
-    """A position for every node, and the points by which arcs over several columns are led."""
+    """A position for every node, and the points through which long arcs run."""
 
     at: Mapping[str, Point]
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
@@ -240,8 +251,12 @@ class NodePositions:
 def lay_out(
     wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]
 ) -> NodePositions:
-    """A position for every node. `sources` are the nodes from which the flow begins (the marked
-    places)."""
+    """Return a position for every node.
+
+    If at least half of the positions are given, they are kept and the others are filled in next to
+    their neighbours; else all nodes are placed in layers, starting from `sources` (the marked
+    places).
+    """
     given = {name: at for name, at in wanted.items() if at is not None}
     if len(given) == len(wanted):
         return NodePositions(given)
@@ -253,7 +268,7 @@ def lay_out(
 def _fill_in(
     names: Sequence[str], given: Mapping[str, Point], edges: Sequence[Edge]
 ) -> dict[str, Point]:
-    """The missing nodes near their neighbours, each at the next free spot."""
+    """Place the missing nodes near their neighbours, each at the nearest free spot."""
     at = dict(given)
     for name in names:
         if name not in at:
@@ -272,7 +287,7 @@ def _fill_in(
 
 
 def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
-    """The nearest spot around the centre that keeps its distance from all others."""
+    """Return the nearest spot around the centre that is far enough from all others."""
     ring = 0
     while True:
         spots = [
@@ -302,16 +317,15 @@ def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
     return NodePositions(
         {name: at(name, layers.column[name]) for name in names},
         {
-            (a, b): [at(p, p[2]) for p in layers.way(a, b)]
+            (a, b): [at(p, p[2]) for p in layers.way_points(a, b)]
             for a, b in edges
-            if all(p in row for p in layers.way(a, b))
+            if all(p in row for p in layers.way_points(a, b))
         },
     )
 
 
 def _settled(layers: Layers) -> dict[Spot, float]:
-    """Heights: every spot as level with its neighbours as its distance from those above and below
-    it allows."""
+    """Return the height of every spot: level with its neighbours as far as distances allow."""
     row: dict[Spot, float] = {}
     for column in layers.columns:
         heights = [0.0]
@@ -331,7 +345,7 @@ def _apart(above: Spot, below: Spot) -> float:
 
 
 def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float, float]:
-    """Where a spot would stand by its neighbours, and how much it wants that."""
+    """Return the mean height of the neighbours of a spot, and the weight of that wish."""
     steps = [
         (row[n], _STRAIGHT[isinstance(spot, tuple) + isinstance(n, tuple)])
         for n in (*layers.before[spot], *layers.next[spot])
@@ -341,8 +355,12 @@ def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float,
 
 
 def _spaced(column: Sequence[Spot], wishes: Sequence[tuple[float, float]]) -> list[float]:
-    """The heights nearest to the wishes (least squares) that keep distance: pooled adjacent
-    violators on shifted wishes."""
+    """Return the heights closest to the wishes (least squares) that keep the minimum distances.
+
+    Subtracting the minimum distances turns the task into isotonic regression, which the
+    pool-adjacent-violators algorithm solves exactly: neighbours in the wrong order are merged into
+    a pool with their weighted mean.
+    """
     offset = [0.0]
     for above, below in pairwise(column):
         offset.append(offset[-1] + _apart(above, below))

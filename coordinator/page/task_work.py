@@ -1,7 +1,7 @@
 """Work on task files that may take long for a large net, as plain functions of plain data: open,
 save, check, convert.
 
-The page's server has all of it done in a process of its own (`coordinator.analysing.Apart`), in the
+The page's server has all of it done in a process of its own (`coordinator.background.BackgroundProcess`), in the
 names of `WORKS`.
 """
 

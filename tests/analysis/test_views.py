@@ -1,5 +1,5 @@
-"""The two views of a task: what each keeps, numbers in closed form, and the shipped tasks with
-broken variants."""
+"""Ordinary and stochastic view of a task: what each keeps, closed forms, shipped and broken
+tasks."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ EXPONENTIAL = {
 def action(
     name: str, estimates: dict[Status, Estimate] | None = None, **more: Any
 ) -> dict[str, Any]:
-    """Primitive task and action place of one name."""
+    """Return a primitive task and an action place of the same name."""
     known = EXPONENTIAL if estimates is None else estimates
     primitive = PrimitiveTask(
         name, f"{name} is done", more.pop("alternatives", ("a",)), 10.0, estimates=known
@@ -117,12 +117,12 @@ def test_preselection_gives_the_mean_of_the_mixture() -> None:
     assert done.probability == pytest.approx(1.0)
     assert done.mean == pytest.approx((0.7 * 2 + 0.2 * 3 + 0.1 * 4) / 0.9)
     assert view.fit_errors["act.a.success"] == pytest.approx(0.0, abs=1e-9)
-    assert any("declared estimates" in text for text in view.assumptions)
+    assert any("estimates declared in the task file" in text for text in view.assumptions)
 
 
 def test_measured_runs_choices_and_no_declared_estimates() -> None:
     task = one_step(estimates={}, alternatives=("slow", "fast"))
-    with pytest.raises(NoEstimate, match="no run of slow was measured"):
+    with pytest.raises(NoEstimate, match="duration of slow is unknown"):
         stochastic_view(task)
     runs = {
         ("act", "slow"): {Status.SUCCESS: Estimate(1.0, 4.0)},
@@ -136,8 +136,8 @@ def test_measured_runs_choices_and_no_declared_estimates() -> None:
 
 
 def test_a_preempting_event_races_with_the_run() -> None:
-    """P(event first) = mean / (mean + wait) for one exponential run; what is left of the run
-    vanishes."""
+    """P(event first) = mean / (mean + wait) for one exponential run; the rest of the run is
+    flushed."""
     task = one_step(estimates={Status.SUCCESS: Estimate(1.0, 2.0, 1.0)})
     caught = Transition(
         "caught", (taken("act", End.PREEMPT, Counts.SUCCESS),), (Output("done"),), events=("hit",)
@@ -162,8 +162,9 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert fixed.mean == pytest.approx(3 * (1 - np.exp(-2 / 3)), rel=5e-3)
 
 
-def test_a_timer_is_set_back_when_its_transition_is_disabled() -> None:
-    """A token bounces between waiting and away; the timer of 1 s only counts unbroken waiting."""
+def test_a_timer_is_reset_when_its_transition_is_disabled() -> None:
+    """A token moves between waiting and away; the timer of 1 s counts only uninterrupted
+    waiting."""
     task = task_of(
         [],
         [Place("wait", Kind.CONTROL, 1), Place("away", Kind.CONTROL), Place("done", Kind.CONTROL)],
@@ -185,7 +186,7 @@ def test_a_timer_is_set_back_when_its_transition_is_disabled() -> None:
     assert once.mean == pytest.approx((1 / 3 + 2 / 3 * 0.1) * 3)
 
 
-def test_servers_let_runs_go_on_side_by_side_and_the_others_queue() -> None:
+def test_servers_run_in_parallel_and_other_runs_queue() -> None:
     def mean(servers: int) -> float:
         steps = action("act", {Status.SUCCESS: Estimate(1.0, 1.0)}, servers=servers)
         task = task_of(
@@ -229,7 +230,7 @@ def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() ->
     ].probability == pytest.approx(0.9)
 
 
-def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
+def test_unknown_numbers_are_refused_with_a_remedy() -> None:
     task = one_step()
     waits = replace(
         task,
@@ -250,8 +251,8 @@ def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
 
 @st.composite
 def tasks(draw: st.DrawFn) -> Task:
-    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors, timers
-    and events."""
+    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors,
+    timers and events."""
     names = [f"a{i}" for i in range(draw(st.integers(1, 3)))]
     controls = [
         Place(
@@ -309,7 +310,7 @@ def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: 
 
 @settings(max_examples=60, deadline=None)
 @given(tasks())
-def test_tokens_of_action_places_are_runs_that_go_on_or_have_ended(task: Task) -> None:
+def test_tokens_of_action_places_are_active_or_finished_runs(task: Task) -> None:
     view = stochastic_view(task, stages=2, timer_stages=2)
     space = explore(view.gspn.net, limits=SearchLimits(states=800))
     index = view.gspn.net.place_index
@@ -320,7 +321,7 @@ def test_tokens_of_action_places_are_runs_that_go_on_or_have_ended(task: Task) -
             assert (own == parts).all()
 
 
-def test_the_operators_hand_is_there_on_request() -> None:
+def test_operator_transitions_are_added_on_request() -> None:
     task = one_step()
     task = replace(task, places={**task.places, "idle": replace(task.places["idle"], capacity=2)})
     view = OrdinaryView(task, operator=True)
@@ -411,8 +412,7 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
 
 
 def with_variable(initial: bool | None) -> Task:
-    """A run of `look` writes `seen`; its normal exits ask for it; a second look is only for what
-    was not seen."""
+    """A run of `look` writes `seen`, its normal exits read it; a second look needs `not seen`."""
     task = task_of(
         [action("look", out={"seen": "seen"})],
         [
@@ -468,7 +468,7 @@ def test_other_conditions_are_dropped_and_too_many_variables_refused() -> None:
     assert "hit" in view.net.transitions
     many = {f"v{i}": Variable(f"v{i}", VariableType.BOOL, False) for i in range(9)}
     wide = replace(task.transitions["hit"], when=parse(" and ".join(many)))
-    with pytest.raises(ValueError, match="9 boolean variables"):
+    with pytest.raises(ValueError, match="got 9"):
         boolean_view(
             replace(
                 task,

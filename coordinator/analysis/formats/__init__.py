@@ -1,5 +1,4 @@
-"""Net files by their endings: read any known one, write any that can be written, list what gets
-lost on the way."""
+"""Net files by their endings: read, write, and list what the written format cannot keep."""
 
 from __future__ import annotations
 
@@ -18,17 +17,17 @@ READ: dict[str, Callable[[bytes, str], NetFile]] = {
     ".pnpro": parse_pnpro,
     ".net": lambda text, file: tina.parse_tina(_utf8(text, file), file),
 }
-"""Readers by ending: `.xml` is what PIPE writes (PNML). An XML file says its encoding itself."""
+"""Readers by ending. `.xml` is PNML as PIPE writes it. Bytes, because XML declares its encoding."""
 WRITE = (".pnml", ".net", ".dot", ".drn")
 """Endings that can be written."""
 
 
 def read_net(path: Path) -> NetFile:
-    """The net in a file. Raises NetFileError, also for a file that cannot be opened."""
+    """Read the net in a file. Raises NetFileError, also for a file that cannot be opened."""
     reader = READ.get(path.suffix.lower())
     if reader is None:
         raise NetFileError(
-            str(path), "file", f"{path.suffix or 'no'} ending", f"known are {', '.join(READ)}"
+            str(path), "file", f"{path.suffix or 'no'} ending", f"expected one of {', '.join(READ)}"
         )
     try:
         text = path.read_bytes()
@@ -47,8 +46,10 @@ def _utf8(text: bytes, file: str) -> str:
 
 
 def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
-    """(text of the net in the format of the target's ending, what that format does not keep).
-    Raises NetFileError."""
+    """Return (the net as text, what is lost) in the format of the target's ending.
+
+    Raises NetFileError.
+    """
     match target.suffix.lower():
         case ".pnml":
             return pnml.write_pnml(model), pnml.losses(model)
@@ -59,7 +60,7 @@ def written(model: NetFile, target: Path) -> tuple[str, list[str]]:
         case ".drn":
             if model.gspn is None:
                 raise NetFileError(
-                    str(target), "rates", "the net has none", "give rates: a CTMC needs them"
+                    str(target), "rates", "the net has none", "give rates; a CTMC needs them"
                 )
             return exports.write_drn(Chain.of(model.gspn)), [
                 "the net itself: only its chain is written"

@@ -1,9 +1,7 @@
-"""Graphviz DOT out: a net, or its reachability graph.
+"""Formats that are only written: Graphviz DOT, and DRN for the model checker Storm.
 
-A chain for Storm: the explicit DRN format of a CTMC over tangible markings, labelled by the
-places that are marked.
-
-Source: Storm's documentation of its explicit input, DRN (direct encoding).
+DOT shows a net or its reachability graph. DRN ("direct encoding", see Storm's documentation of its
+explicit input) holds the chain of a GSPN over its tangible markings as a CTMC.
 """
 
 from __future__ import annotations
@@ -21,7 +19,8 @@ def _quoted(text: str) -> str:
 
 
 def write_dot(model: NetFile) -> str:
-    """A net: circles with tokens, bars (filled if immediate), inhibitor arcs with a round head."""
+    """Return a net as DOT: circles, boxes (filled if immediate), inhibitor arcs with a round
+    head."""
     net = model.net
     lines = [f"digraph {_quoted(model.name or 'net')} {{", "  rankdir=LR;"]
     for p, name in enumerate(net.places):
@@ -57,8 +56,7 @@ def _weight(weight: int, more: str = "") -> str:
 
 
 def write_space_dot(space: Space) -> str:
-    """A reachability graph: markings as nodes (the initial one bold, dead ones filled), edges
-    labelled by transitions."""
+    """Return a reachability graph as DOT: the initial marking bold, dead markings filled."""
     dead = set(space.dead.tolist())
     lines = ["digraph markings {"]
     for i in range(len(space)):
@@ -74,14 +72,14 @@ def write_space_dot(space: Space) -> str:
 
 
 def write_drn(chain: Chain) -> str:
-    """The DRN text of a chain whose initial marking is tangible. Raises NetFileError otherwise.
+    """Return the DRN text of a chain. Raises NetFileError if its initial marking is vanishing.
 
-    Labels are `init`, `deadlock`, and the name of each marked place with everything but letters,
-    digits and _ replaced.
+    States are labelled `init`, `deadlock`, and with the name of each marked place, in which
+    everything but letters, digits and _ is replaced by _.
     """
     if chain.vanishing[0]:
-        remedy = "give the first transition a rate: a CTMC begins in one marking that lasts"
-        raise NetFileError("drn", "init", "the initial marking vanishes at once", remedy)
+        remedy = "a CTMC starts in a tangible marking; give the first transition a rate"
+        raise NetFileError("drn", "init", "the initial marking is vanishing", remedy)
     made = Generator.of(chain)
     rates = (made.matrix.T * made.rate).tocsr()
     marked = np.stack(

@@ -1,9 +1,8 @@
-"""GreatSPN editor projects (`.pnpro`) in: one GSPN with constants, inhibitor arcs, servers and
-priorities.
+"""Reader of GreatSPN editor projects (`.pnpro`): one GSPN with constants, inhibitors and servers.
 
-The attribute `delay` of a transition of type EXP is a rate (1/s), in spite of its name. Without
-`nservers` a timed transition has as many servers as it is enabled times. Deterministic and general
-transitions are refused.
+In spite of its name, the attribute `delay` of a transition of type EXP is a rate (1/s). Without
+`nservers` a timed transition has unlimited servers. Deterministic and general transitions are
+refused.
 """
 
 from __future__ import annotations
@@ -20,19 +19,22 @@ from petrobot.coordinator.analysis.formats.netfile import (
 )
 
 DRAWN = {"text-box", "group", "point"}
-"""Elements that only matter to a drawing."""
+"""Elements that matter only for a drawing."""
 
 
 def parse_pnpro(text: str | bytes, file: str = "pnpro") -> NetFile:
-    """The net of a project. Raises NetFileError."""
+    """Read the net of a project. Raises NetFileError."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise NetFileError(file, "XML", str(error), "the file is cut short or no XML") from error
+        raise NetFileError(file, "XML", str(error), "the file is incomplete or not XML") from error
     nets = list(root.iter("gspn"))
     if root.tag != "project" or len(nets) != 1:
         raise NetFileError(
-            file, root.tag, f"{len(nets)} GSPNs in it", "save a project with exactly one GSPN"
+            file,
+            root.tag,
+            f"expected one GSPN, found {len(nets)}",
+            "save a project with exactly one GSPN",
         )
     (net,) = nets
     draft, positions = NetDraft(file), dict[str, tuple[float, float]]()
@@ -45,9 +47,7 @@ def parse_pnpro(text: str | bytes, file: str = "pnpro") -> NetFile:
         elif node.tag == "transition":
             _transition(draft, node, names)
         elif node.tag not in ("gspn", "nodes", "edges", "arc", "constant", "template", *DRAWN):
-            raise NetFileError(
-                file, node.tag, "an element of unknown meaning", "only plain GSPNs are read"
-            )
+            raise NetFileError(file, node.tag, "unknown element", "only plain GSPNs are read")
     for i, node in enumerate(net.iter("arc")):
         _arc(draft, node, f"arc {i}", names)
     result = draft.net()

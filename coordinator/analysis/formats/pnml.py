@@ -1,17 +1,15 @@
-"""PNML in: ISO/IEC 15909-2 place/transition nets with pages and reference nodes, and what tools
-write beyond the standard.
+"""Reader and writer of PNML (ISO/IEC 15909-2): place/transition nets, pages, reference nodes.
 
-Beyond it: inhibitor and test arcs in the notations of the special-arcs extension and ProM
-(`arctype`), PIPE, TINA, GreatSPN and Storm (`type value`), TAPAAL and Romeo (`type` attribute), and
-as tool-specific data; PIPE's `Default,1`, rates, timed flags, servers and priorities; our own
-tool-specific data. An arc of unknown kind is refused, never taken for a normal one.
+The reader also accepts what tools write beyond the standard: inhibitor and test arcs as in the
+special-arcs extension and ProM (`arctype`), PIPE, TINA, GreatSPN and Storm (`type value`), TAPAAL
+and Romeo (`type` attribute), or in tool-specific data; PIPE's `Default,1`, rates, timed flags,
+servers and priorities; our own tool-specific data. An arc of an unknown kind is refused, never read
+as a normal one.
 
-PNML out. A net that came from a PNML file goes back into its own tree: pages, graphics,
-tool-specific data and names stay.
-
-The standard has no inhibitors, capacities, priorities or rates: inhibitor arcs are written as
-`<type value="inhibitor"/>`, which the most tools read, and the rest as our tool-specific data,
-which every tool may ignore. `losses` lists what a tool that reads the standard alone would miss.
+A net that was read from PNML is written back into its own XML tree, so pages, graphics and the data
+of other tools stay. The standard has no inhibitors, capacities, priorities or rates: inhibitor arcs
+are written as `<type value="inhibitor"/>`, which most tools read, and the rest as our tool-specific
+data, which other tools ignore. `losses` lists what a tool would miss that reads only the standard.
 """
 
 from __future__ import annotations
@@ -50,18 +48,20 @@ PLACE_TRANSITION = (
 
 
 def local(element: Element) -> str:
-    """An element's tag without its namespace; empty for comments and instructions."""
+    """Return the tag of an element without its namespace; "" for comments and instructions."""
     return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
 
 
 def children(element: Element, tag: str) -> Iterator[Element]:
-    """Children with a local tag."""
+    """Yield the children with this tag, in any namespace."""
     return (child for child in element if local(child) == tag)
 
 
 def nodes(net: Element) -> Iterator[Element]:
-    """The objects of a net and of its pages, however deep. What else holds such tags (final
-    markings, tool-specific data, unfoldings) is none of them.
+    """Yield the objects of a net and of its pages at any depth.
+
+    The same tags also occur elsewhere (final markings, tool-specific data, unfoldings); those are
+    not objects of the net.
     """
     for child in net:
         if local(child) == "page":
@@ -77,8 +77,7 @@ def nodes(net: Element) -> Iterator[Element]:
 
 
 def label(element: Element, tag: str) -> str | None:
-    """Text of a label child (`<tag><text>..` or PIPE's `<tag><value>..`), None if there is no such
-    child."""
+    """Return the text of a label (`<tag><text>..` or PIPE's `<tag><value>..`), or None."""
     for child in children(element, tag):
         for inner in child:
             if local(inner) in ("text", "value"):
@@ -88,7 +87,7 @@ def label(element: Element, tag: str) -> str | None:
 
 
 def own_data(element: Element) -> dict[str, str]:
-    """Our tool-specific data of an element."""
+    """Return our tool-specific data of an element."""
     for data in children(element, "toolspecific"):
         if data.get("tool") == TOOL:
             return {local(item): (item.text or "").strip() for item in data if local(item)}
@@ -99,12 +98,12 @@ ENTITY = re.compile(r"<!ENTITY", re.IGNORECASE)
 
 
 def parse_pnml(text: str | bytes, file: str = "PNML") -> NetFile:
-    """The net in a PNML text. Raises NetFileError."""
+    """Read the net in a PNML text. Raises NetFileError."""
     root = _tree(text, file)
     nets = [root] if local(root) == "net" else list(children(root, "net"))
     if len(nets) != 1:
         problem = f"{len(nets)} nets" if nets else "no <net>"
-        raise NetFileError(file, "pnml", problem, "a file holds one net here: split it")
+        raise NetFileError(file, "pnml", problem, "expected one net per file; split it")
     (net,) = nets
     kind = (net.get("type") or "").strip().lower()
     if kind and not any(kind.rstrip("/").endswith(known) for known in PLACE_TRANSITION):
@@ -122,21 +121,21 @@ def _tree(text: str | bytes, file: str) -> Element:
         raise NetFileError(
             file,
             "XML",
-            "a PNML file that defines entities",
-            "they can grow without bound: write them out",
+            "the file defines XML entities",
+            "replace them by their text (nested entities could exhaust the memory)",
         )
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     try:
         parser.feed(text)
         root = parser.close()
     except ElementTree.ParseError as error:
-        raise NetFileError(file, "XML", str(error), "the file is cut short or no XML") from error
+        raise NetFileError(file, "XML", str(error), "the file is incomplete or not XML") from error
     assert isinstance(root, Element)
     return root
 
 
 class _PnmlReading:
-    """One net being read."""
+    """Reads one net: places, transitions, references, then arcs, which need the others."""
 
     def __init__(self, net: Element, file: str) -> None:
         self.element, self.file = net, file
@@ -156,7 +155,7 @@ class _PnmlReading:
             self._arc(node)
 
     def result(self, root: Element) -> NetFile:
-        """The file with everything read."""
+        """Return everything that was read. Raises NetFileError."""
         net = self.draft.net()
         if self.draft.rates and self.untimed:
             for name in self.untimed:
@@ -173,8 +172,8 @@ class _PnmlReading:
 
     def _id(self, node: Element) -> str:
         name = node.get("id")
-        if not name:  # an empty one names nothing either
-            raise NetFileError(self.file, local(node), "it has no id", "every node of PNML has one")
+        if not name:  # missing or empty
+            raise NetFileError(self.file, local(node), "it has no id", "every node needs one")
         return name
 
     def _common(self, node: Element, name: str) -> None:
@@ -196,14 +195,14 @@ class _PnmlReading:
         self._common(node, name)
 
     def _capacity(self, node: Element, name: str) -> int | None:
-        """A place's capacity; PIPE writes 0 for an unlimited one."""
+        """Return the capacity of a place; PIPE writes 0 for an unlimited one."""
         own = own_data(node).get("capacity")
         if own is not None:
             return self._count(f"capacity of {name}", own)
         return self._count(f"capacity of {name}", label(node, "capacity") or "0") or None
 
     def _count(self, element: str, text: str) -> int:
-        """A number, also as PIPE writes it: `Default,2` or `Default,2,Red,0`."""
+        """Return a number, also as PIPE writes it: `Default,2` or `Default,2,Red,0`."""
         parts = [part.strip() for part in text.split(",")]
         if len(parts) > 1:
             pairs = list(zip(parts[::2], parts[1::2], strict=False))
@@ -248,7 +247,7 @@ class _PnmlReading:
         )
         if timed is not None and self.draft.transitions[name]:
             self.draft.notes.append(
-                f"transition {name}: the priority of a timed transition has no effect in a GSPN"
+                f"transition {name}: a priority has no effect on a timed transition of a GSPN"
             )
             self.draft.transitions[name] = 0
 
@@ -257,7 +256,7 @@ class _PnmlReading:
             return float(text)
         except ValueError as error:
             raise NetFileError(
-                self.file, element, f"{text!r} is no number", "write a rate in 1/s"
+                self.file, element, f"expected a number, got {text!r}", "write a rate in 1/s"
             ) from error
 
     def _arc(self, node: Element) -> None:
@@ -276,20 +275,20 @@ class _PnmlReading:
         self.draft.arc(source, target, self._count(element, inscription), kind, element)
 
     def _resolved(self, name: str, element: str) -> str:
-        """The node behind a chain of references."""
+        """Return the node at the end of a chain of references."""
         seen = {name}
         while name in self.references:
             name = self.references[name]
             if name in seen:
                 raise NetFileError(
-                    self.file, element, f"the references around {name!r} go round in a circle"
+                    self.file, element, f"the references around {name!r} form a circle"
                 )
             seen.add(name)
         return name
 
 
 def arc_kind(node: Element, file: str, element: str) -> str:
-    """normal, inhibitor or test. Raises NetFileError for any other kind."""
+    """Return the kind: normal, inhibitor or test. Raises NetFileError for any other."""
     said = [node.get("type", ""), node.get("arctype", ""), node.get("kind", "")]
     for tag in ("type", "arctype", "arcType"):
         for child in children(node, tag):
@@ -310,7 +309,7 @@ def arc_kind(node: Element, file: str, element: str) -> str:
 
 
 def _tool_specific_kinds(data: Element) -> Iterator[str]:
-    """Arc kinds told inside tool-specific data: `<inhibitor/>`, `<type>inhibitor</type>`,
+    """Yield arc kinds inside tool-specific data: `<inhibitor/>`, `<type>inhibitor</type>`,
     `type="inhibitor"`."""
     for inner in data.iter():
         name = local(inner).lower()
@@ -333,21 +332,21 @@ Arc = tuple[str, str, str]
 
 
 def losses(model: NetFile) -> list[str]:
-    """What a reader of the bare standard would miss."""
+    """Return what a reader of the bare standard would miss."""
     net, out = model.net, []
     if any(net.inhibit):
-        out.append("inhibitor arcs are no part of ISO PNML: written as <type value='inhibitor'/>")
+        out.append("inhibitor arcs are not part of ISO PNML: written as <type value='inhibitor'/>")
     if any(c is not None for c in net.capacity):
-        out.append("capacities are no part of ISO PNML: written as tool-specific data")
+        out.append("capacities are not part of ISO PNML: written as tool-specific data")
     if len(set(net.priority)) > 1:
-        out.append("priorities are no part of ISO PNML: written as tool-specific data")
+        out.append("priorities are not part of ISO PNML: written as tool-specific data")
     if model.gspn is not None:
-        out.append("rates and weights are no part of ISO PNML: written as tool-specific data")
+        out.append("rates and weights are not part of ISO PNML: written as tool-specific data")
     return out
 
 
 def write_pnml(model: NetFile) -> str:
-    """The PNML text of a net."""
+    """Return the PNML text of a net."""
     root = deepcopy(model.document) if model.document is not None else _fresh(model)
     _PnmlWriting(root, model).update()
     namespace = root.tag[1:].partition("}")[0] if root.tag.startswith("{") else ""
@@ -373,14 +372,14 @@ def _fresh(model: NetFile) -> Element:
 
 
 def _pages(net: Element) -> Iterator[Element]:
-    """The net and its pages, however deep: whatever holds nodes and arcs."""
+    """Yield the net and its pages at any depth: everything that contains nodes and arcs."""
     yield net
     for page in children(net, "page"):
         yield from _pages(page)
 
 
 class _PnmlWriting:
-    """A tree brought in line with a net."""
+    """Updates an XML tree to match a net, and leaves everything else in it alone."""
 
     def __init__(self, root: Element, model: NetFile) -> None:
         self.root, self.model, self.net = root, model, model.net
@@ -397,7 +396,7 @@ class _PnmlWriting:
         }
 
     def update(self) -> None:
-        """Remove what the net no longer has, set what it has, add what is new."""
+        """Remove what the net no longer has, set what it has, and add what is new."""
         self._drop_missing()
         known = {
             node.get("id"): node
@@ -455,8 +454,8 @@ class _PnmlWriting:
         return node
 
     def _set(self, node: Element, tag: str, text: str | None) -> None:
-        """Set a label in the form that it already has in the file (`text` or `value`), else as the
-        standard says."""
+        """Set a label in the form it already has in the file (`text` or `value`), else as
+        `text`."""
         if text is None:
             return
         for child in children(node, tag):

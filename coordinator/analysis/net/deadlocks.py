@@ -1,15 +1,16 @@
-"""Minimal siphons and traps by branch and bound on bit sets.
+"""Deadlocks without the full state space: siphons and traps, and a search by stubborn sets.
 
-A siphon is a set of places that, once empty, stays empty: whatever puts a token in also takes one
-out. A trap is a set that, once marked, stays marked. Arc weights, inhibitors, capacities and
-priorities do not enter.
+*Siphons and traps.* A siphon is a set of places that stays empty once it is empty, because every
+transition that puts a token into it also takes one out. A trap is a set that stays marked once it
+is marked. If every siphon of an ordinary net contains an initially marked trap, no marking is dead
+(Commoner's condition; T. Murata, Proc. IEEE 77, 1989, section VI). Arc weights, inhibitors,
+capacities and priorities are not considered.
 
-A fast hunt for deadlocks: at each marking only a stubborn set of transitions is followed.
-
-Every dead marking of the net is also reached through stubborn sets, mostly along far fewer
-markings. Source: A. Valmari, Stubborn sets for reduced state space generation (1991). Whether one
-transition can disable another is judged by arcs alone: it takes what the other needs, or gives what
-the other's inhibitor or capacity forbids.
+*Stubborn sets.* At each marking the search follows only a stubborn set of transitions. It reaches
+every dead marking of the net, usually through far fewer markings. Source: A. Valmari, Stubborn sets
+for reduced state space generation, Advances in Petri Nets 1990, LNCS 483 (1991). Whether one
+transition can disable another is decided by their arcs alone: it takes tokens that the other needs,
+or adds tokens where the other has an inhibitor or a capacity.
 """
 
 from __future__ import annotations
@@ -21,29 +22,29 @@ from petrobot.coordinator.analysis.net.pack import effect, thresholds
 from petrobot.coordinator.task.net import Marking, Net
 
 SIPHON_EFFORT = 5_000
-"""Branches looked at before the enumeration gives up."""
+"""Branches after which the enumeration of siphons or traps gives up."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceSets:
-    """Minimal sets of places; all of them if `complete`."""
+    """Minimal sets of places, by place number; all of them if `complete`."""
 
     sets: tuple[frozenset[int], ...]
     complete: bool
 
 
 def minimal_siphons(net: Net, effort: int = SIPHON_EFFORT) -> PlaceSets:
-    """All minimal non-empty siphons, as far as the effort goes."""
+    """Return the minimal non-empty siphons found within `effort` branches."""
     return _closed_sets(net, _masks(net, "consume"), _masks(net, "produce"), effort)
 
 
 def minimal_traps(net: Net, effort: int = SIPHON_EFFORT) -> PlaceSets:
-    """All minimal non-empty traps: siphons of the net with all arcs turned round."""
+    """Return the minimal non-empty traps: the siphons of the net with all arcs reversed."""
     return _closed_sets(net, _masks(net, "produce"), _masks(net, "consume"), effort)
 
 
 def largest_trap(net: Net, within: frozenset[int]) -> frozenset[int]:
-    """The largest trap inside a set of places (may be empty)."""
+    """Return the largest trap inside a set of places (may be empty)."""
     inside = set(within)
     while True:
         leaks = {
@@ -59,8 +60,10 @@ def largest_trap(net: Net, within: frozenset[int]) -> frozenset[int]:
 
 
 def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
-    """The largest siphon without a token in the marking (may be empty): its places can never be
-    marked again."""
+    """Return the largest siphon without a token in the marking (may be empty).
+
+    Its places can never be marked again.
+    """
     inside = {p for p, n in enumerate(marking) if not n}
     while True:
         fed = {
@@ -78,11 +81,11 @@ def empty_siphon(net: Net, marking: Marking) -> frozenset[int]:
 def controlled_siphons(
     net: Net, effort: int = SIPHON_EFFORT, found: PlaceSets | None = None
 ) -> bool | None:
-    """Whether every minimal siphon contains a trap marked initially (Commoner's condition); None if
-    effort ran out.
+    """Return whether every minimal siphon contains an initially marked trap (Commoner's condition).
 
-    `found` are its minimal siphons if they are at hand. In a net with weight-1 arcs, without
-    inhibitors, capacities and priorities, that rules out a dead marking.
+    None if the effort ran out first. `found` passes minimal siphons that are already known. In a
+    net with arc weights of 1 and without inhibitors, capacities and priorities, True rules out
+    dead markings.
     """
     found = found or minimal_siphons(net, effort)
     if any(not any(net.initial[p] for p in largest_trap(net, siphon)) for siphon in found.sets):
@@ -95,11 +98,12 @@ def _masks(net: Net, arcs: str) -> list[int]:
 
 
 def _closed_sets(net: Net, consume: list[int], produce: list[int], effort: int) -> PlaceSets:
-    """Sets S with: whatever produces into S consumes from S. Grown place by place from the smallest
-    member on.
+    """Return the minimal sets S such that every transition producing into S consumes from S.
 
-    A branch adds one of the inputs of a transition that still feeds S freely; inputs tried before
-    stay out, so each minimal set is met once, along the branch that only adds its own members.
+    Branch and bound on bit masks: bit p stands for place p. A set grows from its smallest member.
+    As long as a transition produces into S without consuming from it, one of its input places must
+    be added; each choice is a branch. Inputs tried in earlier branches are banned in later ones, so
+    each minimal set is found exactly once, along the branch that adds only its own members.
     """
     found: list[int] = []
     left = effort
@@ -109,7 +113,7 @@ def _closed_sets(net: Net, consume: list[int], produce: list[int], effort: int) 
         while stack:
             inside, banned = stack.pop()
             if any(inside & known == known for known in found):
-                continue
+                continue  # contains a set already found, so it cannot be minimal
             left -= 1
             if left < 0:
                 return PlaceSets(_minimal(found), False)
@@ -117,6 +121,7 @@ def _closed_sets(net: Net, consume: list[int], produce: list[int], effort: int) 
             if not open_:
                 found.append(inside)
                 continue
+            # The transition with the fewest choices first keeps the tree narrow.
             t = min(open_, key=lambda t: (consume[t] & ~banned).bit_count())
             for bit in _bits(consume[t] & ~banned):
                 stack.append((inside | bit, banned))
@@ -138,13 +143,16 @@ def _minimal(found: list[int]) -> tuple[frozenset[int], ...]:
 
 
 HUNT_EFFORT = 100_000
-"""Markings looked at before giving up."""
+"""Markings after which the search by stubborn sets gives up."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hunt:
-    """`firings` lead to a dead marking that is not final; None with `complete` proves that there is
-    none."""
+    """Result of a search for a deadlock.
+
+    `firings` lead to a dead marking that is not final. If they are None and `complete` is True,
+    there is no such marking.
+    """
 
     firings: tuple[str, ...] | None
     states: int
@@ -154,10 +162,11 @@ class Hunt:
 @dataclass(frozen=True)
 class _Relations:
     conflicts: tuple[tuple[int, ...], ...]
-    """By transition: those that it can disable or that can disable it."""
+    """By transition: the transitions that it can disable or that can disable it."""
     raising: tuple[tuple[int, ...], ...]
-    """By place: transitions that add tokens."""
+    """By place: the transitions that add tokens to it."""
     lowering: tuple[tuple[int, ...], ...]
+    """By place: the transitions that remove tokens from it."""
     limits: tuple[dict[int, int], ...]
 
     @classmethod
@@ -179,10 +188,10 @@ class _Relations:
 def hunt_deadlock(
     net: Net, *, final: Callable[[Marking], bool] | None = None, effort: int = HUNT_EFFORT
 ) -> Hunt:
-    """Look for a dead marking that is not final, depth first through stubborn sets.
+    """Search for a dead marking that is not final, depth first along stubborn sets.
 
-    Nets with priorities are searched in full, since there a lower transition depends on every
-    higher one.
+    In nets with priorities a transition depends on all transitions above it, so no stubborn set
+    would be small: these nets are searched in full.
     """
     relations = _Relations.of(net) if len(set(net.priority)) <= 1 else None
     seen = {net.initial}
@@ -213,7 +222,7 @@ def _way(net: Net, came: dict[Marking, tuple[Marking, int]], marking: Marking) -
 
 
 def _stubborn(net: Net, relations: _Relations, marking: Marking, enabled: list[int]) -> list[int]:
-    """The enabled transitions of the smallest stubborn set grown from any one of them."""
+    """Return the enabled transitions of the smallest stubborn set that contains one of them."""
     best, able = enabled, frozenset(enabled)
     for seed in enabled:
         closed = _closure(net, relations, marking, able, seed, len(best))
@@ -227,8 +236,12 @@ def _stubborn(net: Net, relations: _Relations, marking: Marking, enabled: list[i
 def _closure(
     net: Net, relations: _Relations, marking: Marking, able: frozenset[int], seed: int, worst: int
 ) -> list[int] | None:
-    """Enabled members of a stubborn set that holds the seed; None as soon as there are `worst` of
-    them."""
+    """Return the enabled members of a stubborn set around the seed.
+
+    Two rules close the set: with an enabled transition, all transitions in conflict with it; with a
+    disabled one, all transitions of which at least one must fire before it can be enabled. None as
+    soon as `worst` enabled members are in it, because a smaller set is already known.
+    """
     inside, waiting, members = {seed}, [seed], []
     while waiting:
         t = waiting.pop()
@@ -249,7 +262,10 @@ def _closure(
 def _reason(
     net: Net, relations: _Relations, marking: Marking, t: int, inside: set[int]
 ) -> tuple[int, ...]:
-    """Transitions of which one must fire before t can be enabled; the choice that adds fewest."""
+    """Return transitions of which one must fire before t can be enabled.
+
+    Every unmet requirement of t gives such a set; the one that adds the fewest members is taken.
+    """
     choices = [relations.raising[p] for p, w in net.consume[t] if marking[p] < w]
     choices += [relations.lowering[p] for p, k in relations.limits[t].items() if marking[p] >= k]
     return min(choices, key=lambda some: sum(u not in inside for u in some))
