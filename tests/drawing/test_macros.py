@@ -142,6 +142,8 @@ def test_the_command_opens_a_macro_place(tmp_path: Path) -> None:
     task.write_text(TEXT)
     assert show.run(parser.parse_args([str(task), "--inside", "outer", "--out", str(out)])) == 0
     assert "inner work" in out.read_text() and ">m: outer<" in out.read_text()
-    with pytest.raises(CommandError, match="no macro place 'nowhere'; it has inner, outer, use") as caught:
+    with pytest.raises(
+        CommandError, match="no macro place 'nowhere'; it has inner, outer, use"
+    ) as caught:
         show.run(parser.parse_args([str(task), "--inside", "nowhere", "--out", str(out)]))
     assert caught.value.code == 2
