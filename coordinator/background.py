@@ -1,13 +1,12 @@
-"""Long work on task files and journals, in a process of its own: `python -m
-petrobot.coordinator.background` reads orders.
+"""Long work on task files and journals, in a process of its own.
 
-A process below all others in priority and with a hard end: nothing that is asked of a drawing takes
-time from a mission that is running. A thread would: it shares the interpreter with the mission, and
-then each turn of the loop waits for it. Ends are counted in processor time, so that what is said of
-a drawing does not depend on what else the machine does.
+`python -m petrobot.coordinator.background` reads orders from standard input. It runs at a low
+priority and with a time limit that the kernel enforces, so it never takes time from an active
+mission. A thread would: it shares the interpreter with the mission. Limits are in processor time,
+so the result for a drawing does not depend on what else the machine does.
 
-An order is a line of JSON, {work, given}. The answers are lines of JSON text: any number of
-results, each fuller than the one before, or one refusal behind `!`; an empty line ends them.
+An order is a line of JSON, {work, given}. The answer is any number of lines of JSON, each a more
+complete result than the one before, or one refusal after `!`. An empty line ends the answer.
 """
 
 from __future__ import annotations
@@ -25,17 +24,18 @@ from typing import Any
 from petrobot.services.host.json_text import json_text
 
 STATES, SECONDS, MEMORY = 50_000, 4.0, 256 << 20
-"""What one state space may take: markings, seconds of processor time, bytes."""
+"""Limits of one state space: markings, seconds of processor time, bytes."""
 HARD_END = 8
-"""Seconds of processor time after which the kernel kills an analysis, whatever it does; what it has
-said by then counts."""
+"""Seconds of processor time after which the kernel kills an analysis; results that it has already
+written are used."""
 LONGEST = 100
-"""The same for all other work: opening a long journal takes a while."""
+"""The same for all other work; opening a long journal takes a while."""
 PATIENCE = 120.0
-"""Seconds until one that gets no processor time is given up."""
+"""Seconds after which an order is given up, in case the process gets no processor time."""
 LONGEST_LINE = 256 << 20
+"""The longest line that is read from the process (bytes)."""
 LOWER = 10
-"""How much below others it runs (nice)."""
+"""By how much its priority is lowered (nice)."""
 WORDS = {
     "bounded": "Tokens stay bounded",
     "safe": "Never two tokens in a place",
@@ -50,11 +50,12 @@ WORDS = {
     "stable": "Comes back to its nominal flow after errors",
     "controllable": "Every error can be recovered from",
 }
+"""Verdicts in the words that the operator's page shows."""
 
 
 class RefusedError(ValueError):
-    """The work cannot be done, and why; `status` is the HTTP status to answer with, `more` further
-    parts of the answer."""
+    """The work cannot be done. `status` is the HTTP status of the answer, `more` its further
+    keys."""
 
     def __init__(self, status: int, text: str, more: Mapping[str, Any] | None = None) -> None:
         super().__init__(text)
@@ -62,16 +63,15 @@ class RefusedError(ValueError):
         self.more = dict(more or {})
 
 
-class Superseded(RefusedError):  # noqa: N818 - no fault: whoever asked has drawn on
-    """A newer drawing came from the same desk, so nothing is said of this one."""
+class Superseded(RefusedError):  # noqa: N818 - not a fault: the drawing has changed since
+    """The same desk sent a newer drawing, so this one gets no answer."""
 
     def __init__(self) -> None:
         super().__init__(409, "a newer drawing took its place")
 
 
-class Apart:
-    """One process for long work, started with the first order; one order at a time, the others wait
-    their turn."""
+class BackgroundProcess:
+    """A process for long work. It is started with the first order and does one order at a time."""
 
     def __init__(self) -> None:
         self._turn = asyncio.Lock()
@@ -81,15 +81,15 @@ class Apart:
 
     @property
     def process(self) -> int | None:
-        """The id of its process, while there is one."""
+        """The id of its process, or None if none is running."""
         process = self._process
         return process.pid if process is not None and process.returncode is None else None
 
     async def do(self, work: str, given: Mapping[str, Any], desk: str = "") -> bytes:
-        """The answer as JSON text, the fullest that there was in time. Raises RefusedError.
+        """Return the answer as JSON text: the most complete one within the time limit.
 
-        An order of the same `desk` that came before is given up at once: only the newest drawing on
-        a desk matters.
+        `desk` identifies the page that sends drawings. An earlier order of the same desk is given
+        up at once, because only its newest drawing matters. Raises RefusedError.
         """
         order = object()
         if desk:
@@ -105,7 +105,7 @@ class Apart:
             if self._newest.get(desk) is order:
                 del self._newest[desk]
         if not said:
-            raise RefusedError(422, f"the {work} took too long, or its process was killed")
+            raise RefusedError(422, f"the {work} took too long or its process was killed")
         if said.startswith(b"!"):
             raise RefusedError(**json.loads(said[1:]))
         return said
@@ -115,13 +115,13 @@ class Apart:
             raise Superseded
 
     def give_up(self, desk: str) -> None:
-        """Whatever was asked from that desk is not wanted any more."""
+        """Give up the order of a desk; its process is killed if it is working on it."""
         order = self._newest.pop(desk, None)
         if order is not None and order is self._current:
             self._kill()
 
     async def close(self) -> None:
-        """End the process; what it does just then is given up."""
+        """End the process; an active order is given up."""
         process = self._process
         self._kill()
         if process is not None:
@@ -140,7 +140,7 @@ class Apart:
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=LONGEST_LINE,
-                # Ctrl-C is for the coordinator, which ends it in good order
+                # Ctrl-C must reach only the coordinator, which then ends this process.
                 start_new_session=True,
             )
         assert process.stdin is not None and process.stdout is not None
@@ -153,9 +153,8 @@ class Apart:
                         if line == b"\n":
                             ended = True
                             break
-                        if not (
-                            newest and line.startswith(b"!")
-                        ):  # what was found before it failed counts
+                        # A refusal after a result is ignored: what was found before counts.
+                        if not (newest and line.startswith(b"!")):
                             newest = line.rstrip(b"\n")
         finally:
             self._current = None
@@ -165,10 +164,12 @@ class Apart:
         return newest
 
 
-async def analyse_apart(text: str, filename: str) -> dict[str, Any]:
-    """What `analysed` says, from a process of its own; without the forecast if that takes too long.
-    Raises ValueError."""
-    apart = Apart()
+async def analyse_in_background(text: str, filename: str) -> dict[str, Any]:
+    """Return the result of `analysed` from a process of its own.
+
+    Without the forecast if that takes too long. Raises RefusedError.
+    """
+    apart = BackgroundProcess()
     try:
         answer: dict[str, Any] = json.loads(
             await apart.do("analysis", {"text": text, "filename": filename})
@@ -179,27 +180,27 @@ async def analyse_apart(text: str, filename: str) -> dict[str, Any]:
 
 
 def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]:
-    """{complete, markings, verdicts, notes, heat}; a verdict is {name, words, holds, reason,
-    assumption, witness}.
+    """Analyse a task file for the operator's page.
 
-    With the view `gspn` there is also the forecast: `heat` is the share of the time that each
-    action place takes. Raises TaskFileError.
+    Return {complete, markings, verdicts, notes, heat, figures}; a verdict is {name, words, holds,
+    reason, assumption, witness, complete}, false ones first. With the view "gspn" the forecast is
+    included: `heat` is the share of the time that each action place takes. Raises TaskFileError.
     """
-    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import analyse, heat
     from petrobot.coordinator.task.file import loads
 
-    limits = Limits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
+    limits = SearchLimits(states=STATES, seconds=SECONDS, memory=MEMORY, clock=time.process_time)
     analysis = analyse(loads(text, filename), view=view, limits=limits)
     space = analysis.qualitative.space
     verdicts = [
         {"name": name, "words": WORDS.get(name, name.replace("_", " ")), **verdict.to_json()}
         for name, verdict in analysis.verdicts().items()
-        if name != "safe"  # several tokens are several runs to do: a task need not be safe
+        if name != "safe"  # a task need not be safe: a runs place holds one token per run
     ]
     for recovery in analysis.robot.recoveries if analysis.robot else ():
         verdict = recovery.possible
-        words = f"A way back after {recovery.error_exit}"
+        words = f"Can recover after {recovery.error_exit}"
         verdicts.append(
             {"name": f"recovery {recovery.error_exit}", "words": words, **verdict.to_json()}
         )
@@ -216,15 +217,15 @@ def analysed(text: str, filename: str, view: str = "ordinary") -> dict[str, Any]
 
 
 def _analysis(text: str, filename: str) -> Iterator[dict[str, Any]]:
-    for view in ("ordinary", "gspn"):  # verdicts first: a forecast may take long
+    for view in ("ordinary", "gspn"):  # verdicts first, because a forecast may take long
         yield analysed(text, filename, view)
 
 
 def work_of(name: str) -> Callable[..., Any]:
-    """What carries out an order: it takes what is given by name, and returns JSON data or an
-    iterator of such.
+    """Return the function for an order. It takes the given values by name and returns JSON data
+    or an iterator of them.
 
-    Only the room that is needed is imported: all of them would take most of a second. Raises
+    Only the module that is needed is imported; importing all takes most of a second. Raises
     KeyError.
     """
     if name == "analysis":
@@ -258,7 +259,7 @@ def main() -> int:
 
 
 def _limit(seconds: int) -> None:
-    """From now on the process may take so much processor time."""
+    """Limit the processor time that the process may use from now on."""
     spent = resource.getrusage(resource.RUSAGE_SELF)
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
     resource.setrlimit(
@@ -277,15 +278,16 @@ def _said(order: Mapping[str, Any]) -> Iterator[str]:
         )
     except (ValueError, ArithmeticError) as fault:
         yield "!" + json_text({"status": 422, "text": str(fault)})
-    except (
-        Exception
-    ) as fault:  # of the work, not of this process: the next order is carried out again
+    except Exception as fault:
+        # The work failed, not this process: it can do the next order.
         yield "!" + json_text(
             {"status": 500, "text": f"{order['work']} failed: {type(fault).__name__}: {fault}"}
         )
 
 
 if __name__ == "__main__":
-    from petrobot.coordinator import background as analysing
+    # Imported under its own name, so that `RefusedError` is the class that the work raises; in
+    # __main__ it would be a second one.
+    from petrobot.coordinator import background
 
-    sys.exit(analysing.main())
+    sys.exit(background.main())

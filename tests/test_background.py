@@ -16,7 +16,13 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator import background as background
-from petrobot.coordinator.background import Apart, RefusedError, Superseded, analyse_apart, analysed
+from petrobot.coordinator.background import (
+    BackgroundProcess,
+    RefusedError,
+    Superseded,
+    analyse_in_background,
+    analysed,
+)
 from tests.waiting import until
 
 CATCH_BALL = (Path(background.__file__).parent / "tasks" / "catch_ball.toml").read_text(
@@ -26,7 +32,7 @@ CATCH_BALL = (Path(background.__file__).parent / "tasks" / "catch_ball.toml").re
 
 @pytest.mark.processes
 async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
-    answer = await analyse_apart(CATCH_BALL, "catch_ball.toml")
+    answer = await analyse_in_background(CATCH_BALL, "catch_ball.toml")
     assert answer["complete"] is True
     assert {"bounded", "sound", "controllable"} <= {
         verdict["name"] for verdict in answer["verdicts"]
@@ -37,12 +43,12 @@ async def test_verdicts_and_forecast_come_from_a_process_of_its_own() -> None:
 
 
 @pytest.mark.processes
-async def test_a_text_that_is_no_task_is_refused_with_its_fault() -> None:
+async def test_an_invalid_task_is_refused_with_its_fault() -> None:
     with pytest.raises(ValueError, match=r"drawn\.toml"):
-        await analyse_apart("schema = 1\n[task]\n", "drawn.toml")
+        await analyse_in_background("schema = 1\n[task]\n", "drawn.toml")
 
 
-def test_a_search_that_ran_out_of_time_leaves_verdicts_open(
+def test_a_search_that_ran_out_of_time_leaves_verdicts_unknown(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(background, "SECONDS", 0.0)
@@ -53,7 +59,7 @@ def test_a_search_that_ran_out_of_time_leaves_verdicts_open(
 
 
 @pytest.mark.processes
-def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
+def test_the_kernel_ends_a_process_that_takes_too_much_processor_time() -> None:
     """Not wall-clock time: a machine that is busy with a mission changes no verdict."""
     spinning = (
         "from itertools import repeat\n"
@@ -77,7 +83,7 @@ def test_the_kernel_ends_one_that_takes_too_much_processor_time() -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("said", ['{"said": 1}', ""])
-async def test_one_that_does_not_end_is_given_up(
+async def test_a_process_that_does_not_end_is_given_up(
     said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It gets no processor time, or hangs: what it has said by then counts."""
@@ -90,15 +96,15 @@ async def test_one_that_does_not_end_is_given_up(
     monkeypatch.setattr("sys.executable", str(mute))
     monkeypatch.setattr(background, "PATIENCE", 1.0)
     if said:
-        assert await analyse_apart("", "drawn.toml") == {"said": 1}
+        assert await analyse_in_background("", "drawn.toml") == {"said": 1}
     else:
         with pytest.raises(ValueError, match="took too long"):
-            await analyse_apart("", "drawn.toml")
+            await analyse_in_background("", "drawn.toml")
 
 
 @pytest.fixture
-async def apart() -> AsyncIterator[Apart]:
-    made = Apart()
+async def apart() -> AsyncIterator[BackgroundProcess]:
+    made = BackgroundProcess()
     yield made
     await made.close()
 
@@ -107,7 +113,7 @@ FINDINGS = {"text": CATCH_BALL, "filename": "catch_ball.toml", "where": None}
 
 
 @pytest.mark.processes
-async def test_one_process_carries_out_orders_one_after_the_other(apart: Apart) -> None:
+async def test_one_process_does_orders_one_after_the_other(apart: BackgroundProcess) -> None:
     first = await apart.do("findings", FINDINGS)
     process = apart.process
     several = await asyncio.gather(*(apart.do("findings", FINDINGS) for _ in range(3)))
@@ -119,7 +125,9 @@ async def test_one_process_carries_out_orders_one_after_the_other(apart: Apart) 
 
 
 @pytest.mark.processes
-async def test_it_stands_below_all_others_and_away_from_the_keyboard(apart: Apart) -> None:
+async def test_it_has_a_low_priority_and_ignores_the_keyboard(
+    apart: BackgroundProcess,
+) -> None:
     await apart.do("findings", FINDINGS)
     assert apart.process is not None
     assert os.getpriority(os.PRIO_PROCESS, apart.process) >= 10
@@ -127,7 +135,7 @@ async def test_it_stands_below_all_others_and_away_from_the_keyboard(apart: Apar
 
 
 @pytest.mark.processes
-async def test_a_newer_drawing_takes_the_place_of_the_older_one(apart: Apart) -> None:
+async def test_a_newer_drawing_replaces_the_older_one(apart: BackgroundProcess) -> None:
     """Running or waiting, the older ones are given up at once; those of other desks and other work
     are not."""
     endless = {
@@ -145,7 +153,7 @@ async def test_a_newer_drawing_takes_the_place_of_the_older_one(apart: Apart) ->
 
 
 @pytest.mark.processes
-async def test_one_that_was_killed_is_started_again(apart: Apart) -> None:
+async def test_a_killed_process_is_started_again(apart: BackgroundProcess) -> None:
     await apart.do("findings", FINDINGS)
     assert apart.process is not None
     os.kill(apart.process, signal.SIGKILL)
@@ -155,7 +163,9 @@ async def test_one_that_was_killed_is_started_again(apart: Apart) -> None:
 
 
 @pytest.mark.processes
-async def test_an_order_that_is_not_wanted_any_more_ends_its_process(apart: Apart) -> None:
+async def test_giving_up_an_order_ends_its_process(
+    apart: BackgroundProcess,
+) -> None:
     order = asyncio.create_task(apart.do("findings", FINDINGS))
     await until(lambda: apart.process is not None, "its process to start")
     order.cancel()

@@ -1,1 +1,1 @@
-"""Verification and forecast of a net; pure."""
+"""Verification and forecast of Petri nets. Pure: no clock, no input or output but files."""

@@ -1,8 +1,7 @@
-"""What the commands analyse, simulate, convert and show --graph do, as plain functions: (exit code,
-text, plain data).
+"""The commands analyse, simulate, convert and show --graph as functions: exit code, text, data.
 
-Paths of tasks are opened by the caller (`load_task`), since this room knows tasks, not task files.
-Clocks and random seeds come from the caller, too.
+The caller passes `load_task`, because this package knows tasks but not task files. Clocks and
+random generators come from the caller as well.
 """
 
 from __future__ import annotations
@@ -16,15 +15,19 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.formats import read_net, written
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
+from petrobot.coordinator.analysis.formats.netfile import (
+    NetFile,
+    NetFileError,
+    read_rates,
+    unit_rates,
+)
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.picture import graph_svg
-from petrobot.coordinator.analysis.net.space import EngineName, Limits, explore
+from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, explore
 from petrobot.coordinator.analysis.report import CUT, Analysis, analyse
 from petrobot.coordinator.analysis.time.gspn import Gspn
-from petrobot.coordinator.analysis.time.rates import read_rates, unit_rates
 from petrobot.coordinator.analysis.time.simulate import (
-    Estimate,
+    IntervalEstimate,
     Simulation,
     goal_by_marking,
     simulate,
@@ -47,18 +50,18 @@ LoadTask = Callable[[Path], Task]
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What a command gives back."""
+class CommandResult:
+    """The result of a command: exit code, text for the terminal, plain data."""
 
     code: int
     text: str
     data: dict[str, Any]
     analysis: Analysis | None = None
-    """What `analyse` found, for pictures of its witnesses."""
+    """The analysis itself, to draw its witnesses; only from `analyse_command`."""
 
 
 def open_model(path: Path, load_task: LoadTask) -> Task | NetFile:
-    """A task (`.toml`) or a net file. Raises FormatError, and whatever `load_task` raises."""
+    """Open a task (`.toml`) or a net file. Raises NetFileError and the errors of `load_task`."""
     return load_task(path) if path.suffix == ".toml" else read_net(path)
 
 
@@ -69,17 +72,16 @@ def analyse_command(
     view: str | None = None,
     rates: Path | str | None = None,
     stages: int = 8,
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
     engine: EngineName = "auto",
     structure: bool = True,
     changes: Sequence[str] = (),
-) -> Outcome:
-    """`petrobot analyse`: code 0 if bounded and free from deadlock, 1 if not (or unknown), 2 for
-    bad input.
+) -> CommandResult:
+    """Run `petrobot analyse`: code 0 if `Analysis.ok`, 1 if not (or unknown), 2 for bad input.
 
-    `rates` is a rates file, or "unit". Without a `view` a net with rates, given here or found in
-    its file, is analysed as "gspn", all else as "ordinary". `changes` (see `whatif`) are judged
-    beside the file as it is: the code and the text are those of what would be.
+    `rates` is a rates file, or "unit". Without a `view`, a net with rates (passed here or in its
+    file) is analysed as "gspn", everything else as "ordinary". `changes` (see `whatif`) are
+    compared with the file as it is; code and text are those of the changed model.
     """
     try:
         model = open_model(path, load_task)
@@ -93,20 +95,28 @@ def analyse_command(
             tokens = plain and (
                 change_net(plain, _tokens_of(plain, wanted)) if one is not subject else plain
             )
-            return analyse(one, name=name or path.stem, view=view, measured=measured, stages=stages, limits=limits,
-                           engine=engine, ordinary=tokens)  # fmt: skip
+            return analyse(
+                one,
+                name=name or path.stem,
+                view=view,
+                measured=measured,
+                stages=stages,
+                limits=limits,
+                engine=engine,
+                ordinary=tokens,
+            )
 
         now = found(subject, None)
         then = found(*altered) if altered else now
-    except (FormatError, ValueError, OverflowError) as error:
-        return Outcome(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+    except (NetFileError, ValueError, OverflowError) as error:
+        return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     then, data, said = _told(then, structure)
     if wanted:
         what = [change.text for change in wanted]
         data |= {"what_if": what, "as_it_is": now.to_json(structure=False)}
         said += ["", f"what if {', '.join(what)}:", *_compared(now, then)]
     said += [f"note: {note}" for note in notes]
-    return Outcome(
+    return CommandResult(
         OK if then.ok else FAULT,
         "\n".join(said),
         data | {"notes": [*data["notes"], *notes]},
@@ -115,7 +125,7 @@ def analyse_command(
 
 
 def _view(model: Task | NetFile, rates: Path | str | None) -> str:
-    """What is asked for where nobody says: numbers wherever there are rates."""
+    """Return the default view: "gspn" for a net with rates, else "ordinary"."""
     return (
         "gspn"
         if isinstance(model, NetFile) and (rates is not None or model.gspn is not None)
@@ -124,21 +134,25 @@ def _view(model: Task | NetFile, rates: Path | str | None) -> str:
 
 
 def _named(path: Path, error: Exception) -> str:
-    """What is wrong, with the file's name once: readers of files name it themselves."""
+    """Return the error message, prefixed by the file unless the message names it already."""
     told = str(error)
     return (
-        told if isinstance(error, FormatError) or told.startswith(f"{path}:") else f"{path}: {told}"
+        told
+        if isinstance(error, NetFileError) or told.startswith(f"{path}:")
+        else f"{path}: {told}"
     )
 
 
 def _tokens_of(net: Net, changes: Sequence[Change]) -> list[Change]:
-    """The changes that concern tokens."""
+    """Return the changes that concern tokens."""
     return [change for change in changes if ".".join(change.subject) in net.place_index]
 
 
 def _told(found: Analysis, structure: bool) -> tuple[Analysis, dict[str, Any], list[str]]:
-    """The analysis with its data and text; Ctrl-C leaves out what the arcs alone say, then the
-    numbers."""
+    """Return the analysis with its data and text.
+
+    Structure and forecast are computed only now, so Ctrl-C may arrive here: then both are left out.
+    """
     try:
         return found, found.to_json(structure=structure), [found.text()]
     except KeyboardInterrupt:
@@ -160,7 +174,7 @@ def _changed(subject: Subject, changes: Sequence[Change]) -> tuple[Subject, Meas
 
 
 def _compared(now: Analysis, then: Analysis) -> list[str]:
-    """A table of what a change alters: verdicts, then numbers."""
+    """Return a table of what the changes alter: verdicts, then numbers."""
     words = {True: "yes", False: "NO", None: "unknown"}
     rows = [
         (name.replace("_", " "), words[before.holds], words[after.holds])
@@ -178,14 +192,14 @@ def _compared(now: Analysis, then: Analysis) -> list[str]:
 def _subject(
     model: Task | NetFile, rates: Path | str | None, view: str
 ) -> tuple[Subject, str, tuple[str, ...]]:
-    """(what to analyse, its name, notes)."""
+    """Return (what to analyse, its name, notes). Raises NetFileError for rates that do not fit."""
     if isinstance(model, Task):
         if rates is not None:
             remedy = (
                 "leave it out: a task's times are its `estimates` and `mean_wait`, and "
                 "--what-if changes them"
             )
-            raise FormatError(
+            raise NetFileError(
                 "--rates", str(rates), f"{model.name} is a task; rates are for net files", remedy
             )
         return model, model.name, ()
@@ -197,8 +211,11 @@ def _subject(
     if view != "gspn":
         return model.net, model.name, model.notes
     if model.gspn is None:
-        raise FormatError(
-            model.name or "net", "rates", "the file says none", "give --rates FILE, or --rates unit"
+        raise NetFileError(
+            model.name or "net",
+            "rates",
+            "the file has none",
+            "give --rates FILE, or --rates unit",
         )
     return model.gspn, model.name, model.notes
 
@@ -207,7 +224,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise FormatError(str(path), "file", str(error), "give a readable file") from error
+        raise NetFileError(str(path), "file", str(error), "give a readable file") from error
 
 
 def simulate_command(
@@ -223,9 +240,11 @@ def simulate_command(
     stages: int = 64,
     changes: Sequence[str] = (),
     progress: Callable[[int, float], None] | None = None,
-) -> Outcome:
-    """`petrobot simulate`: a task until it is final (or dead), a net until `horizon` (s; needed
-    there); `changes` as `whatif`."""
+) -> CommandResult:
+    """Run `petrobot simulate`: a task until it is final or dead, a net until `horizon` (s).
+
+    A net needs a horizon; for a task it is optional. `changes` as in `whatif`.
+    """
     try:
         model, wanted = open_model(path, load_task), [read_change(text) for text in changes]
         if isinstance(model, Task):
@@ -234,15 +253,23 @@ def simulate_command(
             view = stochastic_view(model, measured, stages=stages, timer_stages=stages)
             ends = OrdinaryView(model)
             goal = goal_by_marking(lambda m: ends.is_final(view.projected(m)))
-            seen = simulate(view.gspn, random, replicas=replicas, horizon=horizon or np.inf, warmup=warmup, goal=goal,
-                            firings=firings, progress=progress)  # fmt: skip
+            seen = simulate(
+                view.gspn,
+                random,
+                replicas=replicas,
+                horizon=horizon or np.inf,
+                warmup=warmup,
+                goal=goal,
+                firings=firings,
+                progress=progress,
+            )
             return _simulated(model.name, seen, view.assumptions)
         subject, name, notes = _subject(model, rates, "gspn")
         assert isinstance(subject, Gspn)
         gspn = change_gspn(subject, wanted)
         if horizon is None:
-            raise FormatError(
-                str(path), "horizon", "a net has no end of its own", "give --horizon SECONDS"
+            raise NetFileError(
+                str(path), "horizon", "a net has no final marking", "give --horizon SECONDS"
             )
         seen = simulate(
             gspn,
@@ -254,17 +281,17 @@ def simulate_command(
             progress=progress,
         )
         return _simulated(name or path.stem, seen, notes)
-    except (FormatError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
+    except (NetFileError, NoEstimate, ValueError, KeyError, OverflowError, MemoryError) as error:
         told = (
             _named(path, error)
             if not isinstance(error, MemoryError)
-            else f"{path}: out of memory: fewer --replicas"
+            else f"{path}: out of memory; use fewer --replicas"
         )
-        return Outcome(BAD_INPUT, told, {"error": told})
+        return CommandResult(BAD_INPUT, told, {"error": told})
 
 
-def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
-    def plain(one: Estimate) -> list[float | None]:
+def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> CommandResult:
+    def plain(one: IntervalEstimate) -> list[float | None]:
         return [x if isfinite(x) else None for x in (one.mean, one.low, one.high)]
 
     data: dict[str, Any] = {
@@ -278,7 +305,7 @@ def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
     }
     lines = [
         f"{name}: {seen.replicas} replicas, {seen.firings} firings"
-        + ("" if seen.complete else " (cut short)")
+        + ("" if seen.complete else " (stopped early)")
     ]
     if seen.completed is not None:
         data["completed"] = plain(seen.completed)
@@ -292,18 +319,19 @@ def _simulated(name: str, seen: Simulation, notes: tuple[str, ...]) -> Outcome:
         )
     if seen.completed is None:
         lines += [f"  {t:24}{_interval(one)} /s" for t, one in seen.throughput.items()]
-    return Outcome(
+    return CommandResult(
         OK if seen.complete else FAULT, "\n".join([*lines, *(f"note: {n}" for n in notes)]), data
     )
 
 
-def _interval(one: Estimate) -> str:
+def _interval(one: IntervalEstimate) -> str:
     return f"{one.mean:.6g} [{one.low:.6g}, {one.high:.6g}]"
 
 
-def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: int = 8) -> Outcome:
-    """`petrobot convert`: read one format, write another by the ending; what the target cannot keep
-    is listed."""
+def convert_command(
+    source: Path, target: Path, load_task: LoadTask, *, stages: int = 8
+) -> CommandResult:
+    """Run `petrobot convert`: formats follow from the file endings; losses are listed."""
     try:
         model = open_model(source, load_task)
         if isinstance(model, Task):
@@ -312,24 +340,26 @@ def convert_command(source: Path, target: Path, load_task: LoadTask, *, stages: 
             lost = list(model.notes)
         text, more = written(model, target)
         write_whole(target, text)
-    except (FormatError, NoEstimate, ValueError, OverflowError) as error:
-        return Outcome(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
+    except (NetFileError, NoEstimate, ValueError, OverflowError) as error:
+        return CommandResult(BAD_INPUT, _named(source, error), {"error": _named(source, error)})
     except OSError as error:
-        return Outcome(
+        return CommandResult(
             BAD_INPUT,
             f"{target}: {error.strerror or error}; name a file that can be written",
             {"error": str(error)},
         )
     lost += more
     lines = [f"{source} -> {target}", *(f"not kept: {what}" for what in lost)]
-    return Outcome(
+    return CommandResult(
         OK, "\n".join(lines), {"source": str(source), "target": str(target), "not_kept": lost}
     )
 
 
 def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]]:
-    """A task as a net file: its stochastic view where rates are needed (.drn), else its ordinary
-    net."""
+    """Return a task as a net file, and what is lost.
+
+    For `.drn` this is its stochastic view, because that format needs rates; else its ordinary net.
+    """
     if target.suffix == ".drn":
         view = stochastic_view(task, stages=stages, timer_stages=stages)
         return NetFile(view.gspn.net, task.name, view.gspn), list(view.assumptions)
@@ -338,7 +368,7 @@ def _exported(task: Task, target: Path, stages: int) -> tuple[NetFile, list[str]
 
 
 def net_file_of(task: Task) -> NetFile:
-    """The ordinary net of a task with its labels and positions."""
+    """Return the ordinary net of a task with its labels and positions."""
     flat = task.flat
     positions: dict[str, tuple[float, float]] = {}
     labels: dict[str, str] = {}
@@ -356,29 +386,31 @@ def graph_command(
     load_task: LoadTask,
     *,
     witness: tuple[str, ...] | None = None,
-    limits: Limits | None = None,
-) -> Outcome:
-    """`petrobot show --graph`: the reachability graph as SVG in data["svg"]; by default with the
-    first deadlock's witness."""
+    limits: SearchLimits | None = None,
+) -> CommandResult:
+    """Run `petrobot show --graph`: the reachability graph as SVG in data["svg"].
+
+    By default the path to the first deadlock is highlighted.
+    """
     try:
         model = open_model(path, load_task)
         net, final = model.net, None
-        space = explore(net, limits=limits or Limits(states=10_000))
-    except (FormatError, ValueError, OverflowError) as error:
-        return Outcome(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
+        space = explore(net, limits=limits or SearchLimits(states=10_000))
+    except (NetFileError, ValueError, OverflowError) as error:
+        return CommandResult(BAD_INPUT, _named(path, error), {"error": _named(path, error)})
     if isinstance(model, Task):
         final = space.where(OrdinaryView(model).is_end)
     stuck = [int(i) for i in space.dead if final is None or not final[i]]
     shown = witness if witness is not None else tuple(space.path(stuck[0])) if stuck else ()
     svg = graph_svg(space, witness=shown, final=final)
     partial = "" if space.complete else f" (partial: {space.reason})"
-    return Outcome(
+    return CommandResult(
         OK,
         f"{len(space)} markings, {space.edges} edges{partial}",
         {"svg": svg, "witness": list(shown)},
     )
 
 
-def limited(limits: Limits, progress: Callable[[int, int], None]) -> Limits:
-    """The same limits with a progress callback (markings found, markings expanded)."""
+def limited(limits: SearchLimits, progress: Callable[[int, int], None]) -> SearchLimits:
+    """Return the limits with a progress callback (markings found, markings expanded)."""
     return replace(limits, progress=progress)

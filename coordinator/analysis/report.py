@@ -1,5 +1,4 @@
-"""One analysis of a net or a task: every verdict and number together, as JSON and as a table for
-people."""
+"""One analysis of a net or a task: all verdicts and numbers, as JSON and as text."""
 
 from __future__ import annotations
 
@@ -11,6 +10,12 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.deadlocks import (
+    PlaceSets,
+    controlled_siphons,
+    minimal_siphons,
+    minimal_traps,
+)
 from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
@@ -21,13 +26,13 @@ from petrobot.coordinator.analysis.net.robot import (
     judge,
     one_run_each,
 )
-from petrobot.coordinator.analysis.net.siphons import (
-    PlaceSets,
-    controlled_siphons,
-    minimal_siphons,
-    minimal_traps,
+from petrobot.coordinator.analysis.net.space import (
+    INTERRUPTED,
+    EngineName,
+    SearchLimits,
+    Space,
+    explore,
 )
-from petrobot.coordinator.analysis.net.space import INTERRUPTED, EngineName, Limits, Space, explore
 from petrobot.coordinator.analysis.net.structure import (
     Semiflows,
     conflict_sets,
@@ -38,7 +43,7 @@ from petrobot.coordinator.analysis.net.structure import (
     place_semiflows,
     transition_semiflows,
 )
-from petrobot.coordinator.analysis.net.verdict import Verdict
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import LongRun, long_run
 from petrobot.coordinator.analysis.time.stochastic import Measured, stochastic_view
@@ -46,12 +51,10 @@ from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.net import Marking, Net
 
-# What the arcs of a net alone say, as plain data: invariants, siphons and traps, conflicts, conservativeness.
-
 
 @dataclass(frozen=True)
-class Structure:
-    """What the arcs alone say, computed when asked for."""
+class StructureReport:
+    """Structural properties of a net, computed on first access: invariants, siphons, traps."""
 
     net: Net
 
@@ -76,7 +79,7 @@ class Structure:
         return minimal_traps(self.net)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data, places and transitions by name."""
+        """Return plain data, with places and transitions by name."""
         places, transitions = self.net.places, self.net.transitions
         function = lyapunov(self.net)
         return {
@@ -106,39 +109,39 @@ class Structure:
 
 
 SHOWN = 20
-"""Entries of a list that the text shows."""
+"""The most entries of a list that the text shows."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """The result of `analyse`. For a task `closed` and `robot` judge the net closed by refill and
-    repair."""
+    """The result of `analyse`. For a task, `closed` and `robot` judge the net that is closed by the
+    transitions refill and repair."""
 
     name: str
     net: Net
     qualitative: Qualitative
     closed: Qualitative | None
     robot: RobotVerdicts | None
-    structure: Structure
+    structure: StructureReport
     run: LongRun | None
     forecast: Forecast | None
     notes: tuple[str, ...]
-    one_run_each: Verdict | None = None
-    """Of a task: whether no action place is entered while its run goes on."""
-    returned: Verdict | None = None
-    """Of a task: whether each resource is there again at the end."""
+    one_run_each: PropertyVerdict | None = None
+    """Tasks only: whether no action place is entered while its run is active."""
+    returned: PropertyVerdict | None = None
+    """Tasks only: whether each resource has its initial tokens again at the end."""
     interrupted: bool = False
-    """Whether Ctrl-C kept something from being found out."""
+    """Whether Ctrl-C ended the analysis before everything was computed."""
 
     @property
     def progress(self) -> Qualitative:
-        """Where liveness, properness and home markings are judged: the closed net if there is
-        one."""
+        """The net on which liveness, properness and home markings are judged: the closed one if
+        there is one."""
         return self.closed or self.qualitative
 
     @property
     def ok(self) -> bool:
-        """Whether it is known that nothing speaks against running it."""
+        """Whether the task is known to have no objection against running it."""
         first = (
             self.qualitative.bounded.holds is True and self.qualitative.deadlock_free.holds is True
         )
@@ -146,13 +149,15 @@ class Analysis:
         return first and single and not self.objections
 
     @property
-    def objections(self) -> dict[str, Verdict]:
-        """What is known to speak against running it: it grows without bound, gets stuck, starts a
-        run while its place is at work, cannot reach its end, goes on at its end, or ends without a
-        resource. (A transition of no use is no objection.)
+    def objections(self) -> dict[str, PropertyVerdict]:
+        """Known reasons against running the task, by the name of the verdict.
+
+        It grows without bound, deadlocks, starts a run in a place that is still active, cannot
+        reach its end, is still active at its end, or loses a resource. A transition that can never
+        fire is not an objection.
         """
         named = self.verdicts()
-        against: dict[str, Verdict] = {
+        against: dict[str, PropertyVerdict] = {
             name: named[name]
             for name in ("bounded", "deadlock_free", "one_run_each", "returned")
             if name in named
@@ -162,7 +167,7 @@ class Analysis:
         return {name: verdict for name, verdict in against.items() if verdict.holds is False}
 
     def to_json(self, *, structure: bool = True) -> dict[str, Any]:
-        """Plain data with the promised keys: verdicts are true, false or null."""
+        """Return plain data with documented keys; verdicts are true, false or null."""
         q, again, unbounded = (
             self.qualitative,
             self.progress,
@@ -227,12 +232,12 @@ class Analysis:
         return {"throughput": None, "mean_tokens": None, "residual": None}
 
     def figures(self) -> dict[str, float]:
-        """The numbers by which two analyses are compared."""
+        """Return the numbers by which two analyses are compared."""
         if self.forecast is not None:
             f = self.forecast
             goal = {} if f.goal_reliability is None else {"R_goal": f.goal_reliability}
             shape = (
-                {"90 % quantile of the time (s)": f.law().quantile(0.9)}
+                {"90 % quantile of the time (s)": f.completion_time().quantile(0.9)}
                 if f.completion_probability > 0
                 else {}
             )
@@ -246,8 +251,8 @@ class Analysis:
             return {f"throughput of {t} (1/s)": x for t, x in self.run.throughput.items()}
         return {"markings": len(self.qualitative.space)}
 
-    def verdicts(self) -> dict[str, Verdict]:
-        """All verdicts by name, in robot words where the net is a task."""
+    def verdicts(self) -> dict[str, PropertyVerdict]:
+        """Return all verdicts by name; for a task also those of `robot.py`."""
         q, again = self.qualitative, self.progress
         out = {
             "bounded": q.bounded,
@@ -267,7 +272,7 @@ class Analysis:
         return out
 
     def text(self) -> str:
-        """A table for people."""
+        """Return the analysis as text for the terminal."""
         q = self.qualitative
         size = _sizes(self.net)
         lines = [
@@ -284,7 +289,7 @@ class Analysis:
             for d in q.deadlocks[:SHOWN]
         ]
         if self.robot is not None:
-            lines += ["", "error exits     possible  sure  further errors  run      way back"]
+            lines += ["", "error exits     possible  sure  further errors  run      recovery"]
             lines += [_recovery_line(r) for r in self.robot.recoveries]
         assumed = dict.fromkeys(
             v.assumption for v in self.verdicts().values() if v.holds and v.assumption
@@ -301,7 +306,7 @@ class Analysis:
         if self.run is not None:
             busiest = sorted(self.run.utilisation.items(), key=lambda one: -one[1])[:SHOWN]
             rows = [
-                f"  {name:24}{self.run.throughput[name]:12.6g} /s {load:10.4g} at work"
+                f"  {name:24}{self.run.throughput[name]:12.6g} /s {load:10.4g} busy"
                 for name, load in busiest
             ]
             return ["", f"long run (residual {self.run.residual:.1e} /s):", *rows]
@@ -318,9 +323,9 @@ class Analysis:
             "",
             f"forecast: P_complete {done.probability:.9f}, {goal}R_conj "
             f"{f.conjunctive_reliability:.6f}",
-            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; back "
-            "to the nominal flow within "
-            f"{f.recovery_time:.3f} s on average at worst; residual {done.residual:.1e}",
+            f"  time {done.mean:.3f} s, standard deviation {done.variance**0.5:.3f} s; mean time "
+            f"back to the nominal flow at most {f.recovery_time:.3f} s; residual "
+            f"{done.residual:.1e}",
             "worth improving:",
             *rows,
             *(f"assumed: {text}" for text in f.view.assumptions),
@@ -334,16 +339,16 @@ def analyse(
     view: str = "ordinary",
     measured: Measured | None = None,
     stages: int = 8,
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
     engine: EngineName = "auto",
     ordinary: Net | None = None,
 ) -> Analysis:
-    """All verdicts on a net or task; with `view="gspn"` also the numbers of its stochastic view.
+    """Return all verdicts on a net or task; with `view="gspn"` also the numbers over time.
 
-    A GSPN gives its long run from the initial marking; a task its forecast. Numbers that cannot be
-    had (a partial space, a timeless trap) leave a note instead. `limits` hold for each state space
-    that is explored. `ordinary` is the ordinary view of a GSPN if it is not the GSPN's own net:
-    where its rates and priorities were not said by the file of the net itself.
+    A GSPN yields its long run from the initial marking, a task its forecast. Numbers that cannot be
+    computed (incomplete space, timeless trap) leave a note instead. `limits` apply to each state
+    space that is explored. `ordinary` is the net for the qualitative verdicts on a GSPN, if it is
+    not the GSPN's own net because the rates and priorities came from another file.
     """
     if isinstance(model, Task):
         return _analyse_task(model, view, measured, stages, limits, engine)
@@ -360,7 +365,7 @@ def analyse(
         found,
         None,
         None,
-        Structure(net),
+        StructureReport(net),
         run,
         None,
         tuple(notes),
@@ -369,18 +374,17 @@ def analyse(
 
 
 LOOK = 10_000
-"""Markings after which a net is asked whether it can grow without end, before it is searched to its
-limits."""
-ENDLESS = "it has no end: the net is unbounded"
-CUT = "Ctrl-C: a partial answer, what had been found by then"
+"""Markings after which boundedness is checked, before the search continues to its limits."""
+ENDLESS = "the net is unbounded"
+CUT = "Ctrl-C: a partial result, from what had been found by then"
 
 
 def _search(
-    net: Net, limits: Limits | None, engine: EngineName
+    net: Net, limits: SearchLimits | None, engine: EngineName
 ) -> tuple[Space, Coverability | None]:
-    """The space within the limits; a net that proves to be unbounded is searched no further than
-    LOOK."""
-    limits = limits or Limits()
+    """Return the space within the limits. A net that is proven unbounded is searched only up to
+    LOOK markings."""
+    limits = limits or SearchLimits()
     if limits.states is None or limits.states > LOOK:
         first = explore(net, limits=replace(limits, states=LOOK), engine=engine)
         if first.complete or len(first) < LOOK:
@@ -396,25 +400,25 @@ def _search(
 
 def _examined(
     net: Net,
-    limits: Limits | None,
+    limits: SearchLimits | None,
     engine: EngineName,
     notes: list[str],
     final: Callable[[Marking], bool] | None = None,
 ) -> Qualitative:
-    """All verdicts; after Ctrl-C those that are plain to see, and a note."""
+    """Return all verdicts; after Ctrl-C only the quick ones, and add a note."""
     space: Space | None = None
     try:
         space, cover = _search(net, limits, engine)
         if space.reason != INTERRUPTED:
             return examine(space, final=final, cover=cover)
     except KeyboardInterrupt:
-        space = space or explore(net, limits=Limits(states=1))
+        space = space or explore(net, limits=SearchLimits(states=1))
     notes.append(CUT)
     return examine(replace(space, complete=False, reason=INTERRUPTED), final=final, in_haste=True)
 
 
 def _long_run(
-    model: Gspn, space: Space, limits: Limits | None, engine: EngineName, notes: list[str]
+    model: Gspn, space: Space, limits: SearchLimits | None, engine: EngineName, notes: list[str]
 ) -> LongRun | None:
     try:
         if model.net != space.net:
@@ -435,7 +439,7 @@ def _analyse_task(
     view: str,
     measured: Measured | None,
     stages: int,
-    limits: Limits | None,
+    limits: SearchLimits | None,
     engine: EngineName,
 ) -> Analysis:
     ordinary, notes = OrdinaryView(task), list[str]()
@@ -443,7 +447,7 @@ def _analyse_task(
     single = [
         p.name for p in task.flat.places.values() if p.kind is Kind.ACTION and p.servers is None
     ]
-    alone, whole = one_run_each(found.space, single), Structure(ordinary.net)
+    alone, whole = one_run_each(found.space, single), StructureReport(ordinary.net)
     closed = robot = numbers = back = None
     try:
         if not notes:
@@ -474,8 +478,10 @@ def _analyse_task(
 
 
 def _uneven(space: Space, final: Mask) -> list[str]:
-    """A note on each place whose tokens at the end depend on the way: left over, lost, or counted
-    on purpose."""
+    """Return a note for each place whose tokens at the end depend on the path taken.
+
+    The tokens may be left over, lost, or a counter on purpose; only the author knows.
+    """
     ends = np.flatnonzero(final)
     held = (
         [(name, space.tokens(p)[ends]) for p, name in enumerate(space.net.places)]
@@ -483,7 +489,7 @@ def _uneven(space: Space, final: Mask) -> list[str]:
         else []
     )
     return [
-        f"{name} holds {tokens.min()} to {tokens.max()} tokens at the end, depending on the way"
+        f"{name} holds {tokens.min()} to {tokens.max()} tokens at the end, depending on the path"
         for name, tokens in held
         if tokens.min() < tokens.max()
     ]
@@ -492,11 +498,11 @@ def _uneven(space: Space, final: Mask) -> list[str]:
 def _closed(
     ordinary: OrdinaryView,
     space: Space,
-    limits: Limits | None,
+    limits: SearchLimits | None,
     engine: EngineName,
     notes: list[str],
 ) -> tuple[Qualitative | None, RobotVerdicts | None]:
-    """The closed net's verdicts and the robot's; a note where they cannot be had."""
+    """Return the verdicts on the closed net and those of `robot.py`, or add a note why not."""
     try:
         net = ordinary.closed(space)
         again = explore(net, limits=limits, engine=engine)
@@ -509,7 +515,11 @@ def _closed(
 
 
 def _forecast(
-    task: Task, measured: Measured | None, stages: int, limits: Limits | None, notes: list[str]
+    task: Task,
+    measured: Measured | None,
+    stages: int,
+    limits: SearchLimits | None,
+    notes: list[str],
 ) -> Forecast | None:
     try:
         found = forecast(stochastic_view(task, measured, stages=stages), limits=limits)
@@ -542,14 +552,14 @@ def _word(holds: bool | None) -> str:
     return {True: "yes", False: "NO", None: "unknown"}[holds]
 
 
-def _verdict_lines(name: str, verdict: Verdict) -> list[str]:
+def _verdict_lines(name: str, verdict: PropertyVerdict) -> list[str]:
     lines = [f"  {name.replace('_', ' '):15}{_word(verdict.holds):8} {verdict.reason}"]
     if verdict.witness is not None:
         firings = " ".join(verdict.witness.firings) or "(initial marking)"
         lines.append(
             f"{'':26}by: {firings}"
             + (
-                f", then again and again: {' '.join(verdict.witness.loop)}"
+                f", then repeatedly: {' '.join(verdict.witness.loop)}"
                 if verdict.witness.loop
                 else ""
             )
@@ -561,13 +571,14 @@ def _recovery_line(r: Recovery) -> str:
     kappa = "any number" if r.kappa is None else "none" if r.kappa <= 0 else str(r.kappa)
     run = {True: "resumed", False: "lost", None: "-"}[r.resumed]
     back = " ".join(r.strategy) or (
-        "(at once)" if r.possible.holds and r.kappa != -1 else "(no way)"
+        "(immediate)" if r.possible.holds and r.kappa != -1 else "(none)"
     )
-    return f"  {r.error_exit:14}{_word(r.possible.holds):10}{_word(r.almost_sure.holds):6}{kappa:16}{run:9}{back}"
+    verdicts = f"{_word(r.possible.holds):10}{_word(r.almost_sure.holds):6}"
+    return f"  {r.error_exit:14}{verdicts}{kappa:16}{run:9}{back}"
 
 
 def heat(analysis: Analysis) -> dict[str, float]:
-    """How much of the time each place takes, 0 to 1: for colouring the bottleneck on a drawing."""
+    """Return the share of the time that each place takes, 0 to 1, to colour a drawing."""
     if analysis.forecast is not None:
         shares: dict[str, float] = {}
         for w in analysis.forecast.worth:

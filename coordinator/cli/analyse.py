@@ -15,8 +15,8 @@ from petrobot.coordinator.cli.loading import task_path, write_json
 from petrobot.services.host.command_line import number, whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.analysis.commands import Outcome
-    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.analysis.commands import CommandResult
+    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import Analysis
 
 EXAMPLE = "petrobot analyse catch_ball --view gspn --what-if locate_ball.error.share=0.01"
@@ -83,11 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Analyse."""
     from petrobot.coordinator.analysis.commands import analyse_command
-    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.task.file import load
 
     longest = options.seconds or None
-    limits = Limits(
+    limits = SearchLimits(
         states=options.states, seconds=longest, memory=options.memory << 20, clock=time.monotonic
     )
     path = task_path(options.file)
@@ -119,7 +119,7 @@ def _draw(analysis: Analysis, path: Path, folder: Path, *, quiet: bool) -> None:
 
 
 @contextmanager
-def progress_of_search(limits: Limits) -> Iterator[Limits]:
+def progress_of_search(limits: SearchLimits) -> Iterator[SearchLimits]:
     """The same limits with a line on the terminal that tells how far a long search is; nothing
     elsewhere."""
     from petrobot.coordinator.analysis.commands import limited
@@ -145,7 +145,7 @@ def progress_of_search(limits: Limits) -> Iterator[Limits]:
         print(file=sys.stderr)
 
 
-def give(outcome: Outcome, json_file: str | None) -> int:
+def give(outcome: CommandResult, json_file: str | None) -> int:
     """Print and write what an analysis command found; gives its exit code. Raises CommandError for
     bad input."""
     from petrobot.coordinator.analysis.commands import BAD_INPUT

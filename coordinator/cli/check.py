@@ -146,10 +146,12 @@ def _missing(task: Task, services: Path | None) -> list[str]:
 
 
 def _analysed(task: Task) -> Analysis:
-    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import analyse
 
-    limits = Limits(states=MOST_STATES, seconds=LONGEST, memory=MOST_MEMORY, clock=time.monotonic)
+    limits = SearchLimits(
+        states=MOST_STATES, seconds=LONGEST, memory=MOST_MEMORY, clock=time.monotonic
+    )
     return analyse(task, limits=limits)
 
 

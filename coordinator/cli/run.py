@@ -198,12 +198,12 @@ def _refuse_unfit(task: Task, directory: Directory) -> None:
 def _warn(task: Task, options: argparse.Namespace) -> None:
     """Say what a short look at the state space finds against running it: whoever runs it all the
     same may want to see that."""
-    from petrobot.coordinator.analysis.net.space import Limits
+    from petrobot.coordinator.analysis.net.space import SearchLimits
     from petrobot.coordinator.analysis.report import analyse
 
     if options.quiet:
         return
-    limits = Limits(states=MOST_STATES, seconds=LONGEST, clock=time.monotonic)
+    limits = SearchLimits(states=MOST_STATES, seconds=LONGEST, clock=time.monotonic)
     for name, verdict in analyse(task, limits=limits).objections.items():
         told = (
             f"warning: {task.name}: {name.replace('_', ' ')}: {verdict.reason} (petrobot "

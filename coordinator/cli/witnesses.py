@@ -11,7 +11,7 @@ from petrobot.coordinator.cli import CommandError
 from petrobot.services.host.whole_file import make_folder, write_whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
+    from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
     from petrobot.coordinator.analysis.report import Analysis
     from petrobot.coordinator.task import Task
     from petrobot.coordinator.task.net import Net
@@ -38,7 +38,7 @@ def draw_witnesses(analysis: Analysis, model: Task | Net, folder: Path) -> list[
     return made
 
 
-def refused(analysis: Analysis) -> Iterator[tuple[str, Verdict]]:
+def refused(analysis: Analysis) -> Iterator[tuple[str, PropertyVerdict]]:
     """Verdicts that do not hold and can show why. A task need not be safe: several tokens are
     several runs to do."""
     order = sorted(analysis.verdicts().items(), key=lambda item: item[0] != "one_run_each")

@@ -1,5 +1,4 @@
-"""A task or an ordinary net as a picture: SVG text, readable in light and dark, error branches
-folded unless asked for."""
+"""Drawings of tasks and nets as SVG text, readable on light and dark backgrounds."""
 
 from __future__ import annotations
 
@@ -20,12 +19,12 @@ def draw(
     overlay: Overlay | None = None,
     inside: str = "",
 ) -> str:
-    """SVG of the model.
+    """Return the SVG text of a task or net.
 
-    A task is drawn as its file has it: macro places stay folded, and so do error branches unless
-    `error_branches`; a badge on a place counts its hidden exits. `marking` (of `Task.net`, or of
-    the net) replaces the initial tokens; `overlay` colours nodes and numbers the firings of a path.
-    `inside` opens a macro place, named as in the flat task: ValueError if there is none.
+    Macro places stay closed, and error branches are hidden unless `error_branches`; a badge on a
+    place counts its hidden outgoing transitions. `marking` (of `Task.net`, or of the net) replaces
+    the initial tokens. `overlay` colours nodes and numbers the firings of a path. `inside` opens a
+    macro place, named as in the flat task; raises ValueError if there is none.
     """
     scene = (
         scene_of_net(model, marking, title)

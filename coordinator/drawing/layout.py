@@ -1,13 +1,231 @@
-"""Where the nodes stand: given positions are kept, missing ones come from layers along the flow of
-tokens."""
+"""Positions of nodes: given ones are kept, missing ones come from layers along the token flow.
+
+Layered drawing after K. Sugiyama, S. Tagawa, M. Toda, Methods for visual understanding of
+hierarchical system structures, IEEE Trans. SMC 11 (1981), in four steps:
+
+1. Reverse arcs that close a cycle.
+2. Put every node into a column, so that all arcs lead to the right.
+3. Give an arc over several columns a way point in each column between, and order each column so
+   that few arcs cross.
+4. Choose heights that make arcs as level as the minimum distances allow.
+"""
 
 from __future__ import annotations
 
+from bisect import bisect_left, insort
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from petrobot.coordinator.drawing.layers import Edge, Layers, Spot
+Edge = tuple[str, str]
+WayPoint = tuple[str, str, int]
+"""A way point of an arc: its two ends and its column."""
+Spot = str | WayPoint
+"""What takes up room in a column: a node, by its name, or a way point."""
+HUB = 14
+"""A node with more arcs than this is a hub: its long arcs get no way points and run straight,
+because so many way points would push the columns apart."""
+_SWEEPS = 10
+"""Sweeps over the columns for each starting order."""
+_TIGHTENINGS = 12
+"""Passes that move nodes closer to their neighbours' columns."""
+
+
+class Layers:
+    """Columns of nodes and way points, in an order with few crossings.
+
+    `next` and `before` hold the neighbours of each spot in the columns to its right and left.
+    """
+
+    def __init__(self, names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> None:
+        kept = set(without_circles(names, edges, sources))
+        self.forward = [
+            (a, b) if (a, b) in kept else (b, a) for a, b in dict.fromkeys(edges) if a != b
+        ]
+        self.column = _columns(names, self.forward)
+        self.columns: list[list[Spot]] = [
+            [] for _ in range(max(self.column.values(), default=0) + 1)
+        ]
+        self.next: dict[Spot, list[Spot]] = {}
+        self.before: dict[Spot, list[Spot]] = {}
+        for name in names:
+            self._add(name, self.column[name])
+        degree = Counter(n for edge in self.forward for n in edge)
+        for a, b in dict.fromkeys(self.forward):
+            if max(degree[a], degree[b]) <= HUB or self.column[b] - self.column[a] == 1:
+                self._lead((a, b))
+        self._order()
+
+    def way_points(self, a: str, b: str) -> list[WayPoint]:
+        """Return the way points of an arc from a to b, in its own direction."""
+        columns = range(self.column[a] + 1, self.column[b])
+        points = [(a, b, c) for c in columns]
+        if self.column[a] > self.column[b]:
+            points = [(b, a, c) for c in range(self.column[a] - 1, self.column[b], -1)]
+        return points
+
+    def _add(self, spot: Spot, column: int) -> None:
+        self.columns[column].append(spot)
+        self.next[spot], self.before[spot] = [], []
+
+    def _lead(self, edge: Edge) -> None:
+        a, b = edge
+        last: Spot = a
+        for point in self.way_points(a, b):
+            self._add(point, point[2])
+            self._join(last, point)
+            last = point
+        self._join(last, b)
+
+    def _join(self, a: Spot, b: Spot) -> None:
+        self.next[a].append(b)
+        self.before[b].append(a)
+
+    def _order(self) -> None:
+        """Try four starts and keep the order with the fewest crossings.
+
+        The barycentre heuristic ends in local optima, so it starts from the given and the reversed
+        order, and from the left and from the right.
+        """
+        best, fewest = [list(c) for c in self.columns], self.crossings()
+        for start in ([list(c) for c in self.columns], [c[::-1] for c in self.columns]):
+            for first in (0, 1):
+                self.columns = [list(c) for c in start]
+                for sweep in range(_SWEEPS if fewest else 0):
+                    self._sweep(forward=(sweep + first) % 2 == 0)
+                    crossings = self.crossings()
+                    if crossings < fewest:
+                        best, fewest = [list(c) for c in self.columns], crossings
+        self.columns = best
+
+    def _sweep(self, forward: bool) -> None:
+        """Sort each column by the mean row of its neighbours (barycentre), then swap neighbours."""
+        inward, columns = (
+            (self.before, self.columns[1:]) if forward else (self.next, self.columns[-2::-1])
+        )
+        for column in columns:
+            self._sort(column, inward)
+        self._exchange()
+
+    def _sort(self, column: list[Spot], inward: Mapping[Spot, Sequence[Spot]]) -> None:
+        row = self._rows()
+        mean = {
+            s: sum(row[n] for n in inward[s]) / len(inward[s]) if inward[s] else row[s]
+            for s in column
+        }
+        column.sort(key=lambda s: mean[s])
+
+    def _exchange(self) -> None:
+        """Swap neighbours in a column as long as that removes crossings."""
+        for _ in range(4):
+            better = False
+            row = self._rows()
+            for column in self.columns:
+                for i in range(len(column) - 1):
+                    a, b = column[i], column[i + 1]
+                    if self._gain(a, b, row) > 0:
+                        column[i], column[i + 1] = b, a
+                        row[a], row[b] = row[b], row[a]
+                        better = True
+            if not better:
+                return
+
+    def _gain(self, a: Spot, b: Spot, row: Mapping[Spot, int]) -> int:
+        """Return how many crossings disappear if b comes before a."""
+        gain = 0
+        for side in (self.before, self.next):
+            for m in side[a]:
+                for n in side[b]:
+                    gain += (row[m] > row[n]) - (row[m] < row[n])
+        return gain
+
+    def _rows(self) -> dict[Spot, int]:
+        return {spot: i for column in self.columns for i, spot in enumerate(column)}
+
+    def crossings(self) -> int:
+        """Count the crossings between neighbouring columns: the inversions among the arcs' ends."""
+        row = self._rows()
+        total = 0
+        for column in self.columns[:-1]:
+            seen: list[int] = []
+            for spot in column:
+                ends = sorted(row[n] for n in self.next[spot])
+                total += sum(len(seen) - bisect_left(seen, end + 1) for end in ends)
+                for end in ends:
+                    insort(seen, end)
+        return total
+
+
+def without_circles(
+    names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
+) -> list[Edge]:
+    """Return the edges except those that close a cycle (depth-first search without recursion)."""
+    following: dict[str, list[str]] = {n: [] for n in names}
+    for a, b in edges:
+        following[a].append(b)
+    kept: list[Edge] = []
+    state: dict[str, int] = {}
+    for root in [*sources, *names]:
+        if root in state:
+            continue
+        state[root] = 1
+        stack = [(root, iter(following[root]))]
+        while stack:
+            node, rest = stack[-1]
+            child = next(rest, None)
+            if child is None:
+                state[node] = 2
+                stack.pop()
+            elif state.get(child) != 1:
+                kept.append((node, child))
+                if child not in state:
+                    state[child] = 1
+                    stack.append((child, iter(following[child])))
+    return kept
+
+
+def _columns(names: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
+    """Return the column of each node.
+
+    First its longest distance from a node without incoming edges. Then each node moves towards the
+    side on which it has more neighbours, as far as its edges allow, which shortens arcs.
+    """
+    before: dict[str, list[str]] = {n: [] for n in names}
+    after: dict[str, list[str]] = {n: [] for n in names}
+    for a, b in edges:
+        before[b].append(a)
+        after[a].append(b)
+    column = _longest_paths(names, before, after)
+    for _ in range(_TIGHTENINGS):
+        moved = False
+        for name in names:
+            low = max((column[n] + 1 for n in before[name]), default=0)
+            high = min((column[n] - 1 for n in after[name]), default=column[name])
+            pull = len(after[name]) - len(before[name])
+            wanted = high if pull > 0 else low if pull < 0 and before[name] else column[name]
+            moved |= wanted != column[name]
+            column[name] = wanted
+        if not moved:
+            break
+    return column
+
+
+def _longest_paths(
+    names: Sequence[str], before: Mapping[str, Sequence[str]], after: Mapping[str, Sequence[str]]
+) -> dict[str, int]:
+    column = dict.fromkeys(names, 0)
+    waiting = {n: len(before[n]) for n in names}
+    ready = [n for n in names if not waiting[n]]
+    while ready:
+        node = ready.pop()
+        for child in after[node]:
+            column[child] = max(column[child], column[node] + 1)
+            waiting[child] -= 1
+            if not waiting[child]:
+                ready.append(child)
+    return column
+
 
 Point = tuple[float, float]
 
@@ -18,13 +236,13 @@ _BESIDE_NODE = 58.0
 _BESIDE_ARC = 24.0
 _SETTLINGS = 20
 _STRAIGHT = (1.0, 3.0, 9.0)
-"""How much a step wants to be level: between nodes, from a node to a way point, between way
-points."""
+"""Weights of level arcs: between nodes, from a node to a way point, between way points. Bends
+between way points look worst, so these weigh most."""
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """A position for every node, and the points by which arcs over several columns are led."""
+class NodePositions:
+    """A position for every node, and the points through which long arcs run."""
 
     at: Mapping[str, Point]
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
@@ -32,21 +250,25 @@ class Layout:
 
 def lay_out(
     wanted: Mapping[str, Point | None], edges: Sequence[Edge], sources: Sequence[str]
-) -> Layout:
-    """A position for every node. `sources` are the nodes from which the flow begins (the marked
-    places)."""
+) -> NodePositions:
+    """Return a position for every node.
+
+    If at least half of the positions are given, they are kept and the others are filled in next to
+    their neighbours; else all nodes are placed in layers, starting from `sources` (the marked
+    places).
+    """
     given = {name: at for name, at in wanted.items() if at is not None}
     if len(given) == len(wanted):
-        return Layout(given)
+        return NodePositions(given)
     if 2 * len(given) >= len(wanted):
-        return Layout(_fill_in(list(wanted), given, edges))
+        return NodePositions(_fill_in(list(wanted), given, edges))
     return _layered(list(wanted), edges, sources)
 
 
 def _fill_in(
     names: Sequence[str], given: Mapping[str, Point], edges: Sequence[Edge]
 ) -> dict[str, Point]:
-    """The missing nodes near their neighbours, each at the next free spot."""
+    """Place the missing nodes near their neighbours, each at the nearest free spot."""
     at = dict(given)
     for name in names:
         if name not in at:
@@ -65,7 +287,7 @@ def _fill_in(
 
 
 def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
-    """The nearest spot around the centre that keeps its distance from all others."""
+    """Return the nearest spot around the centre that is far enough from all others."""
     ring = 0
     while True:
         spots = [
@@ -84,7 +306,7 @@ def _free_spot(centre: Point, taken: Sequence[Point]) -> Point:
         ring += 1
 
 
-def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> Layout:
+def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]) -> NodePositions:
     layers = Layers(names, edges, sources)
     row = _settled(layers)
     top = min(row.values(), default=0.0)
@@ -92,19 +314,18 @@ def _layered(names: Sequence[str], edges: Sequence[Edge], sources: Sequence[str]
     def at(spot: Spot, column: int) -> Point:
         return MARGIN + column * COLUMN, MARGIN + row[spot] - top
 
-    return Layout(
+    return NodePositions(
         {name: at(name, layers.column[name]) for name in names},
         {
-            (a, b): [at(p, p[2]) for p in layers.way(a, b)]
+            (a, b): [at(p, p[2]) for p in layers.way_points(a, b)]
             for a, b in edges
-            if all(p in row for p in layers.way(a, b))
+            if all(p in row for p in layers.way_points(a, b))
         },
     )
 
 
 def _settled(layers: Layers) -> dict[Spot, float]:
-    """Heights: every spot as level with its neighbours as its distance from those above and below
-    it allows."""
+    """Return the height of every spot: level with its neighbours as far as distances allow."""
     row: dict[Spot, float] = {}
     for column in layers.columns:
         heights = [0.0]
@@ -124,7 +345,7 @@ def _apart(above: Spot, below: Spot) -> float:
 
 
 def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float, float]:
-    """Where a spot would stand by its neighbours, and how much it wants that."""
+    """Return the mean height of the neighbours of a spot, and the weight of that wish."""
     steps = [
         (row[n], _STRAIGHT[isinstance(spot, tuple) + isinstance(n, tuple)])
         for n in (*layers.before[spot], *layers.next[spot])
@@ -134,8 +355,12 @@ def _wish(spot: Spot, layers: Layers, row: Mapping[Spot, float]) -> tuple[float,
 
 
 def _spaced(column: Sequence[Spot], wishes: Sequence[tuple[float, float]]) -> list[float]:
-    """The heights nearest to the wishes (least squares) that keep distance: pooled adjacent
-    violators on shifted wishes."""
+    """Return the heights closest to the wishes (least squares) that keep the minimum distances.
+
+    Subtracting the minimum distances turns the task into isotonic regression, which the
+    pool-adjacent-violators algorithm solves exactly: neighbours in the wrong order are merged into
+    a pool with their weighted mean.
+    """
     offset = [0.0]
     for above, below in pairwise(column):
         offset.append(offset[-1] + _apart(above, below))

@@ -1,5 +1,7 @@
-"""Ways of arcs around nodes, and places for words that cover neither nodes nor arcs nor each
-other."""
+"""Paths of arcs around nodes, and positions of labels that cover as little as possible.
+
+Both are greedy: one arc or label after the other takes the candidate of the lowest cost.
+"""
 
 from __future__ import annotations
 
@@ -11,28 +13,33 @@ from itertools import pairwise
 from math import hypot, inf
 
 from petrobot.coordinator.drawing.layout import Point
-from petrobot.coordinator.drawing.scene import RADIUS, Arc, Node, Scene
+from petrobot.coordinator.drawing.scene import RADIUS, Arc, DrawnNode, Scene
 
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom."""
 
 _BENDS = (0.0, 34.0, -34.0, 68.0, -68.0, 110.0, -110.0, 160.0, -160.0, 220.0, -220.0)
+"""Candidates for the bend of an arc, the straight line first (drawing units)."""
 _CLEARANCE = 7.0
+"""Distance that an arc keeps from the border of a node."""
 _SAMPLES = 24
+"""Points on an arc that are tested for collisions."""
 _LEVEL = 36.0
+"""How far an arc may run level on both sides of a path point."""
 _REACH = RADIUS + _CLEARANCE
 _AROUND = 80.0
-"""How far from its node a text may stand, besides its own width."""
+"""How far from its node a label may be, besides its own width."""
 FONT = 12.5
 LINE = 15.0
 _CHARACTER = 0.565
+"""Mean width of a character, relative to the font size."""
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """A smooth curve from border to border, drawn to its control points: a quadratic B-spline.
+class ArcPath:
+    """A smooth curve from border to border: a quadratic B-spline over its control points.
 
-    `bend` is how far a single control point is off the straight line.
+    `bend` is the distance of a single control point from the straight line.
     """
 
     arc: Arc
@@ -47,14 +54,14 @@ class Way:
         return len(self.controls) == 1 and self.bend == 0
 
     def pieces(self, end: Point | None = None) -> list[tuple[Point, Point, Point]]:
-        """Its quadratic pieces: start, control and end of each."""
+        """Return its quadratic Bezier pieces: start, control point and end of each."""
         knots = [((a[0] + b[0]) / 2, (a[1] + b[1]) / 2) for a, b in pairwise(self.controls)]
         return list(
             zip([self.start, *knots], self.controls, [*knots, end or self.end], strict=True)
         )
 
     def point(self, s: float) -> Point:
-        """The point at s, 0 at the start and 1 at the end."""
+        """Return the point at s, from 0 at the start to 1 at the end."""
         n = len(self.controls)
         i = min(int(s * n), n - 1)
         u = s * n - i
@@ -64,79 +71,90 @@ class Way:
 
     @property
     def points(self) -> list[Point]:
-        """Points along it, near enough to each other to tell what it runs over."""
+        """Points along the curve, close enough to detect the nodes that it crosses."""
         n = _SAMPLES + 8 * (len(self.controls) - 1)
         return [self.point(i / n) for i in range(n + 1)]
 
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """Lines of text at a place: where the first baseline begins and how the text is anchored."""
+    """The label of a node: start of its first baseline, text anchor, and the box that it covers."""
 
-    node: Node
+    node: DrawnNode
     x: float
     y: float
     anchor: str
     box: Box
 
 
-def route(scene: Scene) -> list[Way]:
-    """A way for each arc: as the layout leads it, else the least bent one that passes other nodes
-    and ways of its two ends."""
+def route(scene: Scene) -> list[ArcPath]:
+    """Return a path for each arc.
+
+    It runs through the points of the layout, or else has the smallest bend that avoids other nodes
+    and other arcs between the same two nodes.
+    """
     arcs = scene.arcs
     pairs: dict[frozenset[str], set[float]] = {}
     count = Counter(frozenset((a.source, a.target)) for a in arcs)
-    ways: list[Way] = []
+    paths: list[ArcPath] = []
     for arc in arcs:
         key = frozenset((arc.source, arc.target))
         used = pairs.setdefault(key, set())
         best = _best(scene, arc, used, count[key] > 1)
         sense = 1.0 if arc.source < arc.target else -1.0
         used.add(best.bend * sense)
-        ways.append(best)
-    return ways
+        paths.append(best)
+    return paths
 
 
-def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> Way:
-    """The way of least cost; the candidates come least bent first, so that the search ends as soon
-    as none can be better."""
+def _best(scene: Scene, arc: Arc, used: set[float], twins: bool) -> ArcPath:
+    """Return the path of lowest cost.
+
+    Candidates come in order of a lower bound of their cost, so the search ends as soon as no later
+    one can be better.
+    """
     led = scene.through.get((arc.source, arc.target), ())
     best, least = None, inf
     candidates = (
-        [(0.0, partial(_led, points=led)), (0.5, partial(_led, points=led, level=_LEVEL))]
+        [
+            (0.0, partial(_path_through, points=led)),
+            (0.5, partial(_path_through, points=led, level=_LEVEL)),
+        ]
         if led
         else []
     )
     for cost_at_least, make in [
         *candidates,
-        *((abs(bend), partial(_way, bend=bend)) for bend in _BENDS),
+        *((abs(bend), partial(_bent_path, bend=bend)) for bend in _BENDS),
     ]:
         if best is not None and least <= cost_at_least:
             break
-        way = make(scene.nodes, arc)
-        cost = _cost(scene.nodes, way, used, twins) + (
-            cost_at_least if len(way.controls) > 1 else 0.0
+        path = make(scene.nodes, arc)
+        cost = _cost(scene.nodes, path, used, twins) + (
+            cost_at_least if len(path.controls) > 1 else 0.0
         )
         if best is None or cost < least:
-            best, least = way, cost
+            best, least = path, cost
     assert best is not None
     return best
 
 
-def _way(nodes: Mapping[str, Node], arc: Arc, bend: float) -> Way:
+def _bent_path(nodes: Mapping[str, DrawnNode], arc: Arc, bend: float) -> ArcPath:
     source, target = nodes[arc.source], nodes[arc.target]
     (x1, y1), (x2, y2) = source.at, target.at
     length = hypot(x2 - x1, y2 - y1) or 1.0
     control = ((x1 + x2) / 2 - (y2 - y1) / length * bend, (y1 + y2) / 2 + (x2 - x1) / length * bend)
-    return Way(arc, _border(source, control), (control,), _border(target, control), bend)
+    return ArcPath(arc, _border(source, control), (control,), _border(target, control), bend)
 
 
-def _led(nodes: Mapping[str, Node], arc: Arc, points: Sequence[Point], level: float = 0.0) -> Way:
-    """The way by the layout's points; what lies on a line between its neighbours is left out, so
-    that straight is straight.
+def _path_through(
+    nodes: Mapping[str, DrawnNode], arc: Arc, points: Sequence[Point], level: float = 0.0
+) -> ArcPath:
+    """Return the path through the points of the layout.
 
-    With `level` it runs level for so long on both sides of each point, and cuts no corner over what
-    stands beside it.
+    Points that lie on the line between their neighbours are left out, so straight parts stay
+    straight. With `level` the path runs level for this distance on both sides of each point, so it
+    does not cut a corner over a neighbour of the point.
     """
     if level:
         step = level if nodes[arc.target].at[0] > nodes[arc.source].at[0] else -level
@@ -149,13 +167,13 @@ def _led(nodes: Mapping[str, Node], arc: Arc, points: Sequence[Point], level: fl
         if abs(off) > 2.0 * hypot(after[0] - x0, after[1] - y0):
             kept.append(point)
     if not kept:
-        return _way(nodes, arc, 0.0)
+        return _bent_path(nodes, arc, 0.0)
     source, target = nodes[arc.source], nodes[arc.target]
-    return Way(arc, _border(source, kept[0]), tuple(kept), _border(target, kept[-1]), 0.0)
+    return ArcPath(arc, _border(source, kept[0]), tuple(kept), _border(target, kept[-1]), 0.0)
 
 
-def _border(node: Node, towards: Point) -> Point:
-    """Where the line from the node's centre leaves it."""
+def _border(node: DrawnNode, towards: Point) -> Point:
+    """Return where the line from the centre of a node towards a point crosses its border."""
     (x, y), (w, h) = node.at, node.half
     dx, dy = towards[0] - x, towards[1] - y
     if node.is_place:
@@ -165,9 +183,13 @@ def _border(node: Node, towards: Point) -> Point:
     return x + dx * scale, y + dy * scale
 
 
-def _cost(nodes: Mapping[str, Node], way: Way, used: set[float], twins: bool) -> float:
-    ends = (way.arc.source, way.arc.target)
-    points = way.points
+def _cost(nodes: Mapping[str, DrawnNode], path: ArcPath, used: set[float], twins: bool) -> float:
+    """Return the cost: 1000 per node hit, 1500 for lying on another arc, plus the bend itself.
+
+    A path through the layout's points is preferred to an equally cheap bent one (-0.5).
+    """
+    ends = (path.arc.source, path.arc.target)
+    points = path.points
     left, right = min(x for x, _ in points) - _REACH, max(x for x, _ in points) + _REACH
     top, bottom = min(y for _, y in points) - _REACH, max(y for _, y in points) + _REACH
     near = [
@@ -176,22 +198,25 @@ def _cost(nodes: Mapping[str, Node], way: Way, used: set[float], twins: bool) ->
         if left < n.at[0] < right and top < n.at[1] < bottom and n.name not in ends
     ]
     hits = sum(any(_near(node, p) for p in points) for node in near)
-    sense = 1.0 if way.arc.source < way.arc.target else -1.0
-    alone = len(way.controls) == 1
-    taken = alone and (way.bend * sense in used or (twins and way.bend == 0.0))
-    return 1000.0 * hits + 1500.0 * taken + abs(way.bend) - 0.5 * (not alone)
+    sense = 1.0 if path.arc.source < path.arc.target else -1.0
+    alone = len(path.controls) == 1
+    taken = alone and (path.bend * sense in used or (twins and path.bend == 0.0))
+    return 1000.0 * hits + 1500.0 * taken + abs(path.bend) - 0.5 * (not alone)
 
 
-def _near(node: Node, p: Point) -> bool:
+def _near(node: DrawnNode, p: Point) -> bool:
     w, h = node.half
     return abs(p[0] - node.at[0]) < w + _CLEARANCE and abs(p[1] - node.at[1]) < h + _CLEARANCE
 
 
-def place_words(nodes: Mapping[str, Node], ways: Sequence[Way]) -> list[Words]:
-    """Words beside each node where they cover least: nodes and other words count most, then
-    arcs."""
+def place_words(nodes: Mapping[str, DrawnNode], paths: Sequence[ArcPath]) -> list[Words]:
+    """Place the label of each node where it covers least.
+
+    Covering nodes and other labels costs most, then arcs. Long labels are placed first, because
+    they have the fewest free positions; those of places before those of transitions.
+    """
     solid = [_around(n) for n in nodes.values()]
-    curves = [w.points for w in ways]
+    curves = [w.points for w in paths]
     placed: list[Words] = []
     for node in sorted(
         nodes.values(), key=lambda n: (not n.is_place, -max(map(len, n.lines), default=0))
@@ -206,8 +231,8 @@ def place_words(nodes: Mapping[str, Node], ways: Sequence[Way]) -> list[Words]:
     return placed
 
 
-def _region(node: Node) -> Box:
-    """Where a node's words can stand."""
+def _region(node: DrawnNode) -> Box:
+    """Return the region in which the label of a node can be."""
     (x, y), reach = node.at, _AROUND + max(map(text_width, node.lines), default=0.0)
     tall = _AROUND + LINE * len(node.lines)
     return x - reach, y - tall, x + reach, y + tall
@@ -221,10 +246,10 @@ def _holds(box: Box, p: Point) -> bool:
     return box[0] < p[0] < box[2] and box[1] < p[1] < box[3]
 
 
-def badge_spot(node: Node, ways: Sequence[Way]) -> Point:
-    """The corner of a place that is farthest from the ends of its arcs."""
-    ends = [w.start for w in ways if w.arc.source == node.name] + [
-        w.end for w in ways if w.arc.target == node.name
+def badge_spot(node: DrawnNode, paths: Sequence[ArcPath]) -> Point:
+    """Return the corner of a place that is farthest from the ends of its arcs, for its badge."""
+    ends = [w.start for w in paths if w.arc.source == node.name] + [
+        w.end for w in paths if w.arc.target == node.name
     ]
     reach = RADIUS * 0.8
     corners = [
@@ -236,12 +261,12 @@ def badge_spot(node: Node, ways: Sequence[Way]) -> Point:
 
 
 def text_width(text: str) -> float:
-    """Estimated width of a text in the drawing's font."""
+    """Return the estimated width of a text in the font of the drawing."""
     return len(text) * FONT * _CHARACTER
 
 
-def _spots(node: Node) -> Iterator[Words]:
-    """Candidate positions, the usual ones first."""
+def _spots(node: DrawnNode) -> Iterator[Words]:
+    """Yield candidate positions of a label, the usual ones first."""
     width = max(map(text_width, node.lines), default=0.0)
     height = LINE * len(node.lines)
     (x, y), (w, h) = node.at, node.half
@@ -260,17 +285,20 @@ def _spots(node: Node) -> Iterator[Words]:
             yield _words(node, x - 0.8 * w, top, "end", width, height)
 
 
-def _words(node: Node, x: float, top: float, anchor: str, width: float, height: float) -> Words:
+def _words(
+    node: DrawnNode, x: float, top: float, anchor: str, width: float, height: float
+) -> Words:
     left = {"middle": x - width / 2, "start": x, "end": x - width}[anchor]
     return Words(node, x, top + FONT * 0.85, anchor, (left, top, left + width, top + height))
 
 
-def _around(node: Node) -> Box:
+def _around(node: DrawnNode) -> Box:
     (x, y), (w, h) = node.at, node.half
     return x - w - 2, y - h - 2, x + w + 2, y + h + 2
 
 
 def _cover(box: Box, others: Sequence[Box], curves: Sequence[Sequence[Point]]) -> float:
+    """Return the cost of what a label covers: boxes by area, arcs by the length inside the box."""
     cost = 0.0
     for other in others:
         across = min(box[2], other[2]) - max(box[0], other[0])

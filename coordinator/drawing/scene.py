@@ -1,43 +1,45 @@
-"""What there is to draw: nodes with their words, arcs with their ends, before anything has a place
-on the paper."""
+"""What a drawing shows: nodes with labels and positions, arcs between them, before routing."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from petrobot.coordinator.drawing.layers import Edge
-from petrobot.coordinator.drawing.layout import Point, lay_out
+from petrobot.coordinator.drawing.layout import Edge, Point, lay_out
 from petrobot.coordinator.task import End, Kind, Place, Scope, Task, Transition
 from petrobot.coordinator.task.macros import macros_around
 from petrobot.coordinator.task.net import Marking, Net
 from petrobot.coordinator.task.wording import listed
 
-# Which part of a task is drawn: the whole with its macro places closed, or the inside of one of them.
+# Which part of a task is drawn: all of it with its macro places closed, or the inside of one.
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """One level of a task. `task` is the net that it is part of: the task itself, or one with a
-    subnet's net."""
+    """One level of a task: the whole, or the inside of a macro place.
+
+    `task` is the net that it is part of: the task itself, or one with the net of a subnet.
+    """
 
     task: Task
     places: Mapping[str, Place]
     transitions: Mapping[str, Transition]
     border: frozenset[str]
-    """Transitions around the opened macro place: drawn to show where tokens come from and go to."""
+    """Transitions around the opened macro place, drawn to show where tokens come from and go."""
     folded: frozenset[str]
-    """Elements of the net that are not drawn because only error branches reach them."""
+    """Elements of the net that are hidden because only error branches reach them."""
     shown: Mapping[str, str]
-    """What each place of the net is drawn as, here: itself or the macro place around it."""
+    """What each place of the net is drawn as on this sheet: itself or a macro place around it."""
     tokens: Mapping[str, int]
     prefix: str = ""
-    """What stands before the net's names in the flat task."""
+    """Prefix of the names of the net in the flat task."""
 
 
 def sheet_of(task: Task, inside: str, error_branches: bool, marking: Marking | None) -> Sheet:
-    """The sheet of a macro place, named as in the flat task (`fetch.grasp`), or of the whole for
-    "". Raises ValueError."""
+    """Return the sheet of a macro place, named as in the flat task (`fetch.grasp`).
+
+    "" stands for the whole task. Raises ValueError if there is no such macro place.
+    """
     net, prefix, group = _opened(task, inside)
     shown = dict(_shown(net, group))
     folded = frozenset() if error_branches else _folded(net)
@@ -67,14 +69,18 @@ def sheet_of(task: Task, inside: str, error_branches: bool, marking: Marking | N
 
 
 def _opened(task: Task, inside: str) -> tuple[Task, str, str]:
-    """The net that a macro place opens, the prefix of its names in the flat task, and the group in
-    it ("" for all of it)."""
+    """Return the net of a macro place, the prefix of its names in the flat task, and its group.
+
+    The group is "" if the whole net is shown. Raises ValueError.
+    """
     net, prefix, group = task, "", ""
     for part in inside.split(".") if inside else ():
         place = net.places.get(part)
         if place is None or place.kind is not Kind.MACRO or group:
             known = ", ".join(n for n, p in net.places.items() if p.kind is Kind.MACRO)
-            raise ValueError(f"{task.name} has no macro place {inside!r}: {known or 'none'} there")
+            raise ValueError(
+                f"{task.name} has no macro place {inside!r}; it has {known or 'none'} at that level"
+            )
         if place.subnet:
             subnet = task.subnets[place.subnet]
             net, prefix = (
@@ -87,7 +93,7 @@ def _opened(task: Task, inside: str) -> tuple[Task, str, str]:
 
 
 def _shown(net: Task, group: str) -> Iterator[tuple[str, str]]:
-    """What each place within the group is drawn as on the group's sheet."""
+    """Yield what each place within the group is drawn as on the sheet of the group."""
     for place in net.places.values():
         around = [place.name, *macros_around(place.macro, net.places)]
         if not group:
@@ -105,8 +111,7 @@ def _joined(t: Transition) -> Iterable[str]:
 
 
 def _folded(net: Task) -> frozenset[str]:
-    """Error branches, the places that nothing else touches, and the macro places that hold nothing
-    else."""
+    """Return the hidden elements: error branches, and what only they touch or contain."""
     hidden = set(net.error_elements)
     touched: dict[str, list[bool]] = {}
     for t in net.transitions.values():
@@ -125,7 +130,7 @@ def _folded(net: Task) -> frozenset[str]:
 def _tokens(
     task: Task, marking: Marking | None, prefix: str, shown: Mapping[str, str]
 ) -> dict[str, int]:
-    """Tokens by drawn place; a macro place shows those of all places inside it."""
+    """Return the tokens by drawn place; a macro place shows those of all places inside it."""
     tokens: dict[str, int] = {}
     for name, n in zip(task.net.places, marking or task.net.initial, strict=True):
         here = (
@@ -142,12 +147,12 @@ RADIUS = 21.0
 BAR = (4.0, 21.0)
 """Half thickness and half length of a transition."""
 TURNS = 4
-"""Firings of one transition that are numbered along a path."""
+"""The most firings of one transition that are numbered along a path."""
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
-    """A place or a transition. `style` are its CSS classes; `lines` stand beside it, `hint` is its
+class DrawnNode:
+    """A place or a transition: `style` are its CSS classes, `lines` its label, `hint` its
     tooltip."""
 
     name: str
@@ -158,13 +163,13 @@ class Node:
     hint: str
     tokens: int = 0
     hidden: int = 0
-    """Folded error exits."""
+    """Number of hidden error transitions that leave it."""
     upright: bool = True
-    """Transitions: the bar stands."""
+    """Transitions only: the bar is vertical."""
     heat: float | None = None
-    """How warm its halo is, 0 to 1."""
+    """Intensity of its halo, 0 to 1; None for no halo."""
     turns: str = ""
-    """Transitions: when they fire along a path, such as "2, 5"."""
+    """Transitions only: when they fire along a path, such as "2, 5"."""
 
     @property
     def half(self) -> tuple[float, float]:
@@ -176,16 +181,18 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """What is told over a drawing: a halo for each place or transition (0 to 1), and a path of
-    firings, numbered."""
+    """Information drawn over a scene: halos of places or transitions (0 to 1), a path of
+    firings."""
 
     heat: Mapping[str, float] = field(default_factory=dict)
     path: Sequence[str] = ()
     legend: str = ""
 
-    def on(self, node: Node, shown: Mapping[str, str]) -> Node:
-        """The node with what is told of it; what lies inside a macro place (by `shown`) is told of
-        that place."""
+    def on(self, node: DrawnNode, shown: Mapping[str, str]) -> DrawnNode:
+        """Return the node with its overlay.
+
+        A closed macro place receives the overlay of everything inside it (`shown`).
+        """
         heat = [h for name, h in self.heat.items() if node.name == shown.get(name, name)]
         turns = [
             str(i) for i, name in enumerate(self.path, 1) if node.name == shown.get(name, name)
@@ -200,7 +207,7 @@ class Overlay:
 
 @dataclass(frozen=True, slots=True)
 class Arc:
-    """An arc by node names. `kind`: plain, normal, error, preempt, going, inhibitor."""
+    """An arc between two nodes. `kind`: plain, normal, error, preempt, going or inhibitor."""
 
     source: str
     target: str
@@ -211,20 +218,20 @@ class Arc:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Everything on the paper."""
+    """Everything in a drawing."""
 
     title: str
     text: str
-    nodes: Mapping[str, Node]
+    nodes: Mapping[str, DrawnNode]
     arcs: tuple[Arc, ...] = field(default=())
     through: Mapping[Edge, Sequence[Point]] = field(default_factory=dict)
-    """Points by which an automatic layout leads an arc, by its two ends."""
+    """Points through which the layout leads an arc, by its two ends."""
     legend: str = ""
     shown: Mapping[str, str] = field(default_factory=dict)
-    """Places and transitions that are drawn as another node, the macro place around them."""
+    """Places and transitions that are drawn as another node: the macro place around them."""
 
     def under(self, overlay: Overlay) -> Scene:
-        """The same scene with an overlay."""
+        """Return the scene with an overlay."""
         nodes = {name: overlay.on(node, self.shown) for name, node in self.nodes.items()}
         return replace(self, nodes=nodes, legend=overlay.legend)
 
@@ -232,8 +239,10 @@ class Scene:
 def scene_of_task(
     task: Task, error_branches: bool, marking: Marking | None, title: str | None, inside: str = ""
 ) -> Scene:
-    """The scene of a task as its file has it, or of the inside of a macro place. Raises ValueError
-    when there is none."""
+    """Return the scene of a task, or of the inside of a macro place.
+
+    Raises ValueError if there is no such macro place.
+    """
     sheet = sheet_of(task, inside, error_branches, marking)
     arcs = tuple(_joined_arcs(sheet))
     drawn: dict[str, Place | Transition] = {**sheet.places, **sheet.transitions}
@@ -258,7 +267,7 @@ def scene_of_task(
 
 
 def _elsewhere(sheet: Sheet) -> dict[str, str]:
-    """By name in the flat task, what is drawn as a macro place here."""
+    """Return by name in the flat task the node that it is drawn as."""
     net = sheet.task
     shown = {sheet.prefix + name: here for name, here in sheet.shown.items()}
     for name, t in net.flat.transitions.items():
@@ -274,7 +283,7 @@ def _elsewhere(sheet: Sheet) -> dict[str, str]:
 
 
 def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
-    """The scene of an ordinary net."""
+    """Return the scene of a net."""
     arcs: list[Arc] = []
     for t, name in enumerate(net.transitions):
         arcs += [Arc(net.places[p], name, w) for p, w in net.consume[t]]
@@ -289,11 +298,11 @@ def scene_of_net(net: Net, marking: Marking | None, title: str | None) -> Scene:
     )
     at = layout.at
     nodes = {
-        p: Node(p, True, at[p], "place resource", (p,), f"place {p}", n)
+        p: DrawnNode(p, True, at[p], "place resource", (p,), f"place {p}", n)
         for p, n in zip(net.places, tokens, strict=True)
     }
     nodes |= {
-        t: Node(
+        t: DrawnNode(
             t, False, at[t], "transition", (t,), f"transition {t}", upright=_upright(t, at, arcs)
         )
         for t in net.transitions
@@ -306,8 +315,10 @@ def _given(x: float | None, y: float | None) -> Point | None:
 
 
 def _joined_arcs(sheet: Sheet) -> Iterable[Arc]:
-    """The sheet's arcs; those that end in one macro place in the same way are drawn as one, with
-    their weights summed."""
+    """Return the arcs of the sheet.
+
+    Arcs of the same kind between the same two drawn nodes become one; their weights are added up.
+    """
     joined: dict[tuple[str, str, str], Arc] = {}
     for t in sheet.transitions.values():
         for arc in _task_arcs(sheet, t):
@@ -337,7 +348,7 @@ def _task_arcs(sheet: Sheet, t: Transition) -> Iterable[Arc]:
             yield Arc(t.name, shown[o.place], o.weight, "plain", style)
 
 
-def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
+def _place_node(sheet: Sheet, p: Place, at: Point) -> DrawnNode:
     task = sheet.task
     exits = [task.transitions[t] for t in sheet.folded & set(task.transitions)]
     inside = {
@@ -358,12 +369,14 @@ def _place_node(sheet: Sheet, p: Place, at: Point) -> Node:
     capacity = f", at most {p.capacity}" if p.capacity is not None else ""
     hint = f"{p.name}: {what}{capacity}"
     style = f"place {p.kind}" + (" error" if p.name in task.error_elements else "")
-    return Node(p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden)
+    return DrawnNode(
+        p.name, True, at, style, tuple(lines), hint, sheet.tokens.get(p.name, 0), hidden
+    )
 
 
 def _transition_node(
     sheet: Sheet, t: Transition, at: Mapping[str, Point], arcs: Iterable[Arc]
-) -> Node:
+) -> DrawnNode:
     task = sheet.task
     style = "transition" + (" error" if t.name in task.error_elements else "")
     style += " outside" if t.name in sheet.border else ""
@@ -372,7 +385,7 @@ def _transition_node(
         hint += f", priority {t.priority}"
     if t.weight is not None:
         hint += f", weight {t.weight:g}"
-    return Node(
+    return DrawnNode(
         t.name,
         False,
         at[t.name],
@@ -384,8 +397,10 @@ def _transition_node(
 
 
 def event_lines(task: Task, t: Transition) -> tuple[str, ...]:
-    """The words at a transition: what must happen, with the prefixes int and ext of the paper's
-    figures."""
+    """Return the label of a transition: what must happen before it fires.
+
+    The prefixes int and ext (internal, external event) are those of the figures in the paper.
+    """
     lines: list[str] = []
     for name in t.events:
         lines.append(f"{'ext' if task.events[name].scope is Scope.EXTERNAL else 'int'} {name}")
@@ -401,7 +416,7 @@ def event_lines(task: Task, t: Transition) -> tuple[str, ...]:
 
 
 def _upright(name: str, at: Mapping[str, Point], arcs: Iterable[Arc]) -> bool:
-    """Whether most of a transition's arcs come from the sides, so that its bar stands."""
+    """Return whether most arcs of a transition come from the sides, so its bar is vertical."""
     across = down = 0.0
     x, y = at[name]
     for arc in arcs:

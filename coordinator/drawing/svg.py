@@ -1,4 +1,4 @@
-"""A scene as SVG text."""
+"""Write a scene as SVG text."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from petrobot.coordinator.drawing.layout import Point
 from petrobot.coordinator.drawing.routing import (
     FONT,
     LINE,
-    Way,
+    ArcPath,
     Words,
     badge_spot,
     place_words,
     route,
 )
-from petrobot.coordinator.drawing.scene import RADIUS, Node, Scene
+from petrobot.coordinator.drawing.scene import RADIUS, DrawnNode, Scene
 
 _MARGIN = 24.0
 _DOTS: dict[int, tuple[Point, ...]] = {
@@ -86,10 +86,10 @@ text{fill:#e6eaf0}
 
 
 def render(scene: Scene) -> str:
-    """The scene as a complete SVG document."""
-    ways = route(scene)
-    words = place_words(scene.nodes, ways)
-    left, top, width, height = _frame(scene, ways, words)
+    """Return the scene as a complete SVG document."""
+    paths = route(scene)
+    words = place_words(scene.nodes, paths)
+    left, top, width, height = _frame(scene, paths, words)
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{left:g} {top:g} {width:g} {height:g}" '
         f'width="{width:g}" height="{height:g}" role="img" aria-labelledby="title desc">',
@@ -98,10 +98,12 @@ def render(scene: Scene) -> str:
         f"<style>{_STYLE}</style>",
         f'<rect class="page" x="{left:g}" y="{top:g}" width="{width:g}" height="{height:g}"/>',
     ]
-    lines += [line for way in ways for line in _arc(way)]
-    lines += [line for node in scene.nodes.values() for line in _node(node, badge_spot(node, ways))]
+    lines += [line for path in paths for line in _arc(path)]
+    lines += [
+        line for node in scene.nodes.values() for line in _node(node, badge_spot(node, paths))
+    ]
     lines += [line for w in words for line in _words(w)]
-    lines += [line for way in ways if way.arc.weight > 1 for line in _weight(way)]
+    lines += [line for path in paths if path.arc.weight > 1 for line in _weight(path)]
     if scene.legend:
         lines += _text(
             scene.legend, left + _MARGIN / 2, top + height - _MARGIN / 2, "start", "legend"
@@ -117,15 +119,15 @@ def _description(scene: Scene) -> str:
 
 
 def _frame(
-    scene: Scene, ways: Sequence[Way], words: Sequence[Words]
+    scene: Scene, paths: Sequence[ArcPath], words: Sequence[Words]
 ) -> tuple[float, float, float, float]:
-    """Left, top, width and height that hold everything."""
+    """Return left, top, width and height of a frame around everything."""
     points = [
         (n.at[0] + sx * (n.half[0] + 8), n.at[1] + sy * (n.half[1] + 8))
         for n in scene.nodes.values()
         for sx, sy in ((-1, -1), (1, 1))
     ]
-    points += [w.point(i / 8) for w in ways for i in range(9)]
+    points += [w.point(i / 8) for w in paths for i in range(9)]
     points += [p for w in words for p in ((w.box[0], w.box[1]), (w.box[2], w.box[3]))]
     xs, ys = [x for x, _ in points] or [0.0], [y for _, y in points] or [0.0]
     left, top = round(min(xs) - _MARGIN), round(min(ys) - _MARGIN)
@@ -133,7 +135,7 @@ def _frame(
     return left, top, width, round(max(ys) + _MARGIN + (LINE if scene.legend else 0.0)) - top
 
 
-def _node(node: Node, badge: Point) -> Iterator[str]:
+def _node(node: DrawnNode, badge: Point) -> Iterator[str]:
     (x, y), (w, h) = node.at, node.half
     yield f'<g id="{escape(node.name, {chr(34): "&quot;"})}"><title>{escape(node.hint)}</title>'
     yield from _told(node)
@@ -155,8 +157,8 @@ def _node(node: Node, badge: Point) -> Iterator[str]:
     yield "</g>"
 
 
-def _told(node: Node) -> Iterator[str]:
-    """The overlay: a halo, and the turns at which a transition fires."""
+def _told(node: DrawnNode) -> Iterator[str]:
+    """Yield the overlay of a node: a coloured halo, and when a transition fires along a path."""
     (x, y), (w, h) = node.at, node.half
     if node.heat is not None:
         shape = f'width="{2 * w + 20:g}" height="{2 * h + 20:g}" rx="{w + 10:g}"'
@@ -173,7 +175,7 @@ def _told(node: Node) -> Iterator[str]:
         yield from _text(node.turns, x + w + 8, y - h - 4, "start", "turn")
 
 
-def _tokens(node: Node) -> Iterator[str]:
+def _tokens(node: DrawnNode) -> Iterator[str]:
     x, y = node.at
     if node.tokens > 4:
         yield (
@@ -185,10 +187,10 @@ def _tokens(node: Node) -> Iterator[str]:
         yield f'<circle class="token" cx="{x + dx:g}" cy="{y + dy:g}" r="4.2"/>'
 
 
-def _badge(node: Node, spot: Point) -> Iterator[str]:
+def _badge(node: DrawnNode, spot: Point) -> Iterator[str]:
     if node.hidden:
         x, y = spot
-        what = f"{node.hidden} error exit{'s' * (node.hidden > 1)} hidden"
+        what = f"{node.hidden} error transition{'s' * (node.hidden > 1)} hidden"
         yield f'<g><title>{what}</title><circle class="badge" cx="{x:g}" cy="{y:g}" r="7.5"/>'
         yield (
             f'<text class="badge-text" x="{x:g}" y="{y + 3.5:g}" '
@@ -196,15 +198,15 @@ def _badge(node: Node, spot: Point) -> Iterator[str]:
         )
 
 
-def _arc(way: Way) -> Iterator[str]:
-    (x1, y1), (cx, cy), (x2, y2) = way.start, way.controls[-1], way.end
-    style = " ".join(filter(None, (way.arc.kind, way.arc.style)))
+def _arc(path: ArcPath) -> Iterator[str]:
+    (x1, y1), (cx, cy), (x2, y2) = path.start, path.controls[-1], path.end
+    style = " ".join(filter(None, (path.arc.kind, path.arc.style)))
     direction = atan2(y2 - cy, x2 - cx)
-    reach = 9.0 if way.arc.kind == "inhibitor" else 8.0
+    reach = 9.0 if path.arc.kind == "inhibitor" else 8.0
     ex, ey = x2 - reach * cos(direction), y2 - reach * sin(direction)
-    curve = f"L{ex:.1f} {ey:.1f}" if way.is_straight else "".join(_pieces(way, (ex, ey)))
+    curve = f"L{ex:.1f} {ey:.1f}" if path.is_straight else "".join(_pieces(path, (ex, ey)))
     yield f'<path class="arc {style}" d="M{x1:.1f} {y1:.1f}{curve}"/>'
-    if way.arc.kind == "inhibitor":
+    if path.arc.kind == "inhibitor":
         bx, by = x2 - 4.5 * cos(direction), y2 - 4.5 * sin(direction)
         yield f'<circle class="bar {style}" cx="{bx:.1f}" cy="{by:.1f}" r="4.5"/>'
         return
@@ -215,8 +217,8 @@ def _arc(way: Way) -> Iterator[str]:
     yield f'<polygon class="head {style}" points="{points}"/>'
 
 
-def _pieces(way: Way, end: Point) -> Iterator[str]:
-    for (_, _), (cx, cy), (x, y) in way.pieces(end):
+def _pieces(path: ArcPath, end: Point) -> Iterator[str]:
+    for (_, _), (cx, cy), (x, y) in path.pieces(end):
         yield f"Q{cx:.1f} {cy:.1f} {x:.1f} {y:.1f}"
 
 
@@ -226,17 +228,19 @@ def _words(words: Words) -> Iterator[str]:
         yield from _text(line, words.x, words.y + i * LINE, words.anchor, style)
 
 
-def _weight(way: Way) -> Iterator[str]:
-    x, y = way.point(0.5)
-    (x1, y1), (x2, y2) = way.point(0.45), way.point(0.55)
+def _weight(path: ArcPath) -> Iterator[str]:
+    x, y = path.point(0.5)
+    (x1, y1), (x2, y2) = path.point(0.45), path.point(0.55)
     length = hypot(x2 - x1, y2 - y1) or 1.0
     x, y = x + (y2 - y1) / length * FONT * 0.7, y - (x2 - x1) / length * FONT * 0.7
-    yield from _text(str(way.arc.weight), x, y + 4, "middle", "weight")
+    yield from _text(str(path.arc.weight), x, y + 4, "middle", "weight")
 
 
 def _text(text: str, x: float, y: float, anchor: str, style: str) -> Iterator[str]:
-    """A text on a halo of the page's colour (two elements: not every renderer knows
-    paint-order)."""
+    """Yield a text with a halo in the colour of the page.
+
+    Two elements, because not every renderer supports `paint-order`.
+    """
     where = f'x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"'
     yield f'<text class="halo {style}" aria-hidden="true" {where}>{escape(text)}</text>'
     yield f'<text class="{style}" {where}>{escape(text)}</text>'

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import sum_by
-from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.time.stochastic import Measured, is_cause, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import Forecast, forecast
 from petrobot.coordinator.learning.batch import Array
@@ -333,7 +333,7 @@ def propagate(
     choice: ChoiceShares | None = None,
     *,
     measure: str | None = None,
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
 ) -> Propagated:
     """Compute R, C and J of the primitive tasks and of the whole task from estimates of actions,
     through the net.

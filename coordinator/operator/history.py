@@ -197,4 +197,4 @@ class _Teller:
 
 
 WORKS: Mapping[str, Callable[..., Any]] = {"runs": _runs, "run": _run}
-"""For `coordinator.analysing.Apart`."""
+"""For `coordinator.background.BackgroundProcess`."""

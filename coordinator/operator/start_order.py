@@ -317,4 +317,4 @@ def _form(tasks: str, shipped: str, name: str, estimates: str) -> dict[str, Any]
 
 
 WORKS: Mapping[str, Callable[..., Any]] = {"form": _form}
-"""For `coordinator.analysing.Apart`."""
+"""For `coordinator.background.BackgroundProcess`."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from petrobot.coordinator.background import Apart
+from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.engine import Engine
 from petrobot.coordinator.launch import (
     SCRIPTED,
@@ -170,7 +170,7 @@ class Station:
         self._choices: dict[str, str] = {}
         self._nodes: Mapping[str, Any] = {}
         self._run: Run | None = None
-        self._apart = Apart()
+        self._apart = BackgroundProcess()
         self._starting = self._stopped = False
         self._going: asyncio.Task[None] | None = None
         self._looking = asyncio.get_running_loop().create_task(self._look())

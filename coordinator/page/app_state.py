@@ -11,7 +11,7 @@ from typing import Any
 
 from aiohttp import web
 
-from petrobot.coordinator.background import Apart
+from petrobot.coordinator.background import BackgroundProcess
 from petrobot.coordinator.operator.port import HistoryPort, MissionPort, OffersPort, StartsPort
 from petrobot.coordinator.page.access import Doors
 from petrobot.coordinator.page.connection_limits import Gate
@@ -38,9 +38,9 @@ class House:
     gate: Gate | None = None
     sessions: set[Session] = field(default_factory=set)
     commands: set[asyncio.Task[None]] = field(default_factory=set)
-    apart: Apart = field(default_factory=Apart)
+    apart: BackgroundProcess = field(default_factory=BackgroundProcess)
     """Where work on documents and journals is done."""
-    analyses: Apart = field(default_factory=Apart)
+    analyses: BackgroundProcess = field(default_factory=BackgroundProcess)
     """Where drawings are analysed, which takes so long that nothing else may wait for it."""
     closing: bool = False
     _heard: dict[str, float] = field(default_factory=dict)

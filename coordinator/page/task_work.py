@@ -1,7 +1,7 @@
 """Work on task files that may take long for a large net, as plain functions of plain data: open,
 save, check, convert.
 
-The page's server has all of it done in a process of its own (`coordinator.analysing.Apart`), in the
+The page's server has all of it done in a process of its own (`coordinator.background.BackgroundProcess`), in the
 names of `WORKS`.
 """
 
@@ -16,10 +16,8 @@ from typing import Any
 import tomlkit
 
 from petrobot.coordinator.analysis.commands import net_file_of
-from petrobot.coordinator.analysis.formats import pnml_writing
-from petrobot.coordinator.analysis.formats.netfile import FormatError as NetFormatError
-from petrobot.coordinator.analysis.formats.netfile import NetFile
-from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
+from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
+from petrobot.coordinator.analysis.formats.pnml import parse_pnml, write_pnml
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.page.edits import EditError, Rename, parse, plain
 from petrobot.coordinator.page.task_store import Conflict, StoreError, TaskStore, TaskText
@@ -139,7 +137,7 @@ def export(text: str, filename: str, form: str) -> Made:
     if form == "toml":
         return Made(dumps(task), "application/toml")
     if form == "pnml":
-        return Made(pnml_writing.write_pnml(net_file_of(task)), "application/xml")
+        return Made(write_pnml(net_file_of(task)), "application/xml")
     raise FormatError(f"no format {form!r}: toml and pnml are known")
 
 
@@ -151,7 +149,7 @@ def imported(form: str, text: str) -> str:
         raise FormatError(f"no format {form!r}: toml and pnml are known")
     try:
         return as_task_file(parse_pnml(text))
-    except NetFormatError as error:
+    except NetFileError as error:
         raise FormatError(f"not a place/transition net in PNML: {error}") from error
 
 

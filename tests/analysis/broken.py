@@ -1,6 +1,6 @@
-"""Deliberately broken variants of a task: what a designer gets wrong, and the analysis must catch.
+"""Deliberately broken variants of a task: mistakes of designers that the analysis must find.
 
-`python -m tests.analysis.broken FOLDER TASK...` draws what is found of each for docs/.
+`python -m tests.analysis.broken FOLDER TASK...` draws the findings for docs/.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import Analysis, analyse
 from petrobot.coordinator.cli.witnesses import picture, refused
 from petrobot.coordinator.task import End, Kind, Task, Transition
 from petrobot.coordinator.task.file import load
 
 TASKS = Path(__file__).parents[2] / "coordinator" / "tasks"
-LIMITS = Limits(states=20_000)
+LIMITS = SearchLimits(states=20_000)
 
 
 def _with(task: Task, transition: Transition) -> Task:
@@ -25,7 +25,7 @@ def _with(task: Task, transition: Transition) -> Task:
 
 
 def error_exits(task: Task) -> list[Transition]:
-    """Transitions that take a run which ended with ERROR, in the file's order."""
+    """Return the transitions that take a run which ended with ERROR, in the order of the file."""
     return [
         t
         for t in task.transitions.values()
@@ -39,7 +39,7 @@ def missing_recovery(task: Task) -> Task:
 
 
 def double_resource(task: Task) -> Task:
-    """Every resource is there twice, so that two runs may want one device at a time."""
+    """Every resource exists twice, so two runs may use one device at a time."""
     places = {
         name: replace(p, tokens=2, capacity=None)
         if p.kind is Kind.RESOURCE and p.tokens == 1
@@ -73,8 +73,8 @@ VARIANTS: dict[str, Callable[[Task], Task]] = {
 
 
 def damaged(task: Task) -> Iterator[tuple[str, Task]]:
-    """Damage of all kinds that a hand does to a task file: arcs lost, doubled, led elsewhere or
-    added, tokens changed."""
+    """Yield a task with all kinds of single mistakes: arcs lost, doubled, redirected or added,
+    tokens changed."""
     for t in task.transitions.values():
         for i, o in enumerate(t.outputs):
             others = (*t.outputs[:i], *t.outputs[i + 1 :])
@@ -104,7 +104,7 @@ def damaged(task: Task) -> Iterator[tuple[str, Task]]:
 
 
 def judged(task: Task) -> Analysis:
-    """The analysis of a variant; an unbounded one ends early."""
+    """Return the analysis of a variant; that of an unbounded one ends early."""
     return analyse(task, limits=LIMITS)
 
 

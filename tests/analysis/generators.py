@@ -1,5 +1,4 @@
-"""Nets that tests and benchmarks share: generated families of the literature and random small
-nets."""
+"""Nets for tests and benchmarks: families from the literature and small ones."""
 
 from __future__ import annotations
 
@@ -75,7 +74,7 @@ def repairman(machines: int) -> Net:
 
 
 def stages(k: int) -> Net:
-    """k phases one after the other: an Erlang law with rates all equal."""
+    """k phases in a row: an Erlang distribution if all rates are equal."""
     places = {f"s{i}": int(i == 0) for i in range(k + 1)}
     return Net.build(places, {f"t{i}": ({f"s{i}": 1}, {f"s{i + 1}": 1}) for i in range(k)})
 
@@ -109,11 +108,11 @@ def fms(n: int) -> Net:
 
 
 def shared_memory(n: int) -> Net:
-    """n processors, each with a memory that the others reach over one bus: n (n + 3) + 1 places, n
-    (2 n + 1) transitions.
+    """n processors, each with a memory that the others reach over one bus: n (n + 3) + 1 places,
+    n (2 n + 1) transitions.
 
-    Of the Model Checking Contest: 3^n + n (n - 1) 3^(n - 1) markings, 1,863 for n = 5 and 1,830,519
-    for n = 10.
+    From the Model Checking Contest: 3^n + n (n - 1) 3^(n - 1) markings, 1,863 for n = 5 and
+    1,830,519 for n = 10.
     """
     places: Weights = {"bus": 1}
     arcs: dict[str, tuple[Weights, Weights]] = {}
@@ -132,12 +131,11 @@ def shared_memory(n: int) -> Net:
 
 
 def robot_cell(stations: int, parts: int, robots: int = 2) -> Net:
-    """A production cell: robots carry parts from a stock through machines that fail and are mended,
-    and back on pallets.
+    """A production cell: robots carry parts from a stock through machines that fail and are
+    repaired, and back on pallets.
 
-    6 stations + 4 places, 8 stations + 1 transitions. A robot that waits with a part before a
-    machine that has broken down puts it back (the error branch); who mends also needs a robot to
-    hold the part.
+    6 stations + 4 places, 8 stations + 1 transitions. A robot that waits with a part for a broken
+    machine puts it back (the error branch); a repair also needs a robot to hold the part.
     """
     places: Weights = {"stock": parts, "robots": robots, "fitter": 1, "finished": 0}
     arcs: dict[str, tuple[Weights, Weights]] = {"restock": ({"finished": 1}, {"stock": 1})}

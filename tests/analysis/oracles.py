@@ -1,5 +1,5 @@
-"""Other tools as judges of ours (`pip install petrobot[oracle]`): SNAKES, pm4py and Storm count and
-solve the same nets."""
+"""Other tools as references (`pip install petrobot[oracle]`): SNAKES, pm4py and Storm solve the
+same nets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from petrobot.coordinator.task.net import Net
 
 
 def snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | None:
-    """Markings and number of edges by SNAKES 0.9; None if there are more than `most` markings."""
+    """Return markings and number of edges by SNAKES 0.9; None above `most` markings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return _snakes_graph(net, most)
@@ -55,7 +55,8 @@ def _snakes_graph(net: Net, most: int) -> tuple[set[tuple[int, ...]], int] | Non
 
 
 def pm4py_markings(text: str, net: Net) -> set[tuple[int, ...]]:
-    """The markings that pm4py reaches in a PNML text, by its own reader and firing rule."""
+    """Return the markings that pm4py reaches from a PNML text, by its own reader and firing
+    rule."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import pm4py  # type: ignore[import-not-found]
@@ -81,8 +82,7 @@ def pm4py_markings(text: str, net: Net) -> set[tuple[int, ...]]:
 
 
 def storm_share(text: str, label: str) -> float:
-    """The long-run share of time in states with a label, by Storm, of a chain in its explicit
-    format (.drn)."""
+    """Return the long-run share of time in states with a label, by Storm, from a .drn text."""
     import stormpy  # type: ignore[import-not-found]
 
     with tempfile.TemporaryDirectory() as folder:
@@ -94,8 +94,7 @@ def storm_share(text: str, label: str) -> float:
 
 
 def storm_time(text: str, label: str) -> float:
-    """Mean time (s) until a state with a label, by Storm, of a chain in its explicit format
-    (.drn)."""
+    """Return the mean time (s) until a state with a label, by Storm, from a .drn text."""
     import stormpy
 
     with tempfile.TemporaryDirectory() as folder:

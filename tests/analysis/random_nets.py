@@ -1,5 +1,5 @@
-"""Random small nets with everything the firing rule knows, and the slowest possible state space to
-judge others by."""
+"""Small random nets with everything the firing rule supports, and the simplest possible state
+space."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def nets(
     weights: int = 3,
     tokens: int = 3,
 ) -> Net:
-    """A net of at most the given size; arcs are sparse so that many draws are bounded and alive for
-    a while."""
+    """A net of at most the given size; arcs are sparse so that many nets are bounded and do not
+    die at once."""
     names = [f"p{i}" for i in range(draw(st.integers(1, places)))]
     labels = [f"t{i}" for i in range(draw(st.integers(1, transitions)))]
     arcs = st.dictionaries(st.sampled_from(names), st.integers(1, weights), max_size=3)
@@ -61,8 +61,8 @@ def state_machines(
 
 
 def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, int, int]]] | None:
-    """Markings and edges (source, transition, target) in breadth-first order; None if there are
-    more than `limit`."""
+    """Return markings and edges (source, transition, target) in breadth-first order; None above
+    `limit` markings."""
     order, number, edges, queue = [net.initial], {net.initial: 0}, [], deque([0])
     while queue:
         i = queue.popleft()
@@ -80,10 +80,10 @@ def brute_force(net: Net, limit: int) -> tuple[list[Marking], list[tuple[int, in
 
 @st.composite
 def gspns(draw: st.DrawFn, *, tokens: int = 2) -> Gspn:
-    """A bounded GSPN whose transitions move one token each (some immediate, some with several or
-    unlimited servers).
+    """A bounded GSPN whose transitions move one token each; some are immediate, some have
+    several servers.
 
-    An immediate transition only moves tokens to places of higher number, so time always passes.
+    An immediate transition moves tokens only to places of a higher number, so time always passes.
     """
     places = draw(st.integers(3, 5))
     names = [f"p{i}" for i in range(places)]

@@ -1,5 +1,5 @@
-"""What designers get wrong is caught, with a witness that replays and a picture of it, for every
-task that ships."""
+"""Mistakes of designers are found, with a witness that replays and a picture, in every shipped
+task."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.robot import one_run_each
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.cli.witnesses import draw_witnesses, refused
 from petrobot.coordinator.drawing import Overlay, draw
@@ -34,8 +34,7 @@ EXPECTED = {
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_tasks_are_sound(path: Path) -> None:
-    """Nothing is refused of what ships, as designed and closed by the refill; every error exit
-    comes back."""
+    """Nothing in the shipped tasks is refused, and every error exit returns to the nominal flow."""
     found = judged(load(path))
     verdicts = {name: verdict.holds for name, verdict in found.verdicts().items() if name != "safe"}
     assert all(verdicts.values()), verdicts
@@ -47,8 +46,7 @@ def test_shipped_tasks_are_sound(path: Path) -> None:
 @pytest.mark.parametrize("kind", VARIANTS)
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_broken_variants_are_caught(path: Path, kind: str, tmp_path: Path) -> None:
-    """Each comes with a witness that the net replays, and with a picture that shows where it
-    leads."""
+    """Each variant has a witness that the net replays, and a picture that shows where it leads."""
     task = VARIANTS[kind](load(path))
     found = judged(task)
     assert not found.ok
@@ -77,7 +75,7 @@ def carried(task: Task) -> Task:
 
 
 def faults_by_brute_force(task: Task) -> set[str]:
-    """What is wrong with a task by its markings alone, looked at one by one."""
+    """Return what is wrong with a task by checking its markings one by one."""
     found = brute_force(task.net, 5000)
     if found is None:
         return {"bounded"}
@@ -106,9 +104,9 @@ def faults_by_brute_force(task: Task) -> set[str]:
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_damage_of_any_kind_is_refused_if_it_hurts(path: Path, tmp_path: Path) -> None:
-    """Every few of all the damage that can be done by hand: the gate refuses what hangs or leaks,
-    and its witness replays."""
+def test_single_mistakes_are_refused_if_they_matter(path: Path, tmp_path: Path) -> None:
+    """A sample of all single mistakes: the analysis refuses what deadlocks or leaks, and its
+    witness replays."""
     refused_, harmless = 0, 0
     for what, task in list(damaged(carried(load(path))))[::9]:
         file = tmp_path / "damaged.toml"
@@ -128,11 +126,11 @@ def test_damage_of_any_kind_is_refused_if_it_hurts(path: Path, tmp_path: Path) -
     assert refused_ >= 5 and harmless >= 1
 
 
-def test_a_task_that_goes_round_and_never_ends_is_refused(
+def test_a_task_that_loops_and_never_ends_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """No deadlock, no token too many: after the damage the rover's stop can fail for ever, with no
-    way to an end."""
+    """No deadlock and no extra token, but the rover's stop can fail for ever: no end can be
+    reached."""
     task = carried(load(TASKS / "follow_track.toml"))
     lost = task.transitions["stop_failed"]
     outputs = tuple(
@@ -151,7 +149,9 @@ def test_a_task_that_goes_round_and_never_ends_is_refused(
     assert "sound: from" in told and "no designed end can be reached" in told and "by: " in told
 
 
-def test_the_gate_refuses_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_refuses_and_analyse_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`petrobot check` refuses a broken file, `petrobot analyse --pictures` shows why."""
     path = tmp_path / "twice.toml"
     path.write_text(
@@ -160,23 +160,24 @@ def test_the_gate_refuses_and_draws(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["check", str(path)]) == 2
     assert "may not run" in capsys.readouterr().out
     assert main(["analyse", str(path), "--pictures", str(tmp_path / "why")]) == 1
-    assert "entered while its run still goes on" in capsys.readouterr().out
+    assert "entered while its run is still active" in capsys.readouterr().out
     assert (tmp_path / "why" / "catch_ball-one_run_each.svg").exists()
 
 
-def test_a_part_of_the_space_promises_nothing() -> None:
-    """A search that was cut short says that one run at a time is unknown, unless it has seen
-    otherwise."""
+def test_an_incomplete_space_proves_nothing() -> None:
+    """After a search that stopped early, 'one run each' is unknown, unless a counterexample was
+    found."""
     growing = Net.build(
         {"act": 0, "go": 1}, {"t": ({"go": 1}, {"go": 1, "act": 1}), "u": ({"act": 1}, {})}
     )
-    assert one_run_each(explore(growing, limits=Limits(states=2)), ["act"]).holds is None
-    seen = one_run_each(explore(growing, limits=Limits(states=20)), ["act"])
+    assert one_run_each(explore(growing, limits=SearchLimits(states=2)), ["act"]).holds is None
+    seen = one_run_each(explore(growing, limits=SearchLimits(states=20)), ["act"])
     assert seen.holds is False and seen.witness is not None and seen.witness.firings == ("t", "t")
 
 
 def test_an_overlay_colours_and_numbers() -> None:
-    """A halo for each warm place, the turns of a path beside its transitions, a legend below."""
+    """A halo for each place with heat, firing numbers beside transitions, a legend at the
+    bottom."""
     net = Net.build({"a": 1, "b": 0}, {"t": ({"a": 1}, {"b": 1}), "u": ({"b": 1}, {"a": 1})})
     svg = draw(net, overlay=Overlay(heat={"a": 0.25}, path=("t", "u", "t"), legend="what it means"))
     root = ElementTree.fromstring(svg)

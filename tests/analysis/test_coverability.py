@@ -1,19 +1,19 @@
-"""Karp-Miller against exhaustive search on bounded nets and against its own witnesses on unbounded
-ones."""
+"""The Karp-Miller tree against exhaustive search (bounded nets) and its own witnesses (unbounded
+nets)."""
 
 from __future__ import annotations
 
 from hypothesis import assume, given, settings
 
 from petrobot.coordinator.analysis.net.coverability import coverability
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 
 
 def test_a_marking_is_compared_with_its_ancestors_only() -> None:
-    """The net on which comparison with all markings gives a false omega."""
+    """The net on which a comparison with all markings gives a false omega."""
     net = Net.build(
         {"p0": 1, "p1": 0}, {"one": ({"p0": 1}, {"p1": 1}), "two": ({"p0": 1}, {"p1": 2})}
     )
@@ -23,13 +23,13 @@ def test_a_marking_is_compared_with_its_ancestors_only() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(nets(priorities=False, places=4, transitions=4))
-def test_bounds_are_those_of_the_markings_reached(net: Net) -> None:
+def test_bounds_equal_those_of_the_reachable_markings(net: Net) -> None:
     found = coverability(net, effort=3000)
     reached = brute_force(net, 150)
     if found.bounded is None:
         return
     if reached is None:
-        space = explore(net, limits=Limits(states=2000))
+        space = explore(net, limits=SearchLimits(states=2000))
         assert all(b is None or b >= top for b, top in zip(found.bounds, space.bounds, strict=True))
         return
     assert found.bounded and found.complete
@@ -49,7 +49,7 @@ def test_a_witness_of_unboundedness_can_be_pumped_for_ever(net: Net) -> None:
     assert all(pumped[p] > marking[p] for p in grown)
 
 
-def test_inhibitors_are_complemented_where_a_bound_is_known_and_else_unknown() -> None:
+def test_inhibitors_are_complemented_if_a_bound_is_known() -> None:
     arcs = {"fill": ({"go": 1}, {"p": 1, "go": 1}), "reset": ({"p": 2}, {})}
     open_ended = Net.build({"go": 1, "p": 0}, arcs, inhibitors={"fill": {"p": 3}})
     found = coverability(open_ended)
@@ -58,7 +58,7 @@ def test_inhibitors_are_complemented_where_a_bound_is_known_and_else_unknown() -
     assert settled.bounded and settled.bounds == (1, 3)
 
 
-def test_priorities_leave_only_bounds_certain() -> None:
+def test_with_priorities_only_bounds_are_certain() -> None:
     arcs = {"make": ({"s": 1}, {"s": 1, "p": 1}), "eat": ({"p": 1}, {})}
     first = Net.build({"s": 1, "p": 0}, arcs, priority={"eat": 1})
     assert explore(first).bounds == (1, 1)
@@ -66,7 +66,7 @@ def test_priorities_leave_only_bounds_certain() -> None:
     assert found.bounded is None and "priorities" in found.reason and found.bounds == (1, None)
 
 
-def test_effort_is_an_argument_and_is_owned_up_to() -> None:
+def test_the_effort_is_limited_and_reported() -> None:
     found = coverability(kanban(2), effort=50)
     assert found.bounded is None and "50 nodes" in found.reason and not found.complete
 
@@ -83,7 +83,7 @@ def test_known_nets() -> None:
     )
 
 
-def test_the_witness_is_about_the_nearest_ancestor_that_is_covered() -> None:
+def test_the_witness_starts_at_the_nearest_covered_ancestor() -> None:
     """Two ancestors are covered at once: the sequence from the nearer one is the pump."""
     net = Net.build(
         {"p0": 0, "p3": 1},

@@ -1,5 +1,5 @@
-"""Net files of other tools, as the command reads them: odd ids, pages, encodings, final markings,
-nets that grow for ever."""
+"""Net files of other tools, as the command reads them: odd ids, pages, encodings, unbounded
+nets."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from petrobot.coordinator.analysis.commands import (
     simulate_command,
 )
 from petrobot.coordinator.analysis.formats import read_net
-from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.net.coverability import coverability, find_pump
 from petrobot.coordinator.analysis.net.qualitative import examine
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.task.file import load
 from petrobot.coordinator.task.net import Net
@@ -32,7 +32,7 @@ PTNET = "http://www.pnml.org/version-2009/grammar/ptnet"
 
 
 def pnml(tmp_path: Path, body: str, kind: str = PTNET, encoding: str = "utf-8") -> Path:
-    """A file with this net in it."""
+    """Write a file with this net."""
     path = tmp_path / "net.pnml"
     path.write_bytes(
         f'<?xml version="1.0" encoding="{encoding}"?>{HEAD.format(kind, body)}'.encode(encoding)
@@ -41,12 +41,12 @@ def pnml(tmp_path: Path, body: str, kind: str = PTNET, encoding: str = "utf-8") 
 
 
 def place(name: str, tokens: int = 0) -> str:
-    """A place of the standard."""
+    """Return a place as in the standard."""
     return f'<place id="{name}"><initialMarking><text>{tokens}</text></initialMarking></place>'
 
 
 def arc(source: str, target: str, weight: int = 1, more: str = "") -> str:
-    """An arc of the standard."""
+    """Return an arc as in the standard."""
     inscription = f"<inscription><text>{weight}</text></inscription>" if weight != 1 else ""
     return (
         f'<arc id="{source}-{target}" source="{source}" target="{target}">{inscription}{more}</arc>'
@@ -54,7 +54,7 @@ def arc(source: str, target: str, weight: int = 1, more: str = "") -> str:
 
 
 def analysed(path: Path, **more: Any) -> dict[str, Any]:
-    """What the command says, through strict JSON."""
+    """Return the JSON of the command, parsed strictly."""
     text = json.dumps(analyse_command(path, load, **more).data, allow_nan=False)
     data: dict[str, Any] = json.loads(text)
     return data
@@ -70,9 +70,9 @@ LOOP = (
 LOOP += arc("b", "u") + arc("u", "a")
 
 
-def test_what_other_tools_keep_inside_a_net_is_no_part_of_it(tmp_path: Path) -> None:
-    """Final markings (pm4py) name places again; tool-specific data may hold whole nets. A round
-    trip keeps both."""
+def test_data_of_other_tools_is_not_part_of_the_net(tmp_path: Path) -> None:
+    """Final markings (pm4py) name places again, and tool-specific data may contain whole nets; a
+    round trip keeps both."""
     final = (
         '<finalmarkings><marking><place idref="a"><text>1</text></place></marking></finalmarkings>'
     )
@@ -95,7 +95,7 @@ def test_what_other_tools_keep_inside_a_net_is_no_part_of_it(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "iso-8859-1", "utf-16"])
-def test_a_file_says_its_own_encoding(tmp_path: Path, encoding: str) -> None:
+def test_a_file_declares_its_encoding(tmp_path: Path, encoding: str) -> None:
     path = pnml(tmp_path, LOOP.replace('"a"', '"läufer &lt;1&gt;"'), encoding=encoding)
     assert set(analysed(path)["bounds"]) == {"läufer <1>", "b"}
 
@@ -110,13 +110,13 @@ def test_a_file_says_its_own_encoding(tmp_path: Path, encoding: str) -> None:
     ],
 )
 def test_nets_of_other_types_are_refused(tmp_path: Path, kind: str) -> None:
-    with pytest.raises(FormatError, match="only P/T nets are read"):
+    with pytest.raises(NetFileError, match="only P/T nets are read"):
         read_net(pnml(tmp_path, LOOP, kind))
     assert main(["analyse", str(pnml(tmp_path, LOOP, kind)), "--json", "-"]) == 2
 
 
-def test_rates_that_are_given_bring_the_numbers(tmp_path: Path) -> None:
-    """Without asking for a view; and they are null where nobody gave any."""
+def test_numbers_are_computed_if_rates_are_given(tmp_path: Path) -> None:
+    """No --view is needed; without rates the numbers are null."""
     path, rates = pnml(tmp_path, LOOP), tmp_path / "rates.toml"
     rates.write_text("[rates]\nt = 2.0\nu = 3.0\n", encoding="utf-8")
     bare = analysed(path)
@@ -137,8 +137,8 @@ def test_rates_that_are_given_bring_the_numbers(tmp_path: Path) -> None:
     assert analysed(both)["throughput"] is not None  # rates found in the file
 
 
-def test_a_rates_file_leaves_the_ordinary_view_alone(tmp_path: Path) -> None:
-    """An immediate transition ranks above timed ones in the stochastic view only: `states` are
+def test_a_rates_file_does_not_change_the_ordinary_view(tmp_path: Path) -> None:
+    """Immediate transitions fire before timed ones only in the stochastic view: `states` are
     those of the net."""
     body = place("a", 1) + place("b", 1) + place("c") + '<transition id="t"/><transition id="u"/>'
     body += arc("a", "t") + arc("t", "c") + arc("b", "u") + arc("u", "c")
@@ -151,9 +151,9 @@ def test_a_rates_file_leaves_the_ordinary_view_alone(tmp_path: Path) -> None:
     )
 
 
-def test_a_net_that_grows_is_known_soon(tmp_path: Path) -> None:
-    """No sizes that have no end; dead transitions and sources are known from the coverability tree
-    and the arcs."""
+def test_an_unbounded_net_is_recognised_early(tmp_path: Path) -> None:
+    """An unbounded net has no sizes; dead transitions and sources come from the tree and the
+    arcs."""
     body = (
         place("a")
         + place("never")
@@ -172,7 +172,7 @@ def test_a_net_that_grows_is_known_soon(tmp_path: Path) -> None:
         and data["dead_transitions"] == ["dead"]
         and data["live"] is False
     )
-    assert data["deadlock"] is False and "no end" in data["reason"]
+    assert data["deadlock"] is False and "unbounded" in data["reason"]
     witness = data["verdicts"]["bounded"]["witness"]
     net = read_net(tmp_path / "net.pnml").net
     *_, before = net.replay(witness["firings"])
@@ -180,14 +180,14 @@ def test_a_net_that_grows_is_known_soon(tmp_path: Path) -> None:
     assert sum(after) > sum(before)
 
 
-def test_a_pump_that_no_inhibitor_looks_at_is_enough() -> None:
-    """p0 is inhibited and grows, but by a transition that does not mind: Karp and Miller's tree may
-    not be used here."""
+def test_a_pump_that_no_inhibitor_can_stop_is_enough() -> None:
+    """p0 is inhibited and grows, but by a transition without inhibitor; the Karp-Miller tree
+    cannot be used here."""
     net = Net.build(
         {"p": 0}, {"grow": ({}, {"p": 3}), "use": ({"p": 1}, {})}, inhibitors={"use": {"p": 2}}
     )
     assert coverability(net).bounded is None
-    found = examine(explore(net, limits=Limits(states=50)))
+    found = examine(explore(net, limits=SearchLimits(states=50)))
     assert (
         found.bounded.holds is False
         and found.bounded.witness is not None
@@ -201,11 +201,11 @@ def test_a_pump_that_no_inhibitor_looks_at_is_enough() -> None:
     assert explore(urgent).complete and find_pump(explore(urgent)) is None
 
 
-def test_an_upper_bound_is_no_maximum() -> None:
-    """Of a part of the space: invariants bound a place by 2, but nothing shows that it ever holds
-    them."""
+def test_an_upper_bound_is_not_a_maximum() -> None:
+    """In an incomplete space invariants bound a place by 2, but nothing shows that it ever holds
+    2 tokens."""
     net = philosophers(12)
-    part = examine(explore(net, limits=Limits(states=100)))
+    part = examine(explore(net, limits=SearchLimits(states=100)))
     assert part.bounded.holds is True and part.most == 1  # seen, and no place can hold more
     idle = Net.build(
         {
@@ -219,12 +219,12 @@ def test_an_upper_bound_is_no_maximum() -> None:
         | {f"t{i}": ({f"x{i}": 1}, {f"y{i}": 1}) for i in range(12)},
     )
     doubled = Net.build({"a": 1, "b": 0}, {"t": ({"a": 1}, {"b": 2}), "u": ({"b": 2}, {"a": 1})})
-    assert examine(explore(idle, limits=Limits(states=50))).most == 2
-    assert examine(explore(doubled, limits=Limits(states=1))).most is None
+    assert examine(explore(idle, limits=SearchLimits(states=50))).most == 2
+    assert examine(explore(doubled, limits=SearchLimits(states=1))).most is None
 
 
-def test_more_tokens_than_a_word_counts(tmp_path: Path) -> None:
-    """Beyond 63 bits: a weight makes a partial answer, an initial marking one clear error."""
+def test_more_tokens_than_a_word_can_count(tmp_path: Path) -> None:
+    """Above 63 bits: a weight leads to a partial result, an initial marking to one clear error."""
     body = place("a", 1) + '<transition id="t"/>' + arc("a", "t") + arc("t", "a", 1 << 62)
     data = analysed(pnml(tmp_path, body))
     assert data["bounded"] is False and data["states"] is None
@@ -232,9 +232,9 @@ def test_more_tokens_than_a_word_counts(tmp_path: Path) -> None:
     assert outcome.code == 2 and "63" in outcome.text and "net.pnml" in outcome.text
 
 
-def test_nets_of_nothing(tmp_path: Path) -> None:
-    """No transitions: one marking, dead, its own home; no places: a transition that always
-    fires."""
+def test_empty_nets(tmp_path: Path) -> None:
+    """Without transitions: one dead marking, its own home. Without places: a transition that can
+    always fire."""
     alone = analysed(pnml(tmp_path, place("a", 2)), rates="unit")
     assert (alone["states"], alone["deadlock"], alone["home_states"], alone["live"]) == (
         1,
@@ -255,7 +255,7 @@ def test_nets_of_nothing(tmp_path: Path) -> None:
 
 
 def test_a_simulation_without_time_is_valid_json(tmp_path: Path) -> None:
-    """Immediate transitions for ever: nothing is observed, and the answer says null, not NaN."""
+    """Immediate transitions fire for ever, so nothing is observed: the result is null, not NaN."""
     import numpy as np
 
     path, rates = pnml(tmp_path, LOOP), tmp_path / "rates.toml"

@@ -1,4 +1,4 @@
-"""Net files of other tools in, ours out: nothing changes its behaviour in silence."""
+"""Readers and writers of net files: nothing changes the behaviour of a net silently."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from hypothesis import given, settings
 
 from petrobot.coordinator.analysis.formats import read_net, written
 from petrobot.coordinator.analysis.formats.greatspn import parse_pnpro
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetFile
-from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
-from petrobot.coordinator.analysis.formats.pnml_writing import losses, write_pnml
+from petrobot.coordinator.analysis.formats.netfile import NetFile, NetFileError
+from petrobot.coordinator.analysis.formats.pnml import losses, parse_pnml, write_pnml
 from petrobot.coordinator.analysis.formats.tina import parse_tina, write_tina
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import KANBAN_RATES, kanban, queue
@@ -23,7 +22,8 @@ from tests.analysis.random_nets import gspns, nets
 
 ISO = """<?xml version="1.0"?>
 <pnml xmlns="http://www.pnml.org/version-2009/grammar/pnml">
- <net id="n" type="http://www.pnml.org/version-2009/grammar/ptnet"><name><text>two pages</text></name>
+ <net id="n" type="http://www.pnml.org/version-2009/grammar/ptnet"><name>
+<text>two pages</text></name>
   <!-- kept -->
   <page id="one">
    <place id="p"><name><text>start</text><graphics><offset x="3" y="4"/></graphics></name>
@@ -34,7 +34,8 @@ ISO = """<?xml version="1.0"?>
    <arc id="b" source="t" target="r2"/>
    <referencePlace id="r2" ref="r1"/>
   </page>
-  <page id="two"><place id="q"/><referencePlace id="r1" ref="q"/><referenceTransition id="rt" ref="t"/>
+  <page id="two"><place id="q"/><referencePlace id="r1" ref="q"/>
+<referenceTransition id="rt" ref="t"/>
    <arc id="c" source="rt" target="q"/></page>
  </net></pnml>"""
 
@@ -50,7 +51,7 @@ def test_pages_and_references_are_followed() -> None:
     assert any("added up" in note for note in model.notes)
 
 
-def test_a_round_trip_keeps_pages_graphics_and_what_other_tools_wrote() -> None:
+def test_a_round_trip_keeps_pages_graphics_and_tool_specific_data() -> None:
     model = parse_pnml(ISO)
     changed = replace(model, net=replace(model.net, initial=(5, 1)))
     text = write_pnml(changed)
@@ -109,7 +110,8 @@ def test_pnml_round_trip_of_any_gspn(gspn: Gspn) -> None:
 
 
 def arc_file(arc: str, extra: str = "") -> str:
-    return f"""<pnml><net id="n" type="P/T net"><place id="p"><initialMarking><text>1</text></initialMarking></place>
+    return f"""<pnml><net id="n" type="P/T net">
+<place id="p"><initialMarking><text>1</text></initialMarking></place>
     <place id="q"/><transition id="t"/><arc id="a" source="p" target="t" {extra}>{arc}</arc>
     <arc id="b" source="t" target="q"/></net></pnml>"""
 
@@ -136,7 +138,7 @@ def test_inhibitor_arcs_in_every_notation(arc: str, extra: str) -> None:
 
 
 @pytest.mark.parametrize("arc", ['<type value="test"/>', "<arctype><text>read</text></arctype>"])
-def test_test_arcs_look_and_leave(arc: str) -> None:
+def test_test_arcs_do_not_consume(arc: str) -> None:
     net = parse_pnml(arc_file(arc)).net
     assert net.consume == (((0, 1),),) and net.produce == (((0, 1), (1, 1)),)
 
@@ -151,24 +153,30 @@ def test_test_arcs_look_and_leave(arc: str) -> None:
         ("<toolspecific tool='x' version='1'><reset/></toolspecific>", ""),
     ],
 )
-def test_unknown_arcs_are_refused_loudly(arc: str, extra: str) -> None:
-    with pytest.raises(FormatError, match=r"file\.pnml: arc a: an arc of the kind"):
+def test_unknown_arcs_are_refused(arc: str, extra: str) -> None:
+    with pytest.raises(NetFileError, match=r"file\.pnml: arc a: an arc of the kind"):
         parse_pnml(arc_file(arc, extra), "file.pnml")
 
 
 PIPE = """<pnml><net id="Net-One" type="P/T net"><token id="Default" red="0"/>
-<place id="P0"><initialMarking><value>Default,2</value></initialMarking><capacity><value>0</value></capacity></place>
-<place id="P1"><initialMarking><value>{empty}</value></initialMarking><capacity><value>3</value></capacity></place>
-<transition id="T0"><rate><value>2.5</value></rate><timed><value>true</value></timed><infiniteServer><value>true</value></infiniteServer><priority><value>1</value></priority></transition>
-<transition id="T1"><rate><value>0.5</value></rate><timed><value>false</value></timed><priority><value>2</value></priority></transition>
-<arc id="a" source="P0" target="T0"><inscription><value>Default,1</value></inscription><type value="normal"/></arc>
+<place id="P0"><initialMarking><value>Default,2</value></initialMarking><capacity>
+<value>0</value></capacity></place>
+<place id="P1"><initialMarking><value>{empty}</value></initialMarking><capacity>
+<value>3</value></capacity></place>
+<transition id="T0"><rate><value>2.5</value></rate><timed><value>true</value></timed>
+<infiniteServer><value>true</value></infiniteServer><priority>
+<value>1</value></priority></transition>
+<transition id="T1"><rate><value>0.5</value></rate><timed><value>false</value></timed><priority>
+<value>2</value></priority></transition>
+<arc id="a" source="P0" target="T0"><inscription><value>Default,1</value></inscription>
+<type value="normal"/></arc>
 <arc id="b" source="T0" target="P1"><inscription><value>1</value></inscription></arc>
 <arc id="c" source="P1" target="T1"><inscription><value></value></inscription></arc>
 <arc id="d" source="T1" target="P0"/></net></pnml>"""
 
 
 @pytest.mark.parametrize("empty", ["", "Default,0", "0", "Default,0,Red,0", "Default,"])
-def test_what_pipe_writes(empty: str) -> None:
+def test_files_of_pipe(empty: str) -> None:
     model = parse_pnml(PIPE.format(empty=empty))
     assert model.gspn is not None
     assert model.net.initial == (2, 0) and model.net.capacity == (None, 3)
@@ -182,9 +190,9 @@ def test_what_pipe_writes(empty: str) -> None:
 
 
 def test_coloured_tokens_and_other_net_types_are_refused() -> None:
-    with pytest.raises(FormatError, match="colour 'Red'"):
+    with pytest.raises(NetFileError, match="colour 'Red'"):
         parse_pnml(PIPE.format(empty="Default,0,Red,1"))
-    with pytest.raises(FormatError, match="only P/T nets"):
+    with pytest.raises(NetFileError, match="only P/T nets"):
         parse_pnml(
             '<pnml><net id="n" '
             'type="http://www.pnml.org/version-2009/grammar/symmetricnet"/></pnml>'
@@ -194,36 +202,45 @@ def test_coloured_tokens_and_other_net_types_are_refused() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("<pnml><net id='n'>", "cut short"),
+        ("<pnml><net id='n'>", "incomplete"),
         ("<pnml/>", "no <net>"),
         ("<pnml><net id='a'/><net id='b'/></pnml>", "2 nets"),
         ("<pnml><net id='n'><place/></net></pnml>", "no id"),
-        ("<pnml><net id='n'><place id='p'/><place id='p'/></net></pnml>", "stands there twice"),
-        ("<pnml><net id='n'><place id='p'/><arc id='a' source='p' target='x'/></net></pnml>", "joins a place and a transition"),
-        ("<pnml><net id='n'><place " "id='p'><initialMarking><text>two</text></initialMarking></place></net></pnml>", "has no value"),
-        ("<pnml><net id='n'><place " "id='p'><initialMarking><text>1.5</text></initialMarking></place></net></pnml>", "whole number"),
-        ("<pnml><net id='n'><referencePlace id='a' ref='b'/><referencePlace id='b' " "ref='a'/><transition id='t'/>"
+        ("<pnml><net id='n'><place id='p'/><place id='p'/></net></pnml>", "occurs twice"),
+        ("<pnml><net id='n'><place id='p'/><arc id='a' source='p' target='x'/></net></pnml>",
+         "connects a place and a transition"),
+        ("<pnml><net id='n'><place id='p'><initialMarking><text>two</text></initialMarking></place>"
+         "</net></pnml>", "has no value"),
+        ("<pnml><net id='n'><place id='p'><initialMarking><text>1.5</text></initialMarking></place>"
+         "</net></pnml>", "whole number"),
+        ("<pnml><net id='n'><referencePlace id='a' ref='b'/><referencePlace id='b' ref='a'/>"
+         "<transition id='t'/>"
          "<arc id='c' source='a' target='t'/></net></pnml>", "circle"),
     ],
 )  # fmt: skip
-def test_broken_files_say_where_and_what(text: str, said: str) -> None:
-    with pytest.raises(FormatError, match=said) as caught:
+def test_errors_of_broken_files_say_where_and_what(text: str, said: str) -> None:
+    with pytest.raises(NetFileError, match=said) as caught:
         parse_pnml(text, "some.pnml")
     assert str(caught.value).startswith("some.pnml: ")
 
 
 PNPRO = """<?xml version="1.0"?><project name="P" version="121"><gspn name="G"><nodes>
-<constant name="mu" consttype="REAL" value="2*(1+0.25)" x="1" y="1"/><constant name="N" consttype="INTEGER" value="3"/>
-<place marking="N" name="idle" x="1.5" y="2"/><place name="busy" x="3" y="2"/><text-box name="b" x="0" y="0">hello</text-box>
-<transition name="go" type="EXP" delay="mu" x="2" y="2"/><transition name="one" type="EXP" delay="1/4" nservers="1" x="2" y="2"/>
+<constant name="mu" consttype="REAL" value="2*(1+0.25)" x="1" y="1"/>
+<constant name="N" consttype="INTEGER" value="3"/>
+<place marking="N" name="idle" x="1.5" y="2"/><place name="busy" x="3" y="2"/>
+<text-box name="b" x="0" y="0">hello</text-box>
+<transition name="go" type="EXP" delay="mu" x="2" y="2"/>
+<transition name="one" type="EXP" delay="1/4" nservers="1" x="2" y="2"/>
 <transition name="now" type="IMM" priority="2" weight="3" x="2" y="2"/></nodes><edges>
-<arc tail="idle" head="go" kind="INPUT" mult="2"/><arc tail="go" head="busy" kind="OUTPUT" mult="2"><point x="1" y="1"/></arc>
+<arc tail="idle" head="go" kind="INPUT" mult="2"/>
+<arc tail="go" head="busy" kind="OUTPUT" mult="2"><point x="1" y="1"/></arc>
 <arc tail="busy" head="one" kind="INPUT"/><arc tail="one" head="idle" kind="OUTPUT"/>
-<arc tail="busy" head="now" kind="INPUT"/><arc tail="now" head="idle" kind="OUTPUT"/><arc tail="idle" head="now" kind="INHIBITOR"/>
+<arc tail="busy" head="now" kind="INPUT"/><arc tail="now" head="idle" kind="OUTPUT"/>
+<arc tail="idle" head="now" kind="INHIBITOR"/>
 </edges></gspn></project>"""
 
 
-def test_greatspn_projects_give_rates_under_the_name_of_delays() -> None:
+def test_delays_in_greatspn_projects_are_rates() -> None:
     model = parse_pnpro(PNPRO)
     assert model.gspn is not None and model.net == model.gspn.net
     assert (
@@ -251,14 +268,14 @@ def test_greatspn_projects_give_rates_under_the_name_of_delays() -> None:
         ('delay="mu"', 'delay="nu"', "has no value"),
         ('delay="mu"', 'delay="__import__(1)"', "has no value"),
         ('name="busy" x', 'name="busy" domain="C" x', "coloured"),
-        ("<text-box", "<fluid", "unknown meaning"),
+        ("<text-box", "<fluid", "unknown element"),
     ],
 )
-def test_greatspn_features_that_we_lack_are_refused(old: str, new: str, said: str) -> None:
+def test_unsupported_greatspn_features_are_refused(old: str, new: str, said: str) -> None:
     text = PNPRO.replace(old, new).replace(
         "</text-box>", "</fluid>" if new == "<fluid" else "</text-box>"
     )
-    with pytest.raises(FormatError, match=said):
+    with pytest.raises(NetFileError, match=said):
         parse_pnpro(text)
 
 
@@ -285,19 +302,19 @@ def test_tina_nets() -> None:
     [
         ("tr t [1,2] p -> q", "time interval"),
         ("tr t p q", "no ->"),
-        ("tr t p!2 -> q", "an arc 'p!2'"),
-        ("tr t p -> q?1", "an arc 'q\\?1'"),
+        ("tr t p!2 -> q", "unknown arc 'p!2'"),
+        ("tr t p -> q?1", "unknown arc 'q\\?1'"),
         ("zz t", "begins with 'zz'"),
-        ("pl p 3", "behind a place"),
+        ("pl p 3", "after a place"),
     ],
 )
 def test_tina_lines_that_cannot_be_read(line: str, said: str) -> None:
-    with pytest.raises(FormatError, match=said):
+    with pytest.raises(NetFileError, match=said):
         parse_tina(line, "x.net")
 
 
-def test_priorities_that_are_no_levels_are_refused() -> None:
-    with pytest.raises(FormatError, match="between some pairs only"):
+def test_priorities_that_do_not_form_levels_are_refused() -> None:
+    with pytest.raises(NetFileError, match="between some pairs only"):
         parse_tina("tr a p -> p\ntr b p -> p\ntr c p -> p\npr a > b\n")
 
 
@@ -311,7 +328,7 @@ def test_tina_round_trip_of_any_net(net: Net) -> None:
 
 
 def _in_order(net: Net, other: Net) -> tuple[object, ...]:
-    """The parts of a net with its places in another net's order."""
+    """Return the parts of a net with its places in the order of another net."""
     number = {p: other.place_index[name] for p, name in enumerate(net.places)}
     arcs = [
         tuple(tuple(sorted((number[p], w) for p, w in a)) for a in table)
@@ -323,12 +340,12 @@ def _in_order(net: Net, other: Net) -> tuple[object, ...]:
 
 @settings(max_examples=40, deadline=None)
 @given(nets(priorities=False, inhibitors=False))
-def test_capacities_survive_as_inhibitors(net: Net) -> None:
+def test_capacities_are_kept_as_inhibitors(net: Net) -> None:
     try:
         again = parse_tina(write_tina(NetFile(net))).net
-    except FormatError:
+    except NetFileError:
         return
-    one, two = (explore(n, limits=Limits(states=200)) for n in (net, again))
+    one, two = (explore(n, limits=SearchLimits(states=200)) for n in (net, again))
     assert len(one) == len(two) and one.edges == two.edges
 
 
@@ -342,15 +359,16 @@ def test_files_are_chosen_by_their_ending(tmp_path: Path) -> None:
         assert explore(read_net(path).net).edges == 6
         assert any("rates" in note for note in lost)
     for path, said in ((tmp_path / "a.txt", "ending"), (tmp_path / "missing.pnml", "No such file")):
-        with pytest.raises(FormatError, match=said):
+        with pytest.raises(NetFileError, match=said):
             read_net(path)
     with pytest.raises(
-        FormatError, match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml"
+        NetFileError,
+        match=r"net\.xyz: file: no writer for the ending \.xyz; end its name in \.pnml",
     ):
         written(model, Path("net.xyz"))
-    with pytest.raises(FormatError, match="net: file: no writer for a file without ending"):
+    with pytest.raises(NetFileError, match="net: file: no writer for a file without ending"):
         written(model, Path("net"))
-    with pytest.raises(FormatError, match=r"net\.drn: rates: .*give rates"):
+    with pytest.raises(NetFileError, match=r"net\.drn: rates: .*give rates"):
         written(NetFile(gspn.net), Path("net.drn"))
 
 
@@ -380,11 +398,12 @@ def test_a_net_without_namespace_stays_readable_xml() -> None:
 
 
 def test_entities_are_refused() -> None:
-    """A document that could grow without bound is not even parsed, as text and as bytes."""
+    """A document with entities could grow without bound, so it is not even parsed (str and
+    bytes)."""
     text = (
         '<!DOCTYPE pnml [<!ENTITY a "aaaa">]><pnml><net id="n"><page id="g"><place '
         'id="&a;"/></page></net></pnml>'
     )
     for form in (text, text.encode()):
-        with pytest.raises(FormatError, match="defines entities"):
+        with pytest.raises(NetFileError, match="defines XML entities"):
             parse_pnml(form)

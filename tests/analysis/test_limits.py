@@ -1,5 +1,5 @@
-"""Real processes on nets without end in sight: bounded time and memory, Ctrl-C at any moment, and
-answers marked as partial."""
+"""The commands on huge nets: bounded time and memory, Ctrl-C at any moment, results marked as
+partial."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.analysis.formats.netfile import NetFile
-from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
+from petrobot.coordinator.analysis.formats.pnml import write_pnml
 from petrobot.coordinator.task.net import Net
 from tests.analysis.generators import kanban, philosophers
 from tests.waiting import Limit
@@ -28,14 +28,14 @@ ROOM = 3 << 30
 
 
 def ring(places: int, tokens: int) -> Net:
-    """Tokens that go round: far more than 1e9 markings."""
+    """Tokens in a ring: far more than 1e9 markings."""
     names = [f"p{i}" for i in range(places)]
     arcs = {f"t{i}": ({names[i]: 1}, {names[(i + 1) % places]: 1}) for i in range(places)}
     return Net.build({**dict.fromkeys(names, 0), names[0]: tokens}, arcs)
 
 
 def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    """A command on the net, with its memory limited by the system."""
+    """Start a command on the net; the system limits its memory."""
     path = folder / "net.pnml"
     path.write_text(write_pnml(NetFile(net)), encoding="utf-8")
     command, *rest = arguments
@@ -50,14 +50,13 @@ def started(net: Net, folder: Path, *arguments: str) -> subprocess.Popen[str]:
 
 
 def _limited() -> None:
-    """Little memory, and Ctrl-C heard: a shell that runs the tests in the background has its
-    children ignore it."""
+    """Limit the memory and enable Ctrl-C, which a shell disables for background jobs."""
     resource.setrlimit(resource.RLIMIT_AS, (ROOM, ROOM))
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[str, Any]:
-    """Its JSON; 1 is the code where something is not known."""
+    """Return its JSON; the exit code 1 is allowed, because something is unknown."""
     out, complaint = process.communicate(timeout=300)
     assert process.returncode == (0 if proven else 1), complaint
     data: dict[str, Any] = json.loads(out)
@@ -73,9 +72,7 @@ def answered(process: subprocess.Popen[str], *, proven: bool = False) -> dict[st
     ],
     ids=["300 places", "1e16", "ring"],
 )
-def test_what_has_no_end_in_sight_ends_with_an_honest_part(
-    net: Net, deadlock: bool, tmp_path: Path
-) -> None:
+def test_a_huge_net_ends_with_a_partial_result(net: Net, deadlock: bool, tmp_path: Path) -> None:
     """Stubborn sets find the one deadlock; siphons with marked traps rule out any in the other
     two."""
     process = started(
@@ -93,7 +90,7 @@ def test_what_has_no_end_in_sight_ends_with_an_honest_part(
     assert data["deadlock"] is deadlock and data["live"] is (False if deadlock else None)
 
 
-def test_what_cannot_be_solved_can_be_played(tmp_path: Path) -> None:
+def test_what_cannot_be_solved_can_be_simulated(tmp_path: Path) -> None:
     arguments = ("simulate", "--rates", "unit", "--replicas", "20", "--horizon", "2", "--json", "-")
     process = started(ring(300, 20), tmp_path, *arguments)
     out, complaint = process.communicate(timeout=300)
@@ -110,8 +107,8 @@ def test_what_cannot_be_solved_can_be_played(tmp_path: Path) -> None:
     "net", [philosophers(60), kanban(5)], ids=["300 places", "2.5 million markings"]
 )
 @pytest.mark.parametrize("share", [0.2, pytest.param(1.0, marks=pytest.mark.proof)])
-def test_ctrl_c_leaves_what_was_known(net: Net, share: float, tmp_path: Path) -> None:
-    """At two moments after the search has begun, told by the processor time that it has taken."""
+def test_ctrl_c_keeps_what_was_found(net: Net, share: float, tmp_path: Path) -> None:
+    """Interrupted twice after the search has begun, at given processor times."""
     process = started(net, tmp_path, "analyse", "--rates", "unit", "--json", "-")
     _interrupt_after(process, 0.8 + share)
     data = answered(process)
@@ -142,7 +139,7 @@ def test_ctrl_c_ends_a_simulation_with_its_intervals(tmp_path: Path) -> None:
 
 
 def _interrupt_after(process: subprocess.Popen[str], seconds: float) -> None:
-    """Ctrl-C once the process has taken that much processor time."""
+    """Send Ctrl-C as soon as the process has used that much processor time."""
     ticks, statistics = os.sysconf("SC_CLK_TCK"), Path(f"/proc/{process.pid}/stat")
     limit = Limit(f"{seconds} s of processor time")
     while process.poll() is None and limit.left():

@@ -1,5 +1,4 @@
-"""Long run, transient, completion and derivatives: closed forms, and dense linear algebra on random
-GSPNs."""
+"""Long run, transient, completion and derivatives against closed forms and dense linear algebra."""
 
 from __future__ import annotations
 
@@ -13,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.stats import erlang
 
 from petrobot.coordinator.analysis.net.graph import Mask
-from petrobot.coordinator.analysis.net.space import Limits
-from petrobot.coordinator.analysis.time.completion import completion, law
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time.completion import completion, completion_time
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn, TimelessTrap, Values
 from petrobot.coordinator.analysis.time.linear import stationary
 from petrobot.coordinator.analysis.time.markov import (
@@ -83,7 +82,7 @@ def test_erlang_completion(k: int) -> None:
     assert done.mean == pytest.approx(k / rate, rel=1e-12) and done.variance == pytest.approx(
         k / rate**2, rel=1e-9
     )
-    shape = law(chain, goal)
+    shape = completion_time(chain, goal)
     exact = erlang(k, scale=1 / rate)
     for q in (0.05, 0.5, 0.9, 0.99):
         assert shape.quantile(q) == pytest.approx(float(exact.ppf(q)), rel=1e-9)
@@ -107,8 +106,10 @@ def test_kanban_4_throughput_as_published() -> None:
 
 
 def expm(A: Values) -> Values:
-    """exp(A) by scaling and squaring of its Taylor series (scipy 1.17.1 is wrong on triangular ones
-    with equal diagonals)."""
+    """Return exp(A) by scaling and squaring its Taylor series.
+
+    scipy 1.17.1 is wrong on triangular matrices with equal diagonal entries.
+    """
     halvings = max(0, int(np.ceil(np.log2(max(1e-9, float(np.abs(A).sum(axis=1).max()))))) + 4)
     small, term, total = A / 2.0**halvings, np.eye(len(A)), np.eye(len(A))
     for k in range(1, 16):
@@ -118,7 +119,7 @@ def expm(A: Values) -> Values:
 
 
 def dense(chain: Chain) -> tuple[Values, Values]:
-    """(generator over tangible markings, probabilities of entering them first) by plain
+    """Return (generator over tangible markings, probability to enter each first) as dense
     matrices."""
     P = np.zeros((chain.n, chain.n))
     np.add.at(P, (chain.source, chain.target), chain.amount)
@@ -177,7 +178,7 @@ def test_completion_against_dense_matrices(gspn: Gspn, data: st.DataObject) -> N
         p @ second / whole - (p @ first / whole) ** 2, rel=1e-6, abs=1e-9
     )
     assert done.residual < 1e-12
-    shape, t = law(chain, goal), 1.3
+    shape, t = completion_time(chain, goal), 1.3
     frozen = Q.copy()
     frozen[~stay] = 0.0
     assert shape.cdf(t) == pytest.approx(
@@ -258,7 +259,7 @@ def cycle_of_immediates(escape: float) -> Gspn:
     return Gspn.of(net, {"go": 2.0}, weights={"out": escape})
 
 
-def test_cycles_of_immediate_transitions_are_solved_and_timeless_traps_refused() -> None:
+def test_immediate_cycles_are_solved_and_timeless_traps_refused() -> None:
     run = long_run(Chain.of(cycle_of_immediates(0.25)))
     assert run.throughput["out"] == pytest.approx(2.0) and run.throughput["ba"] == pytest.approx(
         8.0
@@ -274,7 +275,7 @@ def test_cycles_of_immediate_transitions_are_solved_and_timeless_traps_refused()
         Chain.of(Gspn.of(trap, {"go": 1.0}))
 
 
-def test_the_long_run_mixes_the_components_that_are_reached() -> None:
+def test_the_long_run_mixes_the_reachable_components() -> None:
     net = Net.build(
         {"start": 1, "left": 0, "right": 0, "back": 0},
         {
@@ -289,12 +290,12 @@ def test_the_long_run_mixes_the_components_that_are_reached() -> None:
         "back"
     ] == pytest.approx(0.25)
     assert run.throughput["to"] == pytest.approx(0.75 * 2 / 3)
-    with pytest.raises(ValueError, match="several components"):
+    with pytest.raises(ValueError, match="several bottom components"):
         throughput_slopes(run, "to")
 
 
 def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
-    """A birth-death chain of 700 states in a closed form."""
+    """A birth-death chain of 700 states has a closed form."""
     run = long_run(Chain.of(Gspn.of(queue(699), {"arrive": 0.97, "serve": 1.0})))
     p = 0.97 ** np.arange(700.0)
     p /= p.sum()
@@ -316,7 +317,7 @@ def test_large_components_by_gauss_seidel_agree_with_elimination() -> None:
 
 
 def test_completion_of_a_large_component_by_gauss_seidel() -> None:
-    """A random walk on 0..700 that starts at 0: mean time to the top in closed form."""
+    """A random walk on 0..700 from 0: the mean time to the top has a closed form."""
     chain = Chain.of(Gspn.of(queue(700), {"arrive": 2.0, "serve": 1.0}))
     done = completion(chain, chain.space.tokens(1) == 700)
     up, down, total, step = 2.0, 1.0, 0.0, 0.0
@@ -337,17 +338,17 @@ def test_poisson_weights(mean: float) -> None:
         assert weight[k - low] == pytest.approx(exp(-mean) * mean**k / factorial(k), rel=1e-9)
 
 
-def test_what_cannot_be_is_refused_with_a_reason() -> None:
-    with pytest.raises(ValueError, match="no transition"):
+def test_invalid_gspns_are_refused_with_a_reason() -> None:
+    with pytest.raises(ValueError, match="not a transition"):
         Gspn.of(queue(2), {"nobody": 1.0})
-    with pytest.raises(ValueError, match="positive and finite"):
+    with pytest.raises(ValueError, match="positive, finite"):
         Gspn.of(queue(2), {"arrive": 0.0, "serve": 1.0})
     with pytest.raises(ValueError, match="unlimited only"):
         Gspn.of(Net.build({"p": 0}, {"t": ({}, {"p": 1})}), {"t": 1.0}, servers={"t": None})
     with pytest.raises(ValueError, match="simulate instead"):
         Chain.of(
             Gspn.of(Net.build({"p": 1}, {"t": ({"p": 1}, {"p": 2})}), {"t": 1.0}),
-            limits=Limits(states=10),
+            limits=SearchLimits(states=10),
         )
 
 
@@ -357,12 +358,12 @@ def test_what_if() -> None:
     assert long_run(Chain.of(smaller)).throughput["serve"] == pytest.approx(1 / (1 / 0.8 + 1 / 4.0))
 
 
-def test_the_law_ends_where_rounding_begins() -> None:
-    """Many jumps of a large chain leave more rounding than the share at which the law is cut off;
-    it ends all the same."""
+def test_the_distribution_ends_where_rounding_begins() -> None:
+    """Many jumps of a large chain leave larger rounding errors than the tolerance; the
+    computation still ends."""
     task = load(Path(__file__).parents[2] / "coordinator" / "tasks" / "follow_track.toml")
     found = forecast(stochastic_view(task, stages=8, timer_stages=8))
-    whole = law(found.chain, found.done.goal, left=1e-14, steps=60_000)
+    whole = completion_time(found.chain, found.done.goal, left=1e-14, steps=60_000)
     assert whole.quantile(0.5) < found.done.mean < whole.quantile(0.99)
     mean = float(np.sum(whole.probability - whole.absorbed) / whole.rate / whole.probability)
     assert mean == pytest.approx(found.done.mean, rel=1e-6)

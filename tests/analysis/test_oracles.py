@@ -1,4 +1,4 @@
-"""Three independent tools agree with us on random nets, each where it is installed (`pip install
+"""Three independent tools agree with us on random nets, if installed (`pip install
 petrobot[oracle]`)."""
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.formats import written
 from petrobot.coordinator.analysis.formats.netfile import NetFile
-from petrobot.coordinator.analysis.formats.pnml_writing import write_pnml
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.formats.pnml import write_pnml
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.completion import completion
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import long_run
@@ -27,25 +27,25 @@ RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(Hea
 
 @pytest.fixture(scope="module")
 def snakes() -> None:
-    """SNAKES is there."""
+    """Skip unless SNAKES is installed."""
     pytest.importorskip("snakes", reason="the extra `oracle` (SNAKES) is not installed")
 
 
 @pytest.fixture(scope="module")
 def pm4py() -> None:
-    """pm4py is there."""
+    """Skip unless pm4py is installed."""
     pytest.importorskip("pm4py", reason="the extra `oracle` (pm4py) is not installed")
 
 
 @pytest.fixture(scope="module")
 def storm() -> None:
-    """Storm is there."""
+    """Skip unless Storm is installed."""
     pytest.importorskip("stormpy", reason="the extra `oracle` (stormpy) is not installed")
 
 
 def ours(net: Net) -> tuple[set[tuple[int, ...]], int]:
-    """Markings and number of edges that differ."""
-    space = explore(net, limits=Limits(states=10 * MOST))
+    """Return our markings and the number of distinct edges."""
+    space = explore(net, limits=SearchLimits(states=10 * MOST))
     assert space.complete
     edges = set(zip(space.source.tolist(), space.label.tolist(), strict=True))
     return {space.marking(i) for i in range(len(space))}, len(edges)
@@ -54,8 +54,8 @@ def ours(net: Net) -> tuple[set[tuple[int, ...]], int]:
 @RANDOM
 @given(nets(inhibitors=False, capacities=False, priorities=False))
 def test_snakes_reaches_the_same_markings(snakes: None, net: Net) -> None:
-    """Weighted arcs: the same markings and as many firings between them (SNAKES never fires what
-    consumes nothing)."""
+    """Weighted arcs: the same markings and edges (SNAKES never fires a transition without
+    inputs)."""
     assume(all(net.consume))
     assume(brute_force(net, MOST) is not None)
     assert oracles.snakes_graph(net, 10 * MOST) == ours(net)
@@ -64,9 +64,14 @@ def test_snakes_reaches_the_same_markings(snakes: None, net: Net) -> None:
 @RANDOM
 @given(state_machines(), st.data())
 def test_snakes_with_inhibitors(snakes: None, net: Net, data: st.DataObject) -> None:
-    """Inhibitor arcs that look for one token."""
-    arcs = {t: ({net.places[p]: w for p, w in net.consume[i]}, {net.places[p]: w for p, w in net.produce[i]})
-            for i, t in enumerate(net.transitions)}  # fmt: skip
+    """Inhibitor arcs with a threshold of one token."""
+    arcs = {
+        t: (
+            {net.places[p]: w for p, w in net.consume[i]},
+            {net.places[p]: w for p, w in net.produce[i]},
+        )
+        for i, t in enumerate(net.transitions)
+    }
     free = {t: [p for p in net.places if p not in arcs[t][0]] for t in net.transitions}
     inhibitors = {
         t: {data.draw(st.sampled_from(places)): 1} for t, places in free.items() if places
@@ -78,19 +83,19 @@ def test_snakes_with_inhibitors(snakes: None, net: Net, data: st.DataObject) -> 
 @RANDOM
 @given(nets(inhibitors=False, capacities=False, priorities=False))
 def test_pm4py_reads_what_we_write_and_reaches_the_same(pm4py: None, net: Net) -> None:
-    """Through our PNML: its reader and its firing rule."""
+    """Our PNML with its reader and firing rule."""
     assume(brute_force(net, MOST) is not None)
     assert oracles.pm4py_markings(write_pnml(NetFile(net)), net) == ours(net)[0]
 
 
 @pytest.mark.parametrize("net", [kanban(1), philosophers(5)], ids=["kanban", "philosophers"])
 def test_pm4py_on_known_nets(pm4py: None, net: Net) -> None:
-    """The generated nets of the bench."""
+    """The generated nets of the benchmark."""
     assert oracles.pm4py_markings(write_pnml(NetFile(net)), net) == ours(net)[0]
 
 
 def test_storm_reads_what_we_write_and_agrees(storm: None) -> None:
-    """Through our .drn: its long-run shares are ours."""
+    """Our .drn: the long-run shares of Storm equal ours."""
     gspn = Gspn.of(kanban(1), KANBAN_RATES)
     text = written(NetFile(gspn.net, gspn=gspn), Path("net.drn"))[0]
     for label in ("pkan1", "pm1", "pout4"):
@@ -101,8 +106,7 @@ def test_storm_reads_what_we_write_and_agrees(storm: None) -> None:
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(1, 6), st.lists(st.floats(0.2, 5.0), min_size=2, max_size=5))
 def test_storm_agrees_on_times(storm: None, tokens: int, rates: list[float]) -> None:
-    """Mean time until all jobs have gone through a line of machines, solved by Storm, against our
-    completion."""
+    """Mean time until all jobs have passed a line of machines, by Storm and by `completion`."""
     names = [f"p{i}" for i in range(len(rates) + 1)]
     arcs = {f"t{i}": ({names[i]: 1}, {names[i + 1]: 1}) for i in range(len(rates))}
     arcs["all"] = ({names[-1]: tokens}, {"done": 1})

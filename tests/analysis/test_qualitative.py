@@ -1,5 +1,4 @@
-"""Verdicts against their definitions, by brute force on random nets, and witnesses against the net
-itself."""
+"""Verdicts against their definitions by brute force on random nets; witnesses against the net."""
 
 from __future__ import annotations
 
@@ -11,10 +10,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from petrobot.coordinator.analysis.net.deadlocks import hunt_deadlock
 from petrobot.coordinator.analysis.net.graph import Graph, _tarjan
 from petrobot.coordinator.analysis.net.qualitative import Qualitative, examine
-from petrobot.coordinator.analysis.net.space import Limits, explore
-from petrobot.coordinator.analysis.net.stubborn import hunt_deadlock
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.generators import kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets, state_machines
@@ -23,7 +22,7 @@ Reached = tuple[list[Marking], list[tuple[int, int, int]]]
 
 
 def closure(found: Reached) -> np.ndarray:
-    """reach[i, j]: marking j can be reached from marking i (zero steps included)."""
+    """reach[i, j]: marking j can be reached from marking i in any number of steps, 0 included."""
     n = len(found[0])
     reach = np.eye(n, dtype=bool)
     for i, _, j in found[1]:
@@ -34,7 +33,7 @@ def closure(found: Reached) -> np.ndarray:
 
 
 def judge(net: Net, found: Reached, final: Callable[[Marking], bool]) -> dict[str, object]:
-    """Every verdict straight from its definition."""
+    """Return every verdict directly from its definition."""
     markings, edges = found
     reach = closure(found)
     n, m = len(markings), len(net.transitions)
@@ -56,8 +55,12 @@ def judge(net: Net, found: Reached, final: Callable[[Marking], bool]) -> dict[st
         "quasi_live": 0 not in levels,
         "reversible": bool(reach[:, 0].all()),
         "home": int(reach.all(axis=0).sum()),
-        "sound": bool((reach[:, ends].any(axis=1)).all() and not any(i in busy for i in range(n) if ends[i]) and 0 not in levels),
-    }  # fmt: skip
+        "sound": bool(
+            (reach[:, ends].any(axis=1)).all()
+            and not any(i in busy for i in range(n) if ends[i])
+            and 0 not in levels
+        ),
+    }
 
 
 def told(result: Qualitative) -> dict[str, object]:
@@ -75,7 +78,7 @@ def told(result: Qualitative) -> dict[str, object]:
 
 
 def check_witnesses(net: Net, result: Qualitative) -> None:
-    """Every witness replays in the net and ends where it says."""
+    """Check that every witness replays in the net and ends where it says."""
     verdicts = [
         result.bounded,
         result.safe,
@@ -107,7 +110,7 @@ def verdicts_agree(net: Net) -> None:
 
 @settings(max_examples=120, deadline=None)
 @given(st.one_of(nets(), state_machines()))
-def test_verdicts_are_those_of_the_definitions(net: Net) -> None:
+def test_verdicts_agree_with_the_definitions(net: Net) -> None:
     verdicts_agree(net)
 
 
@@ -120,8 +123,8 @@ def test_verdicts_on_thousands_of_nets(net: Net) -> None:
 
 @settings(max_examples=80, deadline=None)
 @given(nets(places=4, transitions=4), st.integers(5, 40))
-def test_a_partial_search_never_says_what_the_whole_one_denies(net: Net, states: int) -> None:
-    part = examine(explore(net, limits=Limits(states=states)))
+def test_a_partial_search_never_contradicts_the_complete_one(net: Net, states: int) -> None:
+    part = examine(explore(net, limits=SearchLimits(states=states)))
     check_witnesses(net, part)
     found = brute_force(net, 120)
     assume(found is not None)
@@ -179,19 +182,26 @@ def test_deadlocks_of_the_philosophers_are_grouped_with_their_emptied_siphon() -
 
 def test_kanban_is_live_reversible_and_bounded() -> None:
     result = examine(explore(kanban(2)))
-    assert [v.holds for v in (result.bounded, result.safe, result.live, result.reversible, result.deadlock_free)] == [
-        True, False, True, True, True,
-    ]  # fmt: skip
+    assert [
+        v.holds
+        for v in (result.bounded, result.safe, result.live, result.reversible, result.deadlock_free)
+    ] == [
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]
     assert (
         result.home_states == 4600 and set(result.levels) == {4} and result.dead_transitions == ()
     )
 
 
-def test_an_unbounded_net_gets_a_pump_and_unknowns() -> None:
+def test_an_unbounded_net_has_a_pump_and_unknown_verdicts() -> None:
     net = Net.build(
         {"p": 1, "q": 0}, {"grow": ({"p": 1}, {"p": 1, "q": 1}), "drop": ({"q": 1}, {})}
     )
-    result = examine(explore(net, limits=Limits(states=100)))
+    result = examine(explore(net, limits=SearchLimits(states=100)))
     assert result.bounded.holds is False and result.bounded.witness is not None
     assert result.bounded.witness.loop == ("grow",) and result.bounds == (1, None)
     assert (
@@ -200,7 +210,7 @@ def test_an_unbounded_net_gets_a_pump_and_unknowns() -> None:
 
 
 def test_a_partial_search_of_a_bounded_net_still_proves_it_bounded() -> None:
-    result = examine(explore(kanban(3), limits=Limits(states=500)))
+    result = examine(explore(kanban(3), limits=SearchLimits(states=500)))
     assert result.bounded.holds is True and result.bounds == (3,) * 16
     assert result.live.holds is None and not result.live.complete
 
@@ -245,10 +255,10 @@ def test_scipy_and_plain_components_agree(seed: int) -> None:
     assert len(np.unique(np.stack([ours, graph.components]), axis=1).T) == len(np.unique(ours))
 
 
-def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
-    """300 places, some 1e28 markings: the answer is honest and has a witness."""
+def test_a_deadlock_far_outside_a_partial_search_is_found() -> None:
+    """300 places and about 1e28 markings: the deadlock is found, with a witness."""
     net = philosophers(60)
-    result = examine(explore(net, limits=Limits(states=2000)))
+    result = examine(explore(net, limits=SearchLimits(states=2000)))
     assert (
         result.deadlock_free.holds is False
         and result.live.holds is False
@@ -265,5 +275,5 @@ def test_a_deadlock_far_outside_a_partial_search_is_hunted_down() -> None:
 
 
 def test_stubborn_sets_prove_freedom_from_deadlock_of_a_partial_search() -> None:
-    result = examine(explore(kanban(4), limits=Limits(states=1000)))
+    result = examine(explore(kanban(4), limits=SearchLimits(states=1000)))
     assert result.deadlock_free.holds is True and "stubborn sets" in result.deadlock_free.reason

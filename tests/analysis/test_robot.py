@@ -1,5 +1,5 @@
-"""The robot's words on small cells whose answers are known, and on random nets against slow
-definitions."""
+"""Stability, recoverability, controllability: small cells with known answers, random nets by
+definition."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.net.graph import Graph
-from petrobot.coordinator.analysis.net.robot import Flow, Recovery, Roles, judge, legal_exits
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.robot import (
+    Recovery,
+    Roles,
+    SpaceWithRoles,
+    judge,
+    legal_exits,
+)
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.task.net import Marking, Net
 from tests.analysis.random_nets import state_machines
 
 
 def arm(attempts: int, *, give_up: bool = True, renewed: bool = True) -> Net:
-    """One action with an error exit, `attempts` retries of its recovery, an honest end, and a
-    repair that closes the net."""
+    """One action with an error exit, `attempts` retries, a proper end, and a repair that closes
+    the net."""
     arcs: dict[str, tuple[dict[str, int], dict[str, int]]] = {
         "start": ({"idle": 1, "runs": 1}, {"move": 1}),
         "done": ({"move": 1}, {"idle": 1, "runs": 1}),
@@ -30,8 +36,10 @@ def arm(attempts: int, *, give_up: bool = True, renewed: bool = True) -> Net:
     if give_up:
         arcs["give_up"] = ({"recover": 1}, {"out_of_order": 1})
     if renewed:
-        arcs["repair"] = ({"out_of_order": 1, "used": attempts} if attempts else {"out_of_order": 1},
-                          {"idle": 1, "left": attempts} if attempts else {"idle": 1})  # fmt: skip
+        arcs["repair"] = (
+            {"out_of_order": 1, "used": attempts} if attempts else {"out_of_order": 1},
+            {"idle": 1, "left": attempts} if attempts else {"idle": 1},
+        )
     places = {
         "idle": 1,
         "runs": 1,
@@ -142,13 +150,19 @@ def test_a_resumed_run_can_still_meet_its_goal() -> None:
             "retry": ({"recover": 1}, {"move": 1}),
         },
     )
-    roles = Roles(lambda m: m[3] == 0, frozenset({"fault"}), frozenset({"start"}), {"move": frozenset({"start", "retry"})},
-                  frozenset({"start"}), frozenset({"done"}))  # fmt: skip
+    roles = Roles(
+        lambda m: m[3] == 0,
+        frozenset({"fault"}),
+        frozenset({"start"}),
+        {"move": frozenset({"start", "retry"})},
+        frozenset({"start"}),
+        frozenset({"done"}),
+    )
     (fault,) = judge(explore(net), roles).recoveries
     assert fault.resumed is True and fault.kappa is None and fault.almost_sure.holds
 
 
-def test_leaving_the_legal_set_is_shown_and_controllable_exits_are_not() -> None:
+def test_only_uncontrollable_exits_from_the_legal_set_are_reported() -> None:
     net = arm(1)
     fine = legal_exits(explore(net), roles_of(net), lambda m: m[net.place_index["move"]] == 0)
     assert fine.holds is True
@@ -158,10 +172,10 @@ def test_leaving_the_legal_set_is_shown_and_controllable_exits_are_not() -> None
     )
 
 
-def test_a_part_of_the_space_promises_nothing() -> None:
+def test_an_incomplete_space_proves_nothing() -> None:
     net = Net.build({"p": 1}, {"grow": ({"p": 1}, {"p": 2})})
     with pytest.raises(ValueError, match="all reachable markings"):
-        Flow(explore(net, limits=Limits(states=5)), Roles(lambda m: True))
+        SpaceWithRoles(explore(net, limits=SearchLimits(states=5)), Roles(lambda m: True))
 
 
 @settings(max_examples=60, deadline=None)
@@ -169,11 +183,10 @@ def test_a_part_of_the_space_promises_nothing() -> None:
 def test_almost_sure_attraction_is_the_value_one_of_the_decision_process(
     net: Net, data: st.DataObject
 ) -> None:
-    """Against value iteration over the support: strategies that leave out free edges, all others
-    equally likely.
+    """Against an enumeration of all memoryless strategies.
 
-    With memoryless strategies enumerated outright, a vertex wins iff under some strategy every
-    vertex reached can still reach the goal.
+    A strategy leaves out free edges; all others are equally likely. A vertex wins if and only if
+    under some strategy every vertex that is reached can still reach the goal.
     """
     space = explore(net)
     edges, n = len(space.target), len(space)

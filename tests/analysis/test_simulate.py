@@ -1,5 +1,4 @@
-"""Simulation against the exact chain, and phase-type laws against their moments and scipy's
-laws."""
+"""Simulation against the exact chain; phase-type distributions against their moments and scipy."""
 
 from __future__ import annotations
 
@@ -9,12 +8,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import gamma
 
-from petrobot.coordinator.analysis.time.completion import completion, law
+from petrobot.coordinator.analysis.time.completion import completion, completion_time
 from petrobot.coordinator.analysis.time.gspn import Chain, Gspn
 from petrobot.coordinator.analysis.time.markov import long_run, transient
 from petrobot.coordinator.analysis.time.phase_type import fit, fit_samples, gamma_quantile
 from petrobot.coordinator.analysis.time.simulate import (
-    Estimate,
+    IntervalEstimate,
     goal_by_marking,
     simulate,
     token_game,
@@ -67,7 +66,7 @@ def test_completion_lies_in_the_intervals() -> None:
     )
     assert seen.completed is not None and seen.time is not None
     assert seen.completed.covers(done.probability) and seen.time.covers(done.mean)
-    assert seen.quantile(0.9) == pytest.approx(law(chain, goal).quantile(0.9), rel=0.1)
+    assert seen.quantile(0.9) == pytest.approx(completion_time(chain, goal).quantile(0.9), rel=0.1)
     same = simulate(
         gspn, sure(2), replicas=4000, goal=goal_by_marking(lambda m: m[2] > 0), horizon=1e9
     )
@@ -129,7 +128,7 @@ def test_fits_meet_mean_and_variance(mean: float, cv: float) -> None:
     assert fitted.cdf(fitted.quantile(0.9)) == pytest.approx(0.9, abs=1e-9)
 
 
-def test_too_small_a_spread_keeps_the_mean_and_owns_up_to_the_error() -> None:
+def test_a_variance_that_needs_more_stages_keeps_the_mean_and_reports_the_error() -> None:
     fitted = fit(2.0, 0.0, stages=25)
     assert fitted.mean == pytest.approx(2.0) and fitted.variance == pytest.approx(4.0 / 25)
     assert fitted.error_at_90(2.0) == pytest.approx(
@@ -138,7 +137,7 @@ def test_too_small_a_spread_keeps_the_mean_and_owns_up_to_the_error() -> None:
     shifted = fit(2.0, 0.01, shift=1.8)
     assert shifted.mean == pytest.approx(2.0) and shifted.variance == pytest.approx(0.01)
     assert shifted.cdf(1.8) == 0.0
-    with pytest.raises(ValueError, match="no law"):
+    with pytest.raises(ValueError, match="expected mean > shift"):
         fit(1.0, 0.1, shift=1.0)
 
 
@@ -157,19 +156,19 @@ def test_fitting_measured_durations() -> None:
 
 
 def test_estimates() -> None:
-    wide, narrow = (Estimate.share(k, 10 * k, 0.95) for k in (3, 300))
+    wide, narrow = (IntervalEstimate.share(k, 10 * k, 0.95) for k in (3, 300))
     assert wide.low < narrow.low < 0.1 < narrow.high < wide.high
-    assert Estimate.share(0, 10, 0.95).low == pytest.approx(0.0) and Estimate.share(
+    assert IntervalEstimate.share(0, 10, 0.95).low == pytest.approx(0.0) and IntervalEstimate.share(
         10, 10, 0.95
     ).high == pytest.approx(1.0)
-    assert Estimate.of(np.array([1.0]), 0.95).covers(1e9)
+    assert IntervalEstimate.of(np.array([1.0]), 0.95).covers(1e9)
 
 
 @settings(max_examples=15, deadline=None)
 @given(gspns(), st.integers(0, 2**32))
 def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
-    """The kernel as it stands (compiled where numba is installed) against the replicas of numpy,
-    within wide intervals."""
+    """The loop (compiled if numba is installed) against the numpy replicas, within wide
+    intervals."""
     random = np.random.default_rng(seed)
     tables, initial = Tables.of(gspn), np.array(gspn.net.initial)
     runs, horizon, warmup = 120, 3.0, 0.5
@@ -183,7 +182,7 @@ def test_the_compiled_loop_plays_the_same_net(gspn: Gspn, seed: int) -> None:
         gspn, random, replicas=600, horizon=horizon, warmup=warmup, confidence=1 - 1e-9
     )
     for t, name in enumerate(gspn.net.transitions):
-        ours = Estimate.of(fires[:, t] / (horizon - warmup), 1 - 1e-9)
+        ours = IntervalEstimate.of(fires[:, t] / (horizon - warmup), 1 - 1e-9)
         assert (
             ours.low - 0.1 <= other.throughput[name].high
             and other.throughput[name].low <= ours.high + 0.1
@@ -205,8 +204,8 @@ def test_the_compiled_engine_is_an_extra() -> None:
 
 
 @pytest.mark.parametrize("kernel", [False, True], ids=["side by side", "one after the other"])
-def test_an_inhibitor_holds_arrivals_back(kernel: bool) -> None:
-    """A queue that takes nobody in beyond two, as fast out as in: 0, 1 and 2 are equally likely, so
+def test_an_inhibitor_stops_arrivals(kernel: bool) -> None:
+    """A queue that accepts two customers, with equal rates: 0, 1 and 2 are equally likely, so
     the mean is 1."""
     net = Net.build(
         {"source": 1, "waiting": 0},

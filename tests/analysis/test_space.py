@@ -1,4 +1,4 @@
-"""The three engines against the firing rule of the net itself, and against each other under every
+"""The three engines against the firing rule of the net, and against each other under every
 limit."""
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from petrobot.coordinator.analysis.net import explore_compiled as explore_numba
-from petrobot.coordinator.analysis.net.explore import Engine, Explored, IntegerEngine
+from petrobot.coordinator.analysis.net.explore import ExplorationEngine, Explored, IntegerEngine
 from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
 from petrobot.coordinator.analysis.net.pack import Layout, TooManyTokens
-from petrobot.coordinator.analysis.net.space import EngineName, Limits, Space, explore
+from petrobot.coordinator.analysis.net.space import EngineName, SearchLimits, Space, explore
 from petrobot.coordinator.task.net import Net
 from petrobot.services.host.numba_kernels import COMPILED
 from tests.analysis.generators import fms, kanban, philosophers
 from tests.analysis.random_nets import brute_force, nets
 from tests.waiting import Limit
 
-ENGINES: dict[str, Callable[[Explored], Engine]] = {
+ENGINES: dict[str, Callable[[Explored], ExplorationEngine]] = {
     "integers": IntegerEngine,
     "numpy": NumpyEngine,
     "kernel": explore_numba.NumbaEngine,
@@ -31,7 +31,7 @@ ENGINES: dict[str, Callable[[Explored], Engine]] = {
 def run(
     kind: str, net: Net, *, least: int = 1, cap: int | None = None, keep: bool = True
 ) -> Explored:
-    """A whole search by one engine, from the narrowest layout unless said otherwise."""
+    """Search completely with one engine, by default from the narrowest layout."""
     engine = ENGINES[kind](Explored.start(net, Layout.for_net(net, least=least), keep))
     limit = Limit("the end of the search")
     while (engine.expand(cap) and (cap is None or engine.states < cap)) and limit.left():
@@ -40,7 +40,7 @@ def run(
 
 
 def listed(found: Explored) -> tuple[list[tuple[int, ...]], list[tuple[int, int, int]]]:
-    """Markings and edges as brute force gives them."""
+    """Return markings and edges in the form of `brute_force`."""
     markings = [tuple(m) for m in found.layout.unpack_many(found.words).tolist()]
     source = np.repeat(np.arange(len(found.row) - 1), np.diff(found.row)).tolist()
     return markings, list(zip(source, found.label.tolist(), found.target.tolist(), strict=True))
@@ -83,7 +83,7 @@ def test_engines_stop_at_the_same_marking_under_a_cap(net: Net, cap: int) -> Non
     st.sampled_from(sorted(ENGINES)),
     st.sampled_from(sorted(ENGINES)),
 )
-def test_one_engine_goes_on_where_another_stopped(
+def test_one_engine_continues_where_another_stopped(
     net: Net, cap: int, first: str, second: str
 ) -> None:
     expected = brute_force(net, 200)
@@ -95,7 +95,7 @@ def test_one_engine_goes_on_where_another_stopped(
     assert listed(engine.explored()) == expected
 
 
-def test_auto_hands_over_to_numpy_and_agrees_with_plain_integers() -> None:
+def test_auto_changes_to_numpy_and_agrees_with_integers() -> None:
     auto, plain = explore(philosophers(9)), explore(philosophers(9), engine="integers")
     assert (auto.engine, plain.engine) == ("numpy", "integers")
     assert len(auto) == len(plain) == 3**9
@@ -125,7 +125,7 @@ def test_fields_grow_with_the_tokens(kind: str) -> None:
 
 @pytest.mark.parametrize("engine", ["integers", "numpy"])
 def test_more_tokens_than_a_word_can_count_end_the_search(engine: EngineName) -> None:
-    """What was found before is kept, marked as a part; an initial marking that no word can count is
+    """What was found before is kept as a partial space; an initial marking above 63 bits is
     refused."""
     huge = Net.build({"p": 1}, {"grow": ({"p": 1}, {"p": (1 << 62) + 1})})
     part = explore(huge, engine=engine)
@@ -142,8 +142,8 @@ def unbounded() -> Net:
 
 
 @pytest.mark.parametrize("engine", ["auto", "integers", "numpy"])
-def test_a_limit_of_states_gives_an_honest_part(engine: EngineName) -> None:
-    space = explore(unbounded(), engine=engine, limits=Limits(states=50))
+def test_a_limit_of_states_gives_a_marked_partial_space(engine: EngineName) -> None:
+    space = explore(unbounded(), engine=engine, limits=SearchLimits(states=50))
     assert not space.complete and "50 states" in space.reason
     assert len(space) >= 50 > space.expanded - 1
     assert space.row[space.expanded] == space.row[-1] == len(space.target)
@@ -159,12 +159,12 @@ def ticking() -> Iterator[float]:
 
 def test_time_and_memory_limits() -> None:
     clock = ticking().__next__
-    space = explore(unbounded(), limits=Limits(seconds=3.0, clock=clock))
+    space = explore(unbounded(), limits=SearchLimits(seconds=3.0, clock=clock))
     assert not space.complete and "3 s" in space.reason
-    space = explore(kanban(3), engine="numpy", limits=Limits(memory=1_000_000))
+    space = explore(kanban(3), engine="numpy", limits=SearchLimits(memory=1_000_000))
     assert not space.complete and "memory" in space.reason
     with pytest.raises(ValueError, match="clock"):
-        Limits(seconds=1.0)
+        SearchLimits(seconds=1.0)
 
 
 @pytest.mark.parametrize("engine", ["integers", "numpy"])
@@ -180,10 +180,10 @@ def test_ctrl_c_leaves_a_consistent_part(engine: EngineName) -> None:
     space = explore(
         unbounded() if engine == "integers" else kanban(3),
         engine=engine,
-        limits=Limits(progress=progress),
+        limits=SearchLimits(progress=progress),
     )
     assert not space.complete and space.reason == "interrupted"
-    whole = explore(space.net, engine=engine, limits=Limits(states=len(space) + 2000))
+    whole = explore(space.net, engine=engine, limits=SearchLimits(states=len(space) + 2000))
     assert np.array_equal(whole.target[: len(space.target)], space.target)
 
 
@@ -209,13 +209,13 @@ def test_numbers_and_markings_are_inverse() -> None:
     )
 
 
-def test_without_edges_the_counts_stay() -> None:
+def test_without_edges_the_counts_are_kept() -> None:
     kept, bare = explore(philosophers(5)), explore(philosophers(5), edges=False)
     assert bare.edges == kept.edges and not bare.target.size
     assert bare.dead.tolist() == kept.dead.tolist() != []
 
 
-def test_numba_is_asked_for_by_name_only() -> None:
+def test_numba_is_used_only_on_request() -> None:
     if COMPILED:
         assert len(explore(kanban(2), engine="numba")) == 4600
     else:
@@ -234,14 +234,14 @@ def test_layout_round_trips_and_fields_stay_apart() -> None:
     assert layout.pack(marking) & layout.guards == 0
 
 
-def test_progress_is_told() -> None:
+def test_progress_is_reported() -> None:
     told: list[tuple[int, int]] = []
     space: Space = explore(
-        kanban(2), limits=Limits(progress=lambda found, done: told.append((found, done)))
+        kanban(2), limits=SearchLimits(progress=lambda found, done: told.append((found, done)))
     )
     assert told == sorted(told) and told[-1][0] <= len(space)
 
 
 def test_fms_has_the_published_number_of_markings() -> None:
-    """3,444 markings for two parts in the Model Checking Contest's known-values list."""
+    """3,444 markings for two parts, as published by the Model Checking Contest."""
     assert (len(explore(fms(2))), explore(fms(2)).edges) == (3444, 16698)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given, settings
 
 from petrobot.coordinator.analysis.net import structure
-from petrobot.coordinator.analysis.net.siphons import (
+from petrobot.coordinator.analysis.net.deadlocks import (
     controlled_siphons,
     empty_siphon,
     largest_trap,
@@ -88,7 +88,7 @@ def test_basis_spans_the_left_kernel(net: Net) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(nets())
-def test_bounds_are_never_below_what_is_reached(net: Net) -> None:
+def test_bounds_are_never_below_reachable_tokens(net: Net) -> None:
     found = brute_force(net, 200)
     assume(found is not None and found)
     reached = np.array(found[0] if found else []).max(axis=0)
@@ -142,14 +142,14 @@ def test_kanban_is_conservative() -> None:
     assert {frozenset(x.values()) for x in transition_semiflows(net).vectors} == {frozenset({1})}
 
 
-def test_a_bounded_effort_says_that_it_gave_up() -> None:
+def test_an_enumeration_that_gave_up_is_marked_incomplete() -> None:
     flows = place_semiflows(philosophers(12), effort=10)
     assert not flows.complete
     assert not minimal_siphons(philosophers(12), effort=20).complete
 
 
 def siphons_by_definition(net: Net) -> set[frozenset[int]]:
-    """All minimal non-empty siphons by trying every subset."""
+    """Return all minimal non-empty siphons by trying every subset."""
     minimal: set[frozenset[int]] = set()
     for size in range(1, len(net.places) + 1):
         for some in map(frozenset, combinations(range(len(net.places)), size)):

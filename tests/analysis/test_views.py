@@ -1,5 +1,5 @@
-"""The two views of a task: what each keeps, numbers in closed form, and the shipped tasks with
-broken variants."""
+"""Ordinary and stochastic view of a task: what each keeps, closed forms, shipped and broken
+tasks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from petrobot.coordinator.analysis.net.booleans import boolean_view
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.qualitative import examine
 from petrobot.coordinator.analysis.net.robot import judge
-from petrobot.coordinator.analysis.net.space import Limits, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.analysis.time.completion import Completion, completion
 from petrobot.coordinator.analysis.time.gspn import Chain
 from petrobot.coordinator.analysis.time.markov import visits_before
@@ -59,7 +59,7 @@ EXPONENTIAL = {
 def action(
     name: str, estimates: dict[Status, Estimate] | None = None, **more: Any
 ) -> dict[str, Any]:
-    """Primitive task and action place of one name."""
+    """Return a primitive task and an action place of the same name."""
     known = EXPONENTIAL if estimates is None else estimates
     primitive = PrimitiveTask(
         name, f"{name} is done", more.pop("alternatives", ("a",)), 10.0, estimates=known
@@ -117,12 +117,12 @@ def test_preselection_gives_the_mean_of_the_mixture() -> None:
     assert done.probability == pytest.approx(1.0)
     assert done.mean == pytest.approx((0.7 * 2 + 0.2 * 3 + 0.1 * 4) / 0.9)
     assert view.fit_errors["act.a.success"] == pytest.approx(0.0, abs=1e-9)
-    assert any("declared estimates" in text for text in view.assumptions)
+    assert any("estimates declared in the task file" in text for text in view.assumptions)
 
 
 def test_measured_runs_choices_and_no_declared_estimates() -> None:
     task = one_step(estimates={}, alternatives=("slow", "fast"))
-    with pytest.raises(NoEstimate, match="no run of slow was measured"):
+    with pytest.raises(NoEstimate, match="duration of slow is unknown"):
         stochastic_view(task)
     runs = {
         ("act", "slow"): {Status.SUCCESS: Estimate(1.0, 4.0)},
@@ -136,8 +136,8 @@ def test_measured_runs_choices_and_no_declared_estimates() -> None:
 
 
 def test_a_preempting_event_races_with_the_run() -> None:
-    """P(event first) = mean / (mean + wait) for one exponential run; what is left of the run
-    vanishes."""
+    """P(event first) = mean / (mean + wait) for one exponential run; the rest of the run is
+    flushed."""
     task = one_step(estimates={Status.SUCCESS: Estimate(1.0, 2.0, 1.0)})
     caught = Transition(
         "caught", (taken("act", End.PREEMPT, Counts.SUCCESS),), (Output("done"),), events=("hit",)
@@ -162,8 +162,9 @@ def test_a_preempting_event_races_with_the_run() -> None:
     assert fixed.mean == pytest.approx(3 * (1 - np.exp(-2 / 3)), rel=5e-3)
 
 
-def test_a_timer_is_set_back_when_its_transition_is_disabled() -> None:
-    """A token bounces between waiting and away; the timer of 1 s only counts unbroken waiting."""
+def test_a_timer_is_reset_when_its_transition_is_disabled() -> None:
+    """A token moves between waiting and away; the timer of 1 s counts only uninterrupted
+    waiting."""
     task = task_of(
         [],
         [Place("wait", Kind.CONTROL, 1), Place("away", Kind.CONTROL), Place("done", Kind.CONTROL)],
@@ -185,7 +186,7 @@ def test_a_timer_is_set_back_when_its_transition_is_disabled() -> None:
     assert once.mean == pytest.approx((1 / 3 + 2 / 3 * 0.1) * 3)
 
 
-def test_servers_let_runs_go_on_side_by_side_and_the_others_queue() -> None:
+def test_servers_run_in_parallel_and_other_runs_queue() -> None:
     def mean(servers: int) -> float:
         steps = action("act", {Status.SUCCESS: Estimate(1.0, 1.0)}, servers=servers)
         task = task_of(
@@ -229,7 +230,7 @@ def test_conditions_on_statuses_choose_their_branch_and_others_are_switches() ->
     ].probability == pytest.approx(0.9)
 
 
-def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
+def test_unknown_numbers_are_refused_with_a_remedy() -> None:
     task = one_step()
     waits = replace(
         task,
@@ -250,8 +251,8 @@ def test_what_cannot_be_told_is_refused_with_a_remedy() -> None:
 
 @st.composite
 def tasks(draw: st.DrawFn) -> Task:
-    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors, timers
-    and events."""
+    """Random tasks of two or three actions with joins, going and preempt arcs, inhibitors,
+    timers and events."""
     names = [f"a{i}" for i in range(draw(st.integers(1, 3)))]
     controls = [
         Place(
@@ -294,7 +295,7 @@ def tasks(draw: st.DrawFn) -> Task:
 @given(tasks())
 def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: Task) -> None:
     view = stochastic_view(task, stages=2, timer_stages=2)
-    space = explore(view.gspn.net, limits=Limits(states=1500))
+    space = explore(view.gspn.net, limits=SearchLimits(states=1500))
     net, gspn_net = task.net, view.gspn.net
     for i, t, j in zip(
         space.source.tolist(), space.label.tolist(), space.target.tolist(), strict=True
@@ -309,9 +310,9 @@ def test_every_firing_of_the_stochastic_view_projects_on_the_ordinary_net(task: 
 
 @settings(max_examples=60, deadline=None)
 @given(tasks())
-def test_tokens_of_action_places_are_runs_that_go_on_or_have_ended(task: Task) -> None:
+def test_tokens_of_action_places_are_active_or_finished_runs(task: Task) -> None:
     view = stochastic_view(task, stages=2, timer_stages=2)
-    space = explore(view.gspn.net, limits=Limits(states=800))
+    space = explore(view.gspn.net, limits=SearchLimits(states=800))
     index = view.gspn.net.place_index
     for place in task.places.values():
         if place.kind is Kind.ACTION:
@@ -320,13 +321,13 @@ def test_tokens_of_action_places_are_runs_that_go_on_or_have_ended(task: Task) -
             assert (own == parts).all()
 
 
-def test_the_operators_hand_is_there_on_request() -> None:
+def test_operator_transitions_are_added_on_request() -> None:
     task = one_step()
     task = replace(task, places={**task.places, "idle": replace(task.places["idle"], capacity=2)})
     view = OrdinaryView(task, operator=True)
     assert view.net.transitions[-2:] == ("put.idle", "take.idle")
     assert view.controllable == {"put.idle", "take.idle", "go"}
-    space = explore(view.net, limits=Limits(states=100))
+    space = explore(view.net, limits=SearchLimits(states=100))
     assert space.bounds[view.net.place_index["idle"]] == 2
     assert space.number((0,) * len(view.net.places)) is not None
 
@@ -383,7 +384,7 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
     twice = (Output("arm_free"), Output("camera_free"), Output("runs", 2))
     leaking = replace(task.transitions["not_located"], outputs=twice)
     view = OrdinaryView(replace(task, transitions={**task.transitions, "not_located": leaking}))
-    leak = examine(explore(view.net, limits=Limits(states=3000)), final=view.is_end)
+    leak = examine(explore(view.net, limits=SearchLimits(states=3000)), final=view.is_end)
     assert (
         leak.bounded.holds is False
         and leak.bounded.witness is not None
@@ -400,7 +401,7 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
     view = OrdinaryView(
         replace(task, places=places, transitions={**task.transitions, "in_place": double})
     )
-    space = explore(view.net, limits=Limits(states=20_000))
+    space = explore(view.net, limits=SearchLimits(states=20_000))
     both = (space.tokens(view.net.place_index["arm_free"]) > 0) & (
         space.tokens(view.net.place_index["catch_ball"]) > 0
     )
@@ -411,8 +412,7 @@ def test_broken_variants_are_caught_with_witnesses() -> None:
 
 
 def with_variable(initial: bool | None) -> Task:
-    """A run of `look` writes `seen`; its normal exits ask for it; a second look is only for what
-    was not seen."""
+    """A run of `look` writes `seen`, its normal exits read it; a second look needs `not seen`."""
     task = task_of(
         [action("look", out={"seen": "seen"})],
         [
@@ -468,7 +468,7 @@ def test_other_conditions_are_dropped_and_too_many_variables_refused() -> None:
     assert "hit" in view.net.transitions
     many = {f"v{i}": Variable(f"v{i}", VariableType.BOOL, False) for i in range(9)}
     wide = replace(task.transitions["hit"], when=parse(" and ".join(many)))
-    with pytest.raises(ValueError, match="9 boolean variables"):
+    with pytest.raises(ValueError, match="got 9"):
         boolean_view(
             replace(
                 task,

@@ -1,4 +1,4 @@
-"""What if: one number changed gives what a file with that number gives."""
+"""What if: changing one number gives the same result as a file with that number."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.analysis.commands import analyse_command, simulate_command
-from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.report import analyse
 from petrobot.coordinator.analysis.time.stochastic import Measured
 from petrobot.coordinator.analysis.time.whatif import change_net, change_task, read_change
@@ -20,8 +20,8 @@ from tests.analysis.broken import TASKS
 CATCH = TASKS / "catch_ball.toml"
 
 
-def test_tokens_are_as_in_the_file(tmp_path: Path) -> None:
-    """runs=2 gives what a file with two tokens gives."""
+def test_changed_tokens_equal_those_in_a_file(tmp_path: Path) -> None:
+    """runs=2 gives the same result as a file with two tokens."""
     edited = tmp_path / "two.toml"
     task = load(CATCH)
     two = replace(task, places={**task.places, "runs": replace(task.places["runs"], tokens=2)})
@@ -36,7 +36,7 @@ def test_tokens_are_as_in_the_file(tmp_path: Path) -> None:
 
 
 def test_shares_keep_their_proportions() -> None:
-    """An error share that moves scales the other statuses and leaves other actions alone."""
+    """A changed error share scales the other statuses and leaves other actions alone."""
     task = load(CATCH)
     estimates = task.primitive_tasks["locate_ball"].estimates
     first = task.primitive_tasks["locate_ball"].alternatives[0]
@@ -54,8 +54,8 @@ def test_shares_keep_their_proportions() -> None:
     )
 
 
-def test_what_is_improved_improves() -> None:
-    """Fewer errors complete more often; a status that was never seen may be supposed."""
+def test_improvements_improve_the_result() -> None:
+    """Fewer errors complete more often; a status that never occurred may be given a share."""
     task = load(CATCH)
 
     def complete(*changes: str) -> float:
@@ -78,37 +78,37 @@ def test_what_is_improved_improves() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("runs", "no change of one number"),
-        ("runs=many", "no change of one number"),
+        ("runs", "not of the form NAME=NUMBER"),
+        ("runs=many", "not of the form NAME=NUMBER"),
         ("runs=1.5", "whole number"),
-        ("locate_ball=1", "no resource or control place"),
-        ("nobody.error.share=0.1", "no number of catch_ball"),
-        ("locate_ball.crash.share=0.1", "no number of catch_ball"),
-        ("locate_ball.nobody.error.share=0.1", "no alternative of locate_ball"),
+        ("locate_ball=1", "not a resource or control place"),
+        ("nobody.error.share=0.1", "catch_ball has no such number"),
+        ("locate_ball.crash.share=0.1", "catch_ball has no such number"),
+        ("locate_ball.nobody.error.share=0.1", "not an alternative of locate_ball"),
         ("locate_ball.error.share=1.5", "out of range"),
         ("locate_ball.success.mean=0", "out of range"),
     ],
 )
-def test_what_cannot_be_supposed_is_told(text: str, said: str) -> None:
+def test_impossible_changes_are_refused(text: str, said: str) -> None:
     """One clear line, and the exit code for bad input."""
     outcome = analyse_command(CATCH, load, changes=[text])
     assert outcome.code == 2 and said in outcome.text and "what if" in outcome.text
 
 
 def test_nets_with_and_without_rates(tmp_path: Path) -> None:
-    """A PNML net: tokens always, rates where it has some."""
+    """A PNML net: tokens always, rates only if it has any."""
     net = tmp_path / "cycle.net"
     net.write_text("tr work a -> b\ntr rest b -> a\npl a (1)\n", encoding="utf-8")
     outcome = analyse_command(net, load, view="gspn", rates="unit", changes=["work.rate=3", "a=2"])
     assert outcome.data["throughput"]["work"] == pytest.approx(12 / 13, rel=1e-9)
     assert outcome.data["as_it_is"]["throughput"]["work"] == pytest.approx(0.5)
     assert analyse_command(net, load, changes=["work.rate=3"]).code == 2
-    with pytest.raises(FormatError, match="no place c"):
+    with pytest.raises(NetFileError, match="no place c"):
         change_net(Net.build({"a": 1}, {}), [read_change("c=1")])
 
 
-def test_simulation_takes_the_same_changes() -> None:
-    """Runs that a change doubles take twice as long."""
+def test_simulation_accepts_the_same_changes() -> None:
+    """Twice the runs take twice as long."""
     import numpy as np
 
     def mean(*changes: str) -> float:

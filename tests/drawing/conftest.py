@@ -1,5 +1,4 @@
-"""Random nets of the shape that robot tasks have: steps, alternatives, loops and side-by-side
-branches around resources."""
+"""Random nets with the structure of robot tasks: steps, alternatives, loops, parallel branches."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ from petrobot.coordinator.task.net import Net
 
 
 class _Growing:
-    """A net that is grown block by block."""
+    """A net that is built block by block."""
 
     def __init__(self, random: np.random.Generator) -> None:
         self.random = random
@@ -19,20 +18,20 @@ class _Growing:
         }
 
     def place(self) -> str:
-        """A new place."""
+        """Add a place."""
         name = f"place_{len(self.places)}"
         self.places[name] = 0
         return name
 
     def step(self, takes: list[str], gives: list[str]) -> None:
-        """A new transition."""
+        """Add a transition."""
         self.transitions[f"step_{len(self.transitions)}"] = (
             dict.fromkeys(takes, 1),
             dict.fromkeys(gives, 1),
         )
 
     def block(self, start: str, depth: int) -> str:
-        """Something that begins at a place; gives the place where it ends."""
+        """Add a block that begins at a place; return the place where it ends."""
         kind = (
             self.random.choice(
                 ["sequence", "sequence", "action", "parallel", "alternative", "loop"]
@@ -62,7 +61,7 @@ class _Growing:
 
 
 def random_task(random: np.random.Generator, depth: int) -> Net:
-    """A random net of some 10 (depth 2) to 60 (depth 4) nodes."""
+    """Return a random net of about 10 (depth 2) to 60 (depth 4) nodes."""
     net = _Growing(random)
     net.step([net.block("go", depth)], ["arm"])
     return Net.build(net.places, net.transitions)

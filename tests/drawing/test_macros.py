@@ -1,5 +1,4 @@
-"""Macro places that group: what a task file may say of them, what it changes, and how they are
-drawn."""
+"""Macro places that group nodes: what a task file may declare, what it changes, how it is drawn."""
 
 from __future__ import annotations
 
@@ -49,7 +48,7 @@ s = { in = ["x"], out = ["y"] }
 
 
 def flat_twin() -> Task:
-    """The same task with nothing grouped."""
+    """Return the same task without groups."""
     lines = [
         line for line in TEXT.splitlines() if not line.startswith(("inner =", "outer =", "g ="))
     ]
@@ -60,13 +59,19 @@ def flat_twin() -> Task:
 
 
 def test_grouping_changes_nothing_but_the_drawing() -> None:
-    """The ordinary net, and so every analysis and every run, is that of the ungrouped task."""
+    """The ordinary net, and so every analysis and run, equals that of the task without groups."""
     task = loads(TEXT)
     assert task.net == flat_twin().net
     assert loads(dumps(task)) == task
     assert {n: p.macro for n, p in task.flat.places.items()} == {
-        "begin": "", "a": "inner", "b": "inner", "c": "outer", "done": "", "use.x": "use.g", "use.y": "use",
-    }  # fmt: skip
+        "begin": "",
+        "a": "inner",
+        "b": "inner",
+        "c": "outer",
+        "done": "",
+        "use.x": "use.g",
+        "use.y": "use",
+    }
 
 
 @pytest.mark.parametrize(
@@ -85,8 +90,8 @@ def test_grouping_changes_nothing_but_the_drawing() -> None:
         ('"y" }', '"y" }', ""),
     ],
 )
-def test_what_is_no_group_is_refused(old: str, new: str, key: str) -> None:
-    """Each fault names its key and a remedy."""
+def test_invalid_groups_are_refused(old: str, new: str, key: str) -> None:
+    """Each error names its key and a remedy."""
     if not key:
         loads(TEXT)
         return
@@ -98,7 +103,7 @@ def test_what_is_no_group_is_refused(old: str, new: str, key: str) -> None:
 
 
 def test_a_macro_place_is_drawn_as_one_with_its_tokens_summed() -> None:
-    """Arcs to several places inside are one arc; the inside is drawn with what stands around it."""
+    """Arcs to several places inside become one arc; the inside is drawn with its surroundings."""
     task = loads(TEXT)
     scene = scene_of_task(task, True, None, None)
     assert set(scene.nodes) == {"begin", "outer", "done", "use", "t1", "t4", "t5"}
@@ -113,15 +118,15 @@ def test_a_macro_place_is_drawn_as_one_with_its_tokens_summed() -> None:
         draw(task, inside="nowhere")
 
 
-def test_what_is_told_of_the_inside_is_told_of_the_macro_place() -> None:
-    """Heat and turns of an overlay go to the macro place that is drawn instead."""
+def test_the_overlay_of_the_inside_is_shown_on_the_macro_place() -> None:
+    """Heat and firing numbers go to the macro place that is drawn instead."""
     svg = draw(loads(TEXT), overlay=Overlay(heat={"a": 0.3, "use.x": 0.2}, path=["t1", "t2", "t3"]))
     texts = [e.text for e in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]
     assert "2, 3" in texts and svg.count('class="warm"') == 2
 
 
-def test_the_page_knows_which_stands_in_which() -> None:
-    """The snapshot's picture has every macro place, with the one around it."""
+def test_the_page_knows_the_nesting_of_macro_places() -> None:
+    """The snapshot lists every macro place and the one around it."""
     made = picture(loads(TEXT))
     around = {p["name"]: p["in_macro"] for p in made["places"] if p["kind"] == "macro"}
     assert around == {"inner": "outer", "outer": "", "use": "", "use.g": "use"}
@@ -129,14 +134,16 @@ def test_the_page_knows_which_stands_in_which() -> None:
 
 
 def test_the_command_opens_a_macro_place(tmp_path: Path) -> None:
-    """`petrobot show --inside` draws the inside; a name that is none is bad input and says which
-    there are."""
+    """`petrobot show --inside` draws the inside; an unknown name is bad input, and the known
+    ones are listed."""
     parser = argparse.ArgumentParser()
     show.add_arguments(parser)
     task, out = tmp_path / "m.toml", tmp_path / "m.svg"
     task.write_text(TEXT)
     assert show.run(parser.parse_args([str(task), "--inside", "outer", "--out", str(out)])) == 0
     assert "inner work" in out.read_text() and ">m: outer<" in out.read_text()
-    with pytest.raises(CommandError, match="no macro place 'nowhere': inner, outer, use") as caught:
+    with pytest.raises(
+        CommandError, match="no macro place 'nowhere'; it has inner, outer, use"
+    ) as caught:
         show.run(parser.parse_args([str(task), "--inside", "nowhere", "--out", str(out)]))
     assert caught.value.code == 2

@@ -1,5 +1,5 @@
-"""Automatic drawings are fit to be published: measured on random nets that nobody looked at while
-the layout was made."""
+"""Automatic drawings are good enough to publish: measured on random nets outside the development
+set."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from petrobot.coordinator.drawing.layout import Point
-from petrobot.coordinator.drawing.routing import Box, Way, Words, place_words, route
-from petrobot.coordinator.drawing.scene import Node, Scene, scene_of_net, scene_of_task
+from petrobot.coordinator.drawing.routing import ArcPath, Box, Words, place_words, route
+from petrobot.coordinator.drawing.scene import DrawnNode, Scene, scene_of_net, scene_of_task
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
 from tests.drawing.conftest import random_task
@@ -23,8 +23,8 @@ SHIPPED = Path(__file__).parents[2] / "coordinator" / "tasks"
 SEEDS = range(300, 316)
 
 
-def crossings(ways: list[Way]) -> int:
-    """Pairs of arcs that cross, but for those that meet at one end anyway."""
+def crossings(ways: list[ArcPath]) -> int:
+    """Count the pairs of arcs that cross, except those that share an end."""
     apart = [
         (a, b)
         for a, b in combinations(ways, 2)
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 
 def _side(p: Array, q: Array, r: Array) -> Array:
-    """On which side of the line from p to q the points r lie."""
+    """Return on which side of the line from p to q the points r lie."""
     side: Array = (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
         r[..., 0] - p[..., 0]
     )
@@ -53,23 +53,23 @@ def _cross(a: Array, b: Array) -> bool:
 
 
 def inside(p: Point, box: Box, margin: float = 0.0) -> bool:
-    """Whether a point lies in a box."""
+    """Return whether a point lies in a box."""
     return box[0] - margin < p[0] < box[2] + margin and box[1] - margin < p[1] < box[3] + margin
 
 
-def box_of(node: Node) -> Box:
-    """What a node covers."""
+def box_of(node: DrawnNode) -> Box:
+    """Return the box that a node covers."""
     (x, y), (w, h) = node.at, node.half
     return x - w, y - h, x + w, y + h
 
 
 def covers(a: Box, b: Box) -> bool:
-    """Whether two boxes overlap."""
+    """Return whether two boxes overlap."""
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def through_nodes(scene: Scene, ways: list[Way]) -> Iterator[tuple[Way, str]]:
-    """Arcs that run over a node that is not theirs."""
+def through_nodes(scene: Scene, ways: list[ArcPath]) -> Iterator[tuple[ArcPath, str]]:
+    """Yield the arcs that cross a node which is not one of their ends."""
     for way in ways:
         for node in scene.nodes.values():
             if node.name not in (way.arc.source, way.arc.target) and any(
@@ -78,21 +78,21 @@ def through_nodes(scene: Scene, ways: list[Way]) -> Iterator[tuple[Way, str]]:
                 yield way, node.name
 
 
-def through_words(words: list[Words], ways: list[Way]) -> int:
-    """Texts with an arc through their middle, where it would be read through."""
+def through_words(words: list[Words], ways: list[ArcPath]) -> int:
+    """Count the labels with an arc through their middle, where it disturbs reading."""
     cores = [(w.box[0], w.box[1] + 4, w.box[2], w.box[3] - 4) for w in words]
     return sum(any(inside(p, core) for p in way.points) for core in cores for way in ways)
 
 
-def drawn(scene: Scene) -> tuple[list[Way], list[Words]]:
-    """Its arcs and words."""
+def drawn(scene: Scene) -> tuple[list[ArcPath], list[Words]]:
+    """Return the paths and labels of a scene."""
     ways = route(scene)
     return ways, place_words(scene.nodes, ways)
 
 
-def test_random_nets_are_drawn_as_a_person_would() -> None:
-    """No node on another, no arc over a node, no word on a word or node; crossings and struck words
-    are rare (all seeds)."""
+def test_random_nets_are_drawn_without_overlaps() -> None:
+    """No overlapping nodes, no arc over a node, no label on a label or node; crossings are rare
+    (all seeds)."""
     arcs = crossed = struck = 0
     for seed in SEEDS:
         scene = scene_of_net(random_task(np.random.default_rng(seed), 2 + seed % 3), None, None)
@@ -113,7 +113,7 @@ def test_random_nets_are_drawn_as_a_person_would() -> None:
 
 
 def unplaced(task: Task) -> Task:
-    """The task without positions."""
+    """Return the task without positions."""
     places = {n: replace(p, x=None, y=None) for n, p in task.places.items()}
     return replace(
         task,
@@ -124,9 +124,9 @@ def unplaced(task: Task) -> Task:
 
 @pytest.mark.parametrize("errors", [False, True])
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda p: p.stem)
-def test_shipped_tasks_could_do_without_positions(path: Path, errors: bool) -> None:
-    """Laid out automatically no arc runs over a node, and no more arcs cross or strike words than
-    where people put things."""
+def test_shipped_tasks_are_drawn_well_without_positions(path: Path, errors: bool) -> None:
+    """With automatic layout no arc crosses a node, and there are no more crossings than with
+    manual positions."""
     task = load(path)
     by_hand = drawn(scene_of_task(task, errors, None, None))
     scene = scene_of_task(unplaced(task), errors, None, None)
@@ -136,8 +136,8 @@ def test_shipped_tasks_could_do_without_positions(path: Path, errors: bool) -> N
     assert through_words(words, ways) <= through_words(by_hand[1], by_hand[0])
 
 
-def test_a_long_way_back_is_led_around() -> None:
-    """An arc over several columns runs by the layout's points, smoothly, from border to border."""
+def test_a_long_arc_back_runs_through_the_points_of_the_layout() -> None:
+    """An arc over several columns runs smoothly through the points of the layout."""
     scene = scene_of_net(random_task(np.random.default_rng(1), 3), None, None)
     ways = route(scene)
     led = [w for w in ways if len(w.controls) > 1]

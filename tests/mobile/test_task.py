@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.analysis.commands import analyse_command
-from petrobot.coordinator.analysis.net.space import Limits
+from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.task import Scope, Task
 from petrobot.coordinator.task.check import check
 from petrobot.coordinator.task.file import load
@@ -66,7 +66,7 @@ def test_all_events_are_internal_and_conflicts_are_settled_by_variables(task: Ta
 
 
 def test_the_state_space_holds_what_a_task_must() -> None:
-    data = analyse_command(PATH, load, limits=Limits()).data
+    data = analyse_command(PATH, load, limits=SearchLimits()).data
     assert data["complete"] and data["states"] < 1000
     verdicts = {name: verdict["holds"] for name, verdict in data["verdicts"].items()}
     assert verdicts.pop("safe") is False, "six attempts lie in one place"

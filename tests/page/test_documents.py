@@ -13,7 +13,7 @@ import aiohttp
 import pytest
 import pytest_asyncio
 
-from petrobot.coordinator.analysis.formats.pnml_reading import parse_pnml
+from petrobot.coordinator.analysis.formats.pnml import parse_pnml
 from petrobot.coordinator.operator import history as journals
 from petrobot.coordinator.page import edits
 from petrobot.coordinator.page import task_store as store

@@ -1,9 +1,8 @@
-"""GreatSPN editor projects (`.pnpro`) in: one GSPN with constants, inhibitor arcs, servers and
-priorities.
+"""Reader of GreatSPN editor projects (`.pnpro`): one GSPN with constants, inhibitors and servers.
 
-The attribute `delay` of a transition of type EXP is a rate (1/s), in spite of its name. Without
-`nservers` a timed transition has as many servers as it is enabled times. Deterministic and general
-transitions are refused.
+In spite of its name, the attribute `delay` of a transition of type EXP is a rate (1/s). Without
+`nservers` a timed transition has unlimited servers. Deterministic and general transitions are
+refused.
 """
 
 from __future__ import annotations
@@ -12,27 +11,30 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from petrobot.coordinator.analysis.formats.netfile import (
-    FormatError,
     NetDraft,
     NetFile,
+    NetFileError,
     arithmetic,
     whole_number,
 )
 
 DRAWN = {"text-box", "group", "point"}
-"""Elements that only matter to a drawing."""
+"""Elements that matter only for a drawing."""
 
 
 def parse_pnpro(text: str | bytes, file: str = "pnpro") -> NetFile:
-    """The net of a project. Raises FormatError."""
+    """Read the net of a project. Raises NetFileError."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise FormatError(file, "XML", str(error), "the file is cut short or no XML") from error
+        raise NetFileError(file, "XML", str(error), "the file is incomplete or not XML") from error
     nets = list(root.iter("gspn"))
     if root.tag != "project" or len(nets) != 1:
-        raise FormatError(
-            file, root.tag, f"{len(nets)} GSPNs in it", "save a project with exactly one GSPN"
+        raise NetFileError(
+            file,
+            root.tag,
+            f"expected one GSPN, found {len(nets)}",
+            "save a project with exactly one GSPN",
         )
     (net,) = nets
     draft, positions = NetDraft(file), dict[str, tuple[float, float]]()
@@ -45,9 +47,7 @@ def parse_pnpro(text: str | bytes, file: str = "pnpro") -> NetFile:
         elif node.tag == "transition":
             _transition(draft, node, names)
         elif node.tag not in ("gspn", "nodes", "edges", "arc", "constant", "template", *DRAWN):
-            raise FormatError(
-                file, node.tag, "an element of unknown meaning", "only plain GSPNs are read"
-            )
+            raise NetFileError(file, node.tag, "unknown element", "only plain GSPNs are read")
     for i, node in enumerate(net.iter("arc")):
         _arc(draft, node, f"arc {i}", names)
     result = draft.net()
@@ -62,7 +62,7 @@ def _constants(net: Element, file: str) -> dict[str, float]:
     for node in (*net.iter("constant"), *net.iter("template")):
         name, value = node.get("name", ""), node.get("value") or ""
         if not value:
-            raise FormatError(
+            raise NetFileError(
                 file, f"{node.tag} {name}", "it has no value", "set a value in the editor"
             )
         names[name] = arithmetic(file, f"constant {name}", value, names)
@@ -72,7 +72,7 @@ def _constants(net: Element, file: str) -> dict[str, float]:
 def _place(draft: NetDraft, node: Element, names: dict[str, float]) -> None:
     name = node.get("name", "")
     if node.get("domain"):
-        raise FormatError(
+        raise NetFileError(
             draft.file, f"place {name}", "it holds coloured tokens", "unfold the net first"
         )
     draft.place(name, whole_number(draft.file, f"place {name}", node.get("marking") or "0", names))
@@ -82,7 +82,7 @@ def _transition(draft: NetDraft, node: Element, names: dict[str, float]) -> None
     name, kind = node.get("name", ""), node.get("type", "")
     element = f"transition {name}"
     if node.get("guard") or node.get("action"):
-        raise FormatError(
+        raise NetFileError(
             draft.file, element, "it has a guard or an action", "unfold the net first"
         )
     if kind == "IMM":
@@ -101,7 +101,7 @@ def _transition(draft: NetDraft, node: Element, names: dict[str, float]) -> None
             else whole_number(draft.file, element, servers, names)
         )
     else:
-        raise FormatError(
+        raise NetFileError(
             draft.file,
             element,
             f"a transition of type {kind!r}",
@@ -113,7 +113,7 @@ def _arc(draft: NetDraft, node: Element, element: str, names: dict[str, float]) 
     kinds = {"INPUT": "normal", "OUTPUT": "normal", "INHIBITOR": "inhibitor"}
     kind = node.get("kind", "")
     if kind not in kinds:
-        raise FormatError(
+        raise NetFileError(
             draft.file, element, f"an arc of kind {kind!r}", f"kinds are {', '.join(kinds)}"
         )
     if node.get("is-broken") == "true":

@@ -1,15 +1,15 @@
-"""TINA's textual nets (`.net`): places, transitions, weights `p*2`, test arcs `p?2`, inhibitor arcs
-`p?-2`, priorities.
+"""Reader and writer of TINA's textual nets (`.net`).
 
-A transition's time interval is refused unless it says nothing ([0,w[); labels are kept, notes are
-listed. Source: manual page formats(n) of the TINA toolbox.
+Places, transitions, weights `p*2`, test arcs `p?2`, inhibitor arcs `p?-2`, priorities and labels. A
+time interval is refused unless it is the trivial one, [0,w[. Source: manual page formats(n) of the
+TINA toolbox.
 """
 
 from __future__ import annotations
 
 import re
 
-from petrobot.coordinator.analysis.formats.netfile import FormatError, NetDraft, NetFile
+from petrobot.coordinator.analysis.formats.netfile import NetDraft, NetFile, NetFileError
 from petrobot.coordinator.task.net import Net
 
 TOKEN = re.compile(r"\{(?:\\.|[^}\\])*\}|->|[^\s{]+")
@@ -19,11 +19,11 @@ ARC = re.compile(r"(?P<kind>\*|\?-|\?|!-|!)(?P<weight>\d+[KMGT]?)\Z")
 
 
 def parse_tina(text: str, file: str = "net") -> NetFile:
-    """The net in a TINA text. Raises FormatError."""
-    return _Reading(text, file).result()
+    """Read the net in a TINA text. Raises NetFileError."""
+    return _TinaReading(text, file).result()
 
 
-class _Reading:
+class _TinaReading:
     def __init__(self, text: str, file: str) -> None:
         self.file = file
         self.name = ""
@@ -63,16 +63,16 @@ class _Reading:
             case "nt":
                 self.notes.append(f"{at}: a note")
             case other:
-                raise FormatError(
+                raise NetFileError(
                     self.file,
                     at,
                     f"a line that begins with {other!r}",
-                    "net, tr, pl, lb, pr, nt are known",
+                    "expected net, tr, pl, lb, pr or nt",
                 )
 
     def _transition(self, words: list[str], at: str) -> None:
         if not words:
-            raise FormatError(self.file, at, "a transition without a name")
+            raise NetFileError(self.file, at, "a transition without a name")
         name = _bare(words[0])
         self.transitions.append(name)
         rest = words[1:]
@@ -80,15 +80,15 @@ class _Reading:
             self.labels[name], rest = _bare(rest[1]), rest[2:]
         if rest and rest[0][0] in "[]":
             if rest[0] not in ("[0,w[", "[0,inf["):
-                raise FormatError(
+                raise NetFileError(
                     self.file,
                     at,
                     f"a time interval {rest[0]}",
-                    "only untimed nets are read: remove it",
+                    "only untimed nets are read; remove it",
                 )
             rest = rest[1:]
         if "->" not in rest:
-            raise FormatError(
+            raise NetFileError(
                 self.file, at, "no -> in a transition", "write tr NAME INPUTS -> OUTPUTS"
             )
         arrow = rest.index("->")
@@ -103,8 +103,8 @@ class _Reading:
         if suffix:
             found = ARC.match(suffix)
             if found is None or found["kind"][0] == "!" or (found["kind"] != "*" and not into):
-                raise FormatError(
-                    self.file, at, f"an arc {word!r}", "arcs are p, p*2, p?2 and p?-2"
+                raise NetFileError(
+                    self.file, at, f"unknown arc {word!r}", "write p, p*2, p?2 or p?-2"
                 )
             kind = {"*": "normal", "?": "test", "?-": "inhibitor"}[found["kind"]]
             weight = _number(found["weight"])
@@ -120,13 +120,13 @@ class _Reading:
             self.labels[name], rest = _bare(rest[1]), rest[2:]
         for word in rest:
             if not re.fullmatch(r"\(\d+[KMGT]?\)", word):
-                raise FormatError(
-                    self.file, at, f"{word!r} behind a place", "write pl NAME (TOKENS)"
+                raise NetFileError(
+                    self.file, at, f"unexpected {word!r} after a place", "write pl NAME (TOKENS)"
                 )
             self.tokens[name] += _number(word[1:-1])
 
     def result(self) -> NetFile:
-        """The file as a net."""
+        """Return the net. Raises NetFileError."""
         draft = NetDraft(self.file)
         for place, tokens in self.tokens.items():
             draft.place(place, tokens)
@@ -140,8 +140,10 @@ class _Reading:
         return NetFile(draft.net(), self.name, None, labels, {}, (*draft.notes, *self.notes))
 
     def _priorities(self) -> dict[str, int]:
-        """Levels for the pairwise relation; refused where levels would add pairs that the file does
-        not say."""
+        """Return priority levels that express the pairs in the file.
+
+        Raises NetFileError if levels would rank pairs that the file does not rank.
+        """
         pairs = {(high, low) for highs, lows in self.above for high in highs for low in lows}
         if not pairs:
             return {}
@@ -152,12 +154,12 @@ class _Reading:
         implied = {(a, b) for a in level for b in level if level[a] > level[b]}
         if implied - pairs - {(a, d) for a, b in pairs for c, d in pairs if b == c}:
             remedy = "only priorities that form levels over all transitions are read"
-            raise FormatError(self.file, "pr", "priorities between some pairs only", remedy)
+            raise NetFileError(self.file, "pr", "priorities between some pairs only", remedy)
         return level
 
 
 def _joined(words: list[str]) -> list[str]:
-    """Words with suffixes of braced names (`{a b}*2`) put together again."""
+    """Join the suffix of a braced name (`{a b}*2`) to it again."""
     out: list[str] = []
     for word in words:
         if out and out[-1].endswith("}") and word[0] in "*?!":
@@ -168,7 +170,7 @@ def _joined(words: list[str]) -> list[str]:
 
 
 def _split(word: str) -> tuple[str, str]:
-    """(place, suffix that says kind and weight)."""
+    """Return (place, suffix with kind and weight)."""
     end = (
         word.rindex("}") + 1
         if word.startswith("{")
@@ -190,7 +192,7 @@ def _quoted(name: str) -> str:
 
 
 def losses(model: NetFile) -> list[str]:
-    """What a `.net` file cannot say."""
+    """Return what a `.net` file cannot express."""
     net: Net = model.net
     out = []
     if any(c is not None for c in net.capacity):
@@ -201,7 +203,10 @@ def losses(model: NetFile) -> list[str]:
 
 
 def write_tina(model: NetFile) -> str:
-    """The TINA text of a net; capacities become inhibitor arcs with the same effect."""
+    """Return the TINA text of a net; capacities become inhibitor arcs with the same effect.
+
+    Raises NetFileError.
+    """
     from petrobot.coordinator.analysis.net.pack import thresholds
 
     net = model.net
@@ -210,8 +215,11 @@ def write_tina(model: NetFile) -> str:
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
         below = sorted(thresholds(net, t).items())
         if any(k < 1 for _, k in below):
-            raise FormatError(
-                "net", f"transition {name}", "its capacity can never be kept", "raise the capacity"
+            raise NetFileError(
+                "net",
+                f"transition {name}",
+                "it would always exceed a capacity, so it can never fire",
+                "raise the capacity",
             )
         need = [_quoted(net.places[p]) + (f"*{w}" if w > 1 else "") for p, w in net.consume[t]]
         need += [f"{_quoted(net.places[p])}?-{k}" for p, k in below]

@@ -1,1 +1,1 @@
-"""What a net can do: state space, structure, and the verdicts on them; pure."""
+"""Qualitative analysis of a net: state space, structure, and verdicts on both. Pure."""

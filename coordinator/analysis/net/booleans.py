@@ -1,11 +1,14 @@
-"""The ordinary view with boolean variables kept: complementary places `v=true`, `v=false` (and
-`v=none` while not yet written).
+"""The ordinary net of a task with its boolean variables kept as complementary places.
 
-A variable may change whenever a place whose runs write it is marked; a transition whose condition
-reads boolean variables alone has one case for each assignment that makes it true, with test arcs
-from these places. So every executed sequence is still one of this net (it allows a few more: a run
-writes at its end only), and safety carries over; with the conditions kept, fewer markings are
-reachable than in the plain ordinary net. Conditions that read anything else are dropped, as there.
+A variable v becomes the places `v=true`, `v=false`, and `v=none` while it is not yet written;
+exactly one of them holds a token. Its value may change whenever a place whose runs write it is
+marked. A transition whose condition reads only boolean variables gets one case for each assignment
+that makes the condition true, with test arcs from these places. Conditions that read anything else
+are dropped, as in the plain ordinary net.
+
+Every executed firing sequence is one of this net, so safety properties carry over to execution. The
+net allows some more sequences (a real run writes only when it ends), but fewer than the ordinary
+net without conditions.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.net import Net
 
 VARIABLES = 8
-"""Boolean variables that one condition may read: each doubles its cases."""
+"""The most boolean variables that one condition may read: each of them doubles its cases."""
 VALUES: tuple[bool | None, ...] = (True, False, None)
 
 Weights = dict[str, int]
@@ -27,16 +30,18 @@ Weights = dict[str, int]
 
 @dataclass(frozen=True)
 class BooleanView:
-    """The refined net: its first places are those of the ordinary net; `origin` names the
-    transition of each case."""
+    """The refined net. Its first places are those of the ordinary net, in the same order; `origin`
+    maps each case to the transition of the task."""
 
     net: Net
     origin: Mapping[str, str]
 
 
 def boolean_view(task: Task) -> BooleanView:
-    """The ordinary net of a task with its boolean variables. Raises ValueError if a condition reads
-    too many of them."""
+    """Return the ordinary net of a task with its boolean variables as places.
+
+    Raises ValueError if a condition reads more than VARIABLES of them.
+    """
     flat, net = task.flat, task.net
     read = set().union(*(t.when.names for t in flat.transitions.values() if t.when is not None))
     kept = {
@@ -69,23 +74,25 @@ def _values(variable: Variable) -> tuple[bool | None, ...]:
 
 
 def _cases(t: Transition, kept: Mapping[str, Variable]) -> Iterator[tuple[str, Weights]]:
-    """(label, test arcs) of each assignment that makes the condition true; one bare case without
-    such a condition."""
+    """Yield (label, test arcs) for each assignment that makes the condition true.
+
+    Without a condition on boolean variables alone there is one case without test arcs.
+    """
     names = sorted(t.when.names) if t.when is not None else []
     if t.when is None or not set(names) <= set(kept):
         yield "", {}
         return
     if len(names) > VARIABLES:
         raise ValueError(
-            f"transitions.{t.name}.when: {len(names)} boolean variables; at most {VARIABLES} "
-            "are unfolded"
+            f"transitions.{t.name}.when: expected at most {VARIABLES} boolean variables, "
+            f"got {len(names)}; split the condition"
         )
     for values in product(*(_values(kept[name]) for name in names)):
         try:
             true = t.when.holds(dict(zip(names, values, strict=True)))
         except ConditionFault:
-            # a variable that was never written gives the condition no truth value: it counts as
-            # false
+            # A variable that was never written leaves the condition without a truth value. The
+            # engine treats that as false, and so does this net.
             continue
         if true:
             said = [_place(name, value) for name, value in zip(names, values, strict=True)]
@@ -95,7 +102,8 @@ def _cases(t: Transition, kept: Mapping[str, Variable]) -> Iterator[tuple[str, W
 def _writes(
     task: Task, kept: Mapping[str, Variable]
 ) -> Iterator[tuple[str, tuple[Weights, Weights]]]:
-    """Changes of a variable while a place whose runs write it is marked."""
+    """Yield one transition for each change of a variable, enabled while a writing place is
+    marked."""
     for place in task.flat.places.values():
         for variable in dict.fromkeys(place.out.values()):
             if variable not in kept:

@@ -1,12 +1,14 @@
-"""Boundedness of nets whose markings have no end: the Karp-Miller tree, compared with ancestors
-only.
+"""Boundedness of nets with infinitely many markings: the Karp-Miller tree, and pumps.
 
-A new marking that is larger than one of its own ancestors gets omega where it is larger. Comparing
-with markings of other branches would call bounded nets unbounded (p0 -> p1 and p0 -> 2 p1 with one
-token in p0: p1 holds at most 2). Inhibitors make omega unsound, so inhibited places with a proven
-bound are complemented away first, and without a bound the answer is unknown. Capacities are bounds
-and are complemented in the same way. Priorities only remove behaviour: bounds found without them
-hold, an unbounded place found without them may yet be bounded.
+If a new marking covers one of its ancestors, the firings between the two can be repeated for ever,
+so every place in which it is larger gets omega ("arbitrarily many tokens"). Only ancestors are
+compared: comparing with other branches would call bounded nets unbounded (p0 -> p1 and p0 -> 2 p1
+with one token in p0: p1 holds at most 2).
+
+With inhibitors omega would be wrong, because more tokens can disable a transition. So an inhibited
+place with a proven bound is replaced by its complement first; without a bound the answer is
+"unknown". Capacities are handled in the same way. Priorities only remove behaviour: bounds found
+without them are valid, but a place that is unbounded without them may be bounded with them.
 
 Source: R. M. Karp, R. E. Miller, Parallel program schemata, J. Comput. Syst. Sci. 3 (1969).
 """
@@ -25,22 +27,21 @@ from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.task.net import Marking, Net
 
 OMEGA = -1
-"""Stands for arbitrarily many tokens in a marking of the tree."""
+"""Arbitrarily many tokens, in a marking of the tree."""
 EFFORT = 20_000
-"""Nodes of the tree at most."""
+"""The most nodes of the tree."""
 COMPARISONS = 100
-"""Comparisons with ancestors at most, for each node that the effort allows: long chains of
-ancestors end the tree sooner."""
+"""The most comparisons with ancestors, per allowed node: limits the time on long chains."""
 
 
 @dataclass(frozen=True, slots=True)
 class Coverability:
-    """How many tokens each place can hold, as far as it could be settled.
+    """How many tokens each place can hold, as far as it is known.
 
-    `bounded` None means unknown; `reason` says why. `bounds[p]` is exact for a net without
-    priorities and a complete tree, None for an unbounded (or unsettled) place. For a witness of
-    unboundedness: firing `pump` after `prefix` can be repeated for ever and leaves more tokens in
-    the places `grows` each time.
+    `bounded` is None if unknown; `reason` says why. `bounds[p]` is exact for a net without
+    priorities and a complete tree, and None for a place that is unbounded or unknown. Witness of
+    unboundedness: after `prefix`, `pump` can be fired for ever, and each time it leaves more tokens
+    in the places `grows`.
     """
 
     bounded: bool | None
@@ -52,17 +53,15 @@ class Coverability:
     pump: tuple[str, ...] = ()
     grows: tuple[str, ...] = ()
     never: tuple[str, ...] = ()
-    """Transitions that a complete tree never fires: they are dead, priorities or not."""
+    """Transitions that a complete tree never fires: they are dead, with or without priorities."""
     exact: bool = False
-    """Whether every transition that is not in `never` can fire: the tree is complete and the net
-    has no priorities."""
+    """Whether every transition outside `never` can fire: complete tree and no priorities."""
 
 
 def settle_bounds(
     net: Net, bounds: Sequence[int | None] | None = None, *, effort: int = EFFORT
 ) -> Coverability:
-    """The complete tree where the effort suffices, else the first place that can grow without
-    end."""
+    """Return the complete tree if the effort allows, else stop at the first unbounded place."""
     whole = coverability(net, effort=effort, bounds=bounds)
     return (
         whole
@@ -78,11 +77,11 @@ def coverability(
     bounds: Sequence[int | None] | None = None,
     first_omega: bool = False,
 ) -> Coverability:
-    """The bounds of all places by the coverability tree.
+    """Return the bounds of all places by the Karp-Miller tree.
 
-    `bounds` are proven bounds of places (by default those of the P-invariants), needed where places
-    are inhibited. With `first_omega` the search ends with the first unbounded place (then only
-    `bounded` is settled, not each bound).
+    `bounds` are proven bounds of places (by default those of the P-invariants); inhibited places
+    need them. With `first_omega` the search ends at the first unbounded place: then `bounded` is
+    known, but not every bound.
     """
     proven = list(bounds) if bounds is not None else place_bounds(net)
     limits = [thresholds(net, t) for t in range(len(net.transitions))]
@@ -92,13 +91,17 @@ def coverability(
         names = ", ".join(net.places[p] for p in unproven)
         unknown = tuple(b if n not in unproven else None for n, b in enumerate(proven))
         return Coverability(
-            None, unknown, f"no bound is known for the inhibited place {names}", 0, False
+            None, unknown, f"no bound is known of the inhibited place {names}", 0, False
         )
     plain = _complemented(net, limits, proven)
     tree = _Tree(plain, len(net.places))
     if not tree.grow(effort, first_omega):
         return Coverability(
-            None, tuple(proven), f"effort of {effort} nodes", len(tree.nodes), False
+            None,
+            tuple(proven),
+            f"the coverability tree exceeds {effort} nodes",
+            len(tree.nodes),
+            False,
         )
     return _verdict(net, tree, first_omega)
 
@@ -130,8 +133,11 @@ def _verdict(net: Net, tree: _Tree, first_omega: bool) -> Coverability:
 
 
 def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[int | None]) -> Net:
-    """The net with every inhibitor and capacity told by a complement place that holds the bound
-    minus the tokens."""
+    """Return the net without inhibitors and capacities, expressed by complement places.
+
+    The complement of p holds bound(p) - M(p). "Fewer than k tokens in p" becomes "at least
+    bound(p) - k + 1 tokens in its complement".
+    """
     places = sorted({p for below in limits for p in below})
     names = [*net.places, *(f"not {net.places[p]}" for p in places)]
     number = {p: len(net.places) + i for i, p in enumerate(places)}
@@ -165,17 +171,16 @@ class _Node:
     parent: int
     fired: int
     ancestor: int = -1
-    """The nearest ancestor that this node's marking strictly covers, if omega came in here."""
+    """The nearest ancestor that this marking strictly covers, if omega was introduced here."""
     grown: tuple[int, ...] = ()
-    """Places in which it does."""
+    """The places in which it is larger."""
 
 
 class _Tree:
-    """The Karp-Miller tree, breadth first, so that chains of ancestors stay short.
+    """The Karp-Miller tree, grown breadth first so that chains of ancestors stay short.
 
-    A marking that any node has already expanded is not expanded again: the same marking roots the
-    same subtree, so leaving it out loses no bound; omega itself is only ever introduced by
-    comparison with ancestors.
+    A marking that was already expanded in another node is not expanded again: it would root the
+    same subtree, so no bound is lost. Omega is still introduced only by comparison with ancestors.
     """
 
     def __init__(self, net: Net, real: int) -> None:
@@ -186,7 +191,7 @@ class _Tree:
         self.compared = 0
 
     def grow(self, effort: int, first_omega: bool) -> bool:
-        """Build the tree; False if the effort ran out."""
+        """Build the tree; return False if the effort ran out."""
         expanded: set[Marking] = set()
         queue = deque([0])
         while queue:
@@ -239,7 +244,7 @@ class _Tree:
             self.omega = len(self.nodes) - 1
 
     def bounds(self) -> tuple[int | None, ...]:
-        """The most tokens of each real place over the tree, None for omega."""
+        """Return the most tokens of each original place over the tree; None for omega."""
         out: list[int | None] = []
         for p in range(self.real):
             seen = {node.marking[p] for node in self.nodes}
@@ -247,7 +252,7 @@ class _Tree:
         return tuple(out)
 
     def witness(self, net: Net) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-        """(prefix, pump, places that grow) of the first omega; empty for a bounded net."""
+        """Return (prefix, pump, places that grow) of the first omega; empty for a bounded net."""
         if self.omega is None:
             return (), (), ()
         node = self.nodes[self.omega]
@@ -267,21 +272,24 @@ def _at_least(a: int, b: int) -> bool:
     return a == OMEGA or (b != OMEGA and a >= b)
 
 
-# Unboundedness by a pump among the markings found: a sequence that ends with more tokens than it began with, for ever.
+# Pumps among the markings found: firing sequences that can be repeated for ever and leave more
+# tokens each time. They prove a net unbounded where the tree cannot be used.
 
 MARKINGS, LEVELS = 10_000, 400
-"""Markings of the space that are compared with their ancestors, and ancestors that each is compared
-with, at most."""
+"""The most markings that are compared with their ancestors, and ancestors for each of them."""
 CANDIDATES, EACH = 1_000, 25
-"""Pairs that are looked at closely, in all and at one distance, at most."""
+"""The most pairs that are examined closely, in total and at one distance."""
 
 Pump = tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]
 """(prefix, pump, places that grow)."""
 
 
 def find_pump(space: Space) -> Pump | None:
-    """The first pump from an ancestor to a marking found, along the breadth-first tree; None if
-    there is none so far."""
+    """Return the first pump from an ancestor to a marking found, or None.
+
+    Ancestors are those in the breadth-first tree; level by level, all markings are compared with
+    their ancestor at the same distance in one numpy operation.
+    """
     count = min(MARKINGS, space.expanded, len(space))
     tokens = space.layout.unpack_many(space.words[:count])
     parent = np.zeros(count, dtype=np.int64)
@@ -304,8 +312,11 @@ def find_pump(space: Space) -> Pump | None:
 
 
 def _judged(space: Space, last: int, first: int, grown: set[int]) -> Pump | None:
-    """The pump between two markings, unless what grows may bar it: by an inhibitor, a capacity or a
-    higher priority."""
+    """Return the pump between two markings, or None if the added tokens may disable it.
+
+    More tokens can disable a transition by an inhibitor, a capacity, or by enabling a transition of
+    a higher priority.
+    """
     net, before = space.net, space.path(first)
     pump = space.path(last)[len(before) :]
     fired = [net.transition_index[name] for name in pump]

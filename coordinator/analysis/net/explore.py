@@ -1,5 +1,4 @@
-"""What the exploration engines share: the state of a search that any of them can continue, and
-their interface."""
+"""The interface of the exploration engines, the state they share, and the engine of integers."""
 
 from __future__ import annotations
 
@@ -22,13 +21,12 @@ from petrobot.coordinator.task.net import Net
 
 Numbers = NDArray[np.int32]
 Labels = NDArray[Any]
-"""Transition of each edge, int16, or int32 in a net of more than 32,767 transitions."""
+"""Transition of each edge: int16, or int32 if the net has 32,768 transitions or more."""
 
 
 @dataclass(frozen=True)
 class Explored:
-    """A breadth-first search so far: markings found, of which the first `len(row) - 1` are
-    expanded."""
+    """State of a breadth-first search: the markings found, the first `len(row) - 1` expanded."""
 
     net: Net
     layout: Layout
@@ -36,13 +34,13 @@ class Explored:
     words: Words
     """Packed markings in order of discovery, shape (states, layout.words)."""
     row: NDArray[np.int64]
-    """Edges before each expanded marking, shape (expanded + 1,)."""
+    """Number of edges before each expanded marking, shape (expanded + 1,)."""
     target: Numbers
     label: Labels
 
     @classmethod
     def start(cls, net: Net, layout: Layout, keep_edges: bool) -> Explored:
-        """Only the initial marking, not yet expanded."""
+        """Return a search that has found only the initial marking."""
         words = layout.split_many([layout.pack(net.initial)])
         label = np.zeros(0, dtype=np.int16 if len(net.transitions) < 1 << 15 else np.int32)
         return cls(
@@ -50,14 +48,14 @@ class Explored:
         )
 
     def relaid(self, layout: Layout) -> Explored:
-        """The same search in another layout."""
+        """Return the same search with its markings packed in another layout."""
         words = self.layout.repack(self.words, layout)
         return Explored(self.net, layout, self.keep_edges, words, self.row, self.target, self.label)
 
 
-class Engine(Protocol):
-    """Expands markings in order. After an interruption at any point `explored()` still gives a
-    consistent search."""
+class ExplorationEngine(Protocol):
+    """Expands markings in order. `explored()` is consistent even after an interruption at any
+    point."""
 
     @property
     def states(self) -> int:
@@ -72,43 +70,46 @@ class Engine(Protocol):
         """Bytes held, roughly."""
 
     def expand(self, cap: int | None) -> bool:
-        """Expand some more markings; False when none is left.
+        """Expand some more markings; return False when none is left.
 
-        Stops right after the marking whose successors bring the number of states to `cap` or
-        beyond.
+        Stop right after the marking whose successors bring the number of states to `cap` or more.
         """
 
     def explored(self) -> Explored:
-        """The search so far."""
+        """Return the search so far."""
 
 
 def widened_layout(layout: Layout, places: list[int]) -> Layout:
-    """The layout to go on with after these places overflowed. Raises TooManyTokens when words
-    end."""
+    """Return the layout with which to continue after these places overflowed.
+
+    Raises TooManyTokens if a place would need more than 63 bits.
+    """
     wider = layout.widened(places)
     if wider == layout:
         raise TooManyTokens(
             "a place holds more tokens than a 64-bit word can count: the net is almost "
-            "surely unbounded"
+            "certainly unbounded"
         )
     return wider
 
 
-# Exploration with plain integers: no set-up, the fastest engine below about ten thousand markings.
+# Exploration with plain integers: no preparation, the fastest engine below about 10,000 markings.
 
 BLOCK = 512
-"""Markings expanded between two looks at the limits."""
+"""Markings expanded between two checks of the limits."""
 STATE_BYTES = 250
-"""Bytes of one marking here: integer, dictionary entry, list entries and its list of enabled
-transitions."""
+"""Estimated bytes of one marking: integer, dictionary and list entries, enabled transitions."""
 
 
 class IntegerEngine:
-    """Markings as integers in a dictionary; a new marking tests only the transitions that the last
-    firing touched."""
+    """Markings as Python integers in a dictionary, in any number of bits.
+
+    A new marking inherits the enabled transitions of the marking before it; only those that the
+    firing touched are tested again.
+    """
 
     def __init__(self, begun: Explored) -> None:
-        """Go on from a search begun in any engine."""
+        """Continue a search that any engine began."""
         self._net, self._keep = begun.net, begun.keep_edges
         self._dependents = dependents(begun.net)
         self._unaffected = [
@@ -124,7 +125,7 @@ class IntegerEngine:
         self._use(begun.layout, begun.layout.join_many(begun.words))
 
     def _use(self, layout: Layout, order: list[int]) -> None:
-        """(Re)build everything that depends on the layout."""
+        """Rebuild everything that depends on the layout."""
         self._layout, self._order = layout, order
         self._index = {packed: i for i, packed in enumerate(order)}
         self._rules = Rules.compiled(self._net, layout)
@@ -152,7 +153,7 @@ class IntegerEngine:
         return STATE_BYTES * len(self._order) + 8 * len(self._target)
 
     def expand(self, cap: int | None) -> bool:
-        """Expand up to BLOCK markings; False when none is left."""
+        """Expand up to BLOCK markings; return False when none is left."""
         for _ in range(BLOCK):
             if self.expanded == self._committed or (cap is not None and self._committed >= cap):
                 break
@@ -164,7 +165,7 @@ class IntegerEngine:
         return self.expanded < self._committed
 
     def _expand_one(self, i: int) -> int:
-        """Expand marking i and commit it; gives the offending successor instead if a field
+        """Expand marking i and commit it. Return 0, or the successor in which a field
         overflowed."""
         order, index, guards, delta = (
             self._order,
@@ -179,6 +180,8 @@ class IntegerEngine:
             number = index.get(after)
             if number is None:
                 if after & guards:
+                    # A guard bit is set: a field overflowed. Drop the successors of this marking;
+                    # it is expanded again after the layout is widened.
                     self._forget(self._committed)
                     return after
                 number = index[after] = len(order)
@@ -206,14 +209,20 @@ class IntegerEngine:
         return known if known is not None else self._passing(self._rules.able, self._order[i])
 
     def _inherit(self, before: list[int], fired: int, packed: int) -> list[int]:
-        """Transitions with concession after a firing: those untouched by it keep theirs."""
+        """Return the enabled transitions after a firing; those that it did not touch stay as they
+        were."""
         unaffected = self._unaffected[fired]
         kept = [t for t in before if t in unaffected]
         able = self._able
         gained = self._passing([t for t in self._dependents[fired] if t in able], packed)
+        # Sorted, because all engines must give the edges in transition order.
         return sorted(kept + gained) if kept and gained else kept or gained
 
     def _passing(self, candidates: list[int] | tuple[int, ...], packed: int) -> list[int]:
+        """Return the candidates whose tests hold: one subtraction tests all places (see pack.py).
+
+        Almost every transition needs a single test, so a second one is kept apart.
+        """
         guarded = packed | self._layout.guards
         sub, guard, want = self._sub, self._guard, self._want
         passing = [t for t in candidates if (guarded - sub[t]) & guard[t] == want[t]]
@@ -229,7 +238,7 @@ class IntegerEngine:
         return [t for t in able if priority[t] == top]
 
     def explored(self) -> Explored:
-        """The search so far."""
+        """Return the search so far."""
         edges = self._row[-1] if self._keep else 0
         return Explored(
             self._net,

@@ -1,4 +1,8 @@
-"""The loop of the compiled engine: plain enough for numba, and the same, only slow, without it."""
+"""The engine that numba compiles: one loop over markings and an open-addressed hash table.
+
+Without numba the same code runs in Python: same results, but slow. Only space.py imports this file,
+and only when the engine "numba" is requested, so that numba stays optional.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +17,15 @@ from petrobot.coordinator.analysis.net.pack import Layout, Rules, Words
 from petrobot.services.host.numba_kernels import kernel
 
 DONE, FULL, CROWDED, OVERFLOWN, CAPPED = 0, 1, 2, 3, 4
-"""Why the loop came back: block expanded, edge buffer full, keys or table crowded, a field
+"""Why the loop returned: block expanded, edge buffer full, keys or table crowded, a field
 overflowed, cap reached."""
 
 
 class Kernel(NamedTuple):
-    """The compiled rules as plain arrays: the tests of transition t are first[t] <= k < first[t +
-    1]."""
+    """The compiled firing rules as plain arrays.
+
+    The tests of transition t are those with first[t] <= k < first[t + 1].
+    """
 
     able: NDArray[np.int64]
     priority: NDArray[np.int64]
@@ -33,7 +39,7 @@ class Kernel(NamedTuple):
 
     @classmethod
     def of(cls, rules: Rules) -> Kernel:
-        """The arrays of the compiled rules."""
+        """Return the arrays of the compiled rules."""
         tests = rules.word_tests
         flat = [test for of_one in tests for test in of_one]
         return cls(
@@ -62,7 +68,7 @@ def enabled_into(
     guards: Words,
     out: NDArray[np.int64],
 ) -> int:
-    """Write the enabled transitions of a packed marking to `out`; gives their number."""
+    """Write the enabled transitions of a packed marking to `out`; return how many there are."""
     count, top = 0, 0
     for t in able:
         if count and priority[t] < top:
@@ -83,7 +89,11 @@ def enabled_into(
 
 @kernel
 def enter_all(keys: Words, states: int, table: NDArray[np.int32], factors: Words) -> None:
-    """Enter the first `states` keys, all different, in an empty table."""
+    """Insert the first `states` keys, which are all different, into an empty table.
+
+    Multiply-and-shift hashing with linear probing; the table is at most half full. Each word is
+    multiplied by an odd constant, and the high bits are folded into the low ones.
+    """
     mask, words = np.uint64(len(table) - 1), keys.shape[1]
     for number in range(states):
         hashed = np.uint64(0)
@@ -110,11 +120,11 @@ def expand_block(
     target: NDArray[np.int32],
     label: Any,
 ) -> tuple[int, int, int, int]:
-    """Expand markings up to number `stop`; gives (why it came back, expanded, states, edges
-    written).
+    """Expand markings up to number `stop`.
 
-    `row[i]` gets the number of edges of the i-th marking of the block. After OVERFLOWN row `states`
-    is what did not fit.
+    Return (why it returned, expanded, states, edges written). `row[i]` receives the number of edges
+    of the i-th marking of the block. After OVERFLOWN, row `states` of `keys` holds the marking that
+    did not fit.
     """
     able, priority, first, word, sub, guard, want, delta, guards = kernel
     out = np.empty(len(able) + 1, dtype=np.int64)
@@ -141,8 +151,8 @@ def expand_block(
             if spilt != 0:
                 keys[before] = keys[states]
                 return OVERFLOWN, expanded, before, edges
-            # Found or added here and not by a helper: a compiled call would count references of its
-            # arrays each time.
+            # The lookup stands here instead of in a helper: a compiled call would count the
+            # references of its arrays every time.
             slot = np.int64((hashed * factors[words] >> np.uint64(20)) & mask)
             number = np.int64(table[slot])
             while number >= 0:
@@ -164,20 +174,19 @@ def expand_block(
     return DONE, expanded, states, edges
 
 
-# Exploration by the compiled kernel (numba is an extra, never required): for spaces of many millions of markings.
+# The engine around the compiled loop (numba is an optional extra): for many millions of markings.
 
 BLOCK = 1 << 16
-"""Markings expanded between two looks at the limits."""
+"""Markings expanded between two checks of the limits."""
 BUFFER = 1 << 20
-"""Edges that the kernel writes before it hands them over."""
+"""Edges that the loop writes before it returns them."""
 
 
 class NumbaEngine:
-    """Markings as rows of 64-bit words in an open hash table, expanded one by one by compiled
-    code."""
+    """Markings as rows of 64-bit words in a hash table, expanded one by one by compiled code."""
 
     def __init__(self, begun: Explored) -> None:
-        """Go on from a search begun in any engine."""
+        """Continue a search that any engine began."""
         self._net, self._keep = begun.net, begun.keep_edges
         self._states, self._expanded, self._edges = (
             len(begun.words),
@@ -202,7 +211,7 @@ class NumbaEngine:
         self._grow(2 * len(words) + 1024)
 
     def _grow(self, wanted: int) -> None:
-        """Room for that many markings, and for those that one firing of each transition adds."""
+        """Make room for that many markings, plus those that one firing of each transition adds."""
         wanted += len(self._net.transitions) + 1
         keys = np.empty((wanted, self._layout.words), dtype=np.uint64)
         keys[: self._states] = self._keys[: self._states]
@@ -227,14 +236,23 @@ class NumbaEngine:
         return self._keys.nbytes + self._table.nbytes + self._held
 
     def expand(self, cap: int | None) -> bool:
-        """Expand a block of markings; False when none is left."""
+        """Expand a block of markings; return False when none is left."""
         stop = min(self._states, self._expanded + BLOCK)
         row = np.zeros(stop - self._expanded, dtype=np.int64)
         with np.errstate(over="ignore"):
             why, expanded, states, edges = expand_block(
-                self._keys, self._table, self._factors, self._kernel, self._expanded, self._states, stop,
-                cap if cap is not None else 1 << 62, row, self._target, self._label,
-            )  # fmt: skip
+                self._keys,
+                self._table,
+                self._factors,
+                self._kernel,
+                self._expanded,
+                self._states,
+                stop,
+                cap if cap is not None else 1 << 62,
+                row,
+                self._target,
+                self._label,
+            )
         offending = self._keys[states].copy() if why == OVERFLOWN else None
         row = self._edges + np.cumsum(row[: expanded - self._expanded])
         if self._keep:
@@ -256,7 +274,7 @@ class NumbaEngine:
         self._use(wider, old.repack(words, wider))
 
     def explored(self) -> Explored:
-        """The search so far."""
+        """Return the search so far."""
         row = np.concatenate(self._rows)
         edges = int(row[-1]) if self._keep else 0
         target, label = joined(self._targets, edges), joined(self._labels, edges)

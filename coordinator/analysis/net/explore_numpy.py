@@ -1,9 +1,11 @@
-"""Exploration with numpy alone: blocks of markings against every transition at once, and a
-vectorised hash table.
+"""Exploration with numpy: blocks of markings, and a vectorised hash table.
 
-The table maps a hash slot to the number of a marking; keys are compared in full, so the search is
-exact. The hash is linear in the words before it is mixed, h(M + d) = h(M) + h(d), so a successor's
-hash costs one addition.
+A block of markings is tested against every transition at once. Its successors are written behind
+the known markings, looked up in a hash table, and only the new ones are kept.
+
+The table maps a slot to the number of a marking. Keys are compared in full, so the search is exact.
+Before its bits are mixed, the hash is linear in the words: h(M + d) = h(M) + h(d). The hash of a
+successor therefore costs one addition.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ from petrobot.coordinator.analysis.net.explore import Explored, Labels, Numbers,
 from petrobot.coordinator.analysis.net.pack import Layout, Rules, Words
 
 SUCCESSORS = 1 << 17
-"""Successors wanted in a block: enough to drown the interpreter, few enough for the cache."""
+"""Successors aimed at in a block: enough to hide the interpreter, few enough for the cache."""
 TESTS = 1 << 22
-"""Marking x transition pairs tested at most in a block."""
+"""The most pairs of marking and transition that a block tests."""
 EMPTY = -1
 MULTIPLIERS = (
     np.random.Generator(np.random.PCG64(0x9E3779B97F4A7C15)).integers(1, 1 << 63, 4096, np.uint64)
@@ -30,10 +32,10 @@ MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
 class NumpyEngine:
-    """Markings as rows of 64-bit words."""
+    """Markings as rows of 64-bit words, expanded in blocks."""
 
     def __init__(self, begun: Explored) -> None:
-        """Go on from a search begun in any engine."""
+        """Continue a search that any engine began."""
         self._net, self._keep = begun.net, begun.keep_edges
         self._states, self._expanded = len(begun.words), len(begun.row) - 1
         self._rows = [begun.row]
@@ -45,7 +47,7 @@ class NumpyEngine:
         self._use(begun.layout, begun.words)
 
     def _use(self, layout: Layout, words: Words) -> None:
-        """(Re)build everything that depends on the layout."""
+        """Rebuild everything that depends on the layout."""
         self._layout = layout
         self._rules = Rules.compiled(self._net, layout)
         self._factors = MULTIPLIERS[: layout.words].copy()
@@ -71,7 +73,7 @@ class NumpyEngine:
         return self._keys.nbytes + self._table.nbytes + self._held
 
     def expand(self, cap: int | None) -> bool:
-        """Expand a block of markings; False when none is left."""
+        """Expand a block of markings; return False when none is left."""
         if self._expanded == self._states or (cap is not None and self._states >= cap):
             return self._expanded < self._states
         block = max(
@@ -93,7 +95,7 @@ class NumpyEngine:
         return self._expanded < self._states
 
     def _enabled(self, words: Words) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Enabled (marking in the block, transition) pairs, in that order."""
+        """Return the enabled pairs (marking in the block, transition), sorted in that order."""
         guarded = np.ascontiguousarray((words | self._layout.guard_words).T)
         able = np.zeros((len(self._net.transitions), len(words)), dtype=np.bool_)
         for t in self._rules.able:
@@ -105,7 +107,7 @@ class NumpyEngine:
         return source, label
 
     def _keep_highest(self, able: NDArray[np.bool_]) -> None:
-        """Where a transition of higher priority is enabled, lower ones are not."""
+        """Disable transitions in markings where one of a higher priority is enabled."""
         if len(self._rules.higher) < 2:
             return
         beaten = np.zeros(able.shape[1], dtype=np.bool_)
@@ -116,7 +118,7 @@ class NumpyEngine:
             beaten |= some
 
     def _fire(self, source: NDArray[np.int64], label: NDArray[np.int64]) -> list[int]:
-        """Write the successors behind the known markings; gives the places that overflowed."""
+        """Write the successors behind the known markings; return the places that overflowed."""
         n, m, delta = self._states, len(source), self._rules.word_delta
         fresh = self._keys[n : n + m]
         np.take(self._keys[self._expanded :], source, axis=0, out=fresh, mode="clip")
@@ -132,8 +134,11 @@ class NumpyEngine:
         )
 
     def _intern(self, source: NDArray[np.int64], label: NDArray[np.int64]) -> Numbers:
-        """Numbers of the successors written behind the known markings; new ones are moved together
-        and counted in."""
+        """Return the numbers of the successors that were written behind the known markings.
+
+        New markings are numbered in the order in which they were found, and moved up to follow the
+        known ones without a gap.
+        """
         n, m = self._states, len(source)
         base = _hash(
             self._keys[self._expanded : self._expanded + (int(source[-1]) + 1 if m else 0)],
@@ -155,12 +160,13 @@ class NumpyEngine:
     def _probe(
         self, slot: NDArray[np.int64]
     ) -> tuple[Numbers, NDArray[np.int64], NDArray[np.int64]]:
-        """Find or claim a slot for each successor: its number, then which successors are new, and
-        their slots.
+        """Find or claim a table slot for each successor.
 
-        Successor k counts as marking n + k until it is known whether it is new. Of several that
-        want one empty slot the first gets it; equal ones see the same slots in the same rounds, so
-        the first of them becomes the new marking.
+        Return (number of each successor, which successors are new, their slots). Linear probing in
+        rounds: every successor that is still waiting looks at its next slot. Successor k counts as
+        marking n + k until it is known to be new. If several want the same empty slot, the first
+        one gets it (assignment in reversed order, since numpy keeps the last). Equal successors
+        probe the same slots in the same rounds, so the first of them becomes the new marking.
         """
         number = self._table.take(slot)
         new, taken = [], []
@@ -198,7 +204,7 @@ class NumpyEngine:
         target: Numbers,
         cap: int | None,
     ) -> None:
-        """Take the block in, up to the marking whose successors reach the cap."""
+        """Append the block to the result, up to the marking whose successors reach the cap."""
         if cap is not None and self._states >= cap and len(target):
             over = int(np.argmax(target >= cap - 1))
             last = int(source[over])
@@ -225,7 +231,7 @@ class NumpyEngine:
         return (mixed >> np.uint64(64 - (len(self._table).bit_length() - 1))).astype(np.int64)
 
     def _reserve(self, more: int) -> None:
-        """Room for that many further rows, and a table at most half full."""
+        """Make room for `more` further rows and keep the table at most half full."""
         wanted = self._states + more
         if wanted > len(self._keys):
             keys = np.empty(
@@ -237,7 +243,7 @@ class NumpyEngine:
             self._grow(wanted)
 
     def _grow(self, wanted: int) -> None:
-        """A new table for at least that many markings, with all known ones entered."""
+        """Build a table for at least that many markings and insert all known ones."""
         self._table = np.full(
             1 << max(12, (4 * wanted - 1).bit_length() - 1), EMPTY, dtype=np.int32
         )
@@ -252,7 +258,7 @@ class NumpyEngine:
                 waiting, slot = waiting[lost], (slot[lost] + 1) & mask
 
     def explored(self) -> Explored:
-        """The search so far."""
+        """Return the search so far."""
         row = np.concatenate(self._rows)
         edges = int(row[-1]) if self._keep else 0
         target, label = joined(self._targets, edges), joined(self._labels, edges)
@@ -261,8 +267,10 @@ class NumpyEngine:
 
 
 def joined(parts: list[NDArray[Any]], length: int) -> NDArray[Any]:
-    """The parts one after the other, cut to a length; they are given up on the way, so memory is
-    needed about once."""
+    """Return the parts one after the other, cut to a length.
+
+    Each part is released as soon as it is copied, so the peak memory is about one copy.
+    """
     whole = np.empty(length, dtype=parts[0].dtype)
     at = 0
     parts.reverse()

@@ -1,8 +1,7 @@
-"""Directed graphs in compact arrays: reachability, strong components, bottom components, almost
-sure attraction.
+"""Directed graphs in compact arrays: reachability, strong components, almost sure attraction.
 
-Used on reachability graphs; knows nothing of nets. Small graphs need no scipy, so that a quick
-check starts quickly.
+The analysis uses them for reachability graphs, but nothing here knows about nets. Small graphs are
+handled without scipy, because importing it takes longer than a quick check.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]
 
 SMALL = 20_000
-"""Edges below which plain Python finds strong components sooner than scipy is imported."""
+"""Vertices plus edges up to which plain Python is faster than importing scipy."""
 
 
 @dataclass(frozen=True)
 class Graph:
-    """Vertices 0 to n - 1; edge e goes from source[e] to target[e], edges sorted by source."""
+    """Vertices 0 to n - 1. Edge e goes from source[e] to target[e]; edges are sorted by source."""
 
     n: int
     source: NDArray[np.int32]
@@ -32,23 +31,27 @@ class Graph:
 
     @cached_property
     def row(self) -> Index:
-        """First edge of each vertex, shape (n + 1,)."""
+        """Number of the first edge of each vertex, and the number of edges; shape (n + 1,)."""
         return np.searchsorted(self.source, np.arange(self.n + 1)).astype(np.int64)
 
     @cached_property
     def into(self) -> tuple[Index, Index]:
-        """Edges by target: (first of each vertex, edge numbers)."""
+        """Edges grouped by target: (position of each vertex' first edge, edge numbers)."""
         order = np.argsort(self.target, kind="stable")
         return np.searchsorted(self.target[order], np.arange(self.n + 1)).astype(np.int64), order
 
     def forward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
-        """Vertices that can be reached from the seeds (seeds included) along the given edges (all
-        by default)."""
+        """Return the vertices reachable from the seeds, seeds included.
+
+        `edges` restricts the search to some edges; by default all count.
+        """
         return self._spread(seeds, edges, self.row, None, self.target)
 
     def backward(self, seeds: Mask | Sequence[int], edges: Mask | None = None) -> Mask:
-        """Vertices from which a seed can be reached (seeds included) along the given edges (all by
-        default)."""
+        """Return the vertices from which a seed can be reached, seeds included.
+
+        `edges` restricts the search to some edges; by default all count.
+        """
         return self._spread(seeds, edges, *self.into, self.source)
 
     def _spread(
@@ -59,6 +62,7 @@ class Graph:
         order: Index | None,
         far: NDArray[np.int32],
     ) -> Mask:
+        """Breadth-first search, one whole layer of vertices per numpy operation."""
         reached = np.zeros(self.n, dtype=np.bool_)
         reached[seeds] = True
         front = np.flatnonzero(reached)
@@ -73,8 +77,11 @@ class Graph:
         return reached
 
     def path(self, start: int, goals: Mask, edges: Mask | None = None) -> list[int] | None:
-        """Edges of a shortest path from a vertex to any goal along the given edges; None if there
-        is none."""
+        """Return the edges of a shortest path from a vertex to any goal, or None if there is none.
+
+        `edges` restricts the search to some edges; by default all count.
+        """
+        # came[v] is the edge by which the search reached v; -1 at the start, -2 not reached.
         came = np.full(self.n, -2, dtype=np.int64)
         came[start] = -1
         front = np.array([start])
@@ -82,6 +89,8 @@ class Graph:
             at = ranges(self.row[front], self.row[front + 1])
             at = at if edges is None else at[edges[at]]
             at = at[came[self.target[at]] == -2]
+            # Several edges may enter the same vertex. numpy keeps the last assignment, so assigning
+            # in reversed order keeps the first edge.
             came[self.target[at[::-1]]] = at[::-1]
             front = np.unique(self.target[at])
         hits = front[goals[front]]
@@ -95,8 +104,10 @@ class Graph:
 
     @cached_property
     def components(self) -> NDArray[np.int32]:
-        """Number of the strong component of each vertex, shape (n,); numbers from 0, in no order to
-        rely on."""
+        """Number of the strong component of each vertex, shape (n,).
+
+        Numbers count from 0, in an unspecified order.
+        """
         if len(self.target) + self.n <= SMALL:
             return _tarjan(self.n, self.row.tolist(), self.target.tolist())
         from scipy.sparse import csr_array
@@ -111,7 +122,7 @@ class Graph:
 
     @cached_property
     def bottom(self) -> Mask:
-        """Which components no edge leaves, shape (components,)."""
+        """Which strong components no edge leaves, shape (components,)."""
         ours, theirs = self.components[self.source], self.components[self.target]
         bottom = np.ones(int(self.components.max()) + 1, dtype=np.bool_)
         bottom[ours[ours != theirs]] = False
@@ -119,20 +130,23 @@ class Graph:
 
     @cached_property
     def inner(self) -> Mask:
-        """Which edges stay inside a strong component: exactly those on a cycle, shape (edges,)."""
+        """Which edges stay inside a strong component, i.e. lie on a cycle; shape (edges,)."""
         inside: Mask = self.components[self.source] == self.components[self.target]
         return inside
 
     def almost_sure(
         self, goal: Mask, free: Mask, *, allowed: Mask | None = None, hits: Mask | None = None
     ) -> Mask:
-        """Vertices from which a strategy reaches `goal`, or takes an edge of `hits`, with
-        probability 1.
+        """Return the vertices from which some strategy reaches the goal with probability 1.
 
-        The strategy may leave out any edge that is `free`; every other edge has positive
-        probability whenever its source is visited (fairness). Before the goal only `allowed`
-        vertices may be visited. The largest set that no other edge leaves and inside which the goal
-        stays reachable (greatest fixed point, as for Markov decision processes).
+        The goal is a vertex of `goal` or an edge of `hits`. The strategy may leave out any edge
+        that is `free`; every other edge has a positive probability whenever its source is visited
+        (fairness). Before the goal only `allowed` vertices may be visited.
+
+        This is almost sure reachability in a Markov decision process (C. Baier, J.-P. Katoen,
+        Principles of Model Checking, MIT Press 2008, section 10.6.1), computed as a greatest fixed
+        point: start with all vertices, and remove those from which an edge that cannot be left out
+        leaves the set, and those from which the goal cannot be reached inside the set.
         """
         hits = np.zeros(len(self.target), dtype=np.bool_) if hits is None else hits
         winning = goal.copy() if allowed is None else goal | allowed
@@ -140,10 +154,12 @@ class Graph:
             winning[:] = True
         forced = ~free & ~hits
         while True:
+            # First the vertices that the environment can push out of the set ...
             leaves = forced & winning[self.source] & ~goal[self.source] & ~winning[self.target]
             if leaves.any():
                 winning[self.source[leaves]] = False
                 continue
+            # ... then those from which the goal is no longer reachable inside it.
             start = goal & winning
             start[self.source[hits & winning[self.source]]] = True
             inside = winning[self.source] & winning[self.target]
@@ -154,12 +170,13 @@ class Graph:
 
 
 def sum_by(index: NDArray[Any], values: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Sum of the values that share an index, shape (n,)."""
+    """Add up the values that share an index; shape (n,)."""
     return np.asarray(np.bincount(index, weights=values, minlength=n), dtype=np.float64)
 
 
 def ranges(first: Index, last: Index) -> Index:
-    """All numbers of the half-open ranges one after the other."""
+    """Return all numbers of the half-open ranges [first, last), one range after the other."""
+    # Equivalent to concatenating np.arange for each pair, without a loop in Python.
     length = last - first
     total = int(length.sum())
     if not total:
@@ -169,7 +186,11 @@ def ranges(first: Index, last: Index) -> Index:
 
 
 def _tarjan(n: int, row: list[int], target: list[int]) -> NDArray[np.int32]:
-    """Strong components by Tarjan's algorithm without recursion."""
+    """Return strong components by Tarjan's algorithm, without recursion.
+
+    Source: R. E. Tarjan, Depth-first search and linear graph algorithms, SIAM J. Comput. 1 (1972).
+    An explicit stack, because reachability graphs are deeper than Python's recursion limit.
+    """
     found, low, label = [-1] * n, [0] * n, [-1] * n
     at, stack, count, components = row[:n], list[int](), 0, 0
     for root in range(n):

@@ -1,5 +1,7 @@
-"""A reachability graph as SVG: columns by distance from the initial marking, dead and final
-markings and a witness marked."""
+"""A reachability graph as SVG, in columns by distance from the initial marking.
+
+Dead markings, final markings and the path of a witness are coloured.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,16 @@ from petrobot.coordinator.analysis.net.graph import Mask
 from petrobot.coordinator.analysis.net.space import Space
 
 MARKINGS = 400
-"""Markings drawn at most; a picture of more says nothing."""
+"""The most markings drawn; a picture of more is unreadable."""
 COLUMN, ROW, WIDE, HIGH = 220, 46, 170, 30
 STYLE = """
-.m rect{fill:#f6f8fa;stroke:#57606a;rx:6}.m text,.e text{font:11px sans-serif;fill:#24292f}.m text{text-anchor:middle}
-.m.initial rect{stroke-width:3}.m.dead rect{fill:#ffd7d5;stroke:#cf222e}.m.final rect{fill:#dafbe1;stroke:#1a7f37}
+.m rect{fill:#f6f8fa;stroke:#57606a;rx:6}.m text,.e text{font:11px sans-serif;fill:#24292f}
+.m text{text-anchor:middle}
+.m.initial rect{stroke-width:3}.m.dead rect{fill:#ffd7d5;stroke:#cf222e}
+.m.final rect{fill:#dafbe1;stroke:#1a7f37}
 .e path{fill:none;stroke:#8c959f;marker-end:url(#head)}.e text{fill:#57606a;font-size:10px}
-.on path{stroke:#bf3989;stroke-width:2.5}.on text{fill:#bf3989;font-weight:bold}.m.on rect{stroke:#bf3989;stroke-width:2.5}
+.on path{stroke:#bf3989;stroke-width:2.5}.on text{fill:#bf3989;font-weight:bold}
+.m.on rect{stroke:#bf3989;stroke-width:2.5}
 @media(prefers-color-scheme:dark){.m rect{fill:#21262d}.m text{fill:#e6edf3}.e text{fill:#8b949e}
 .m.dead rect{fill:#67060c}.m.final rect{fill:#033a16}}
 """
@@ -31,11 +36,11 @@ def graph_svg(
     final: Mask | None = None,
     markings: int = MARKINGS,
 ) -> str:
-    """The SVG text of a space with at most `markings` markings drawn (the nearest to the initial
-    one, and the witness).
+    """Return the SVG text of a space.
 
-    `witness` is a firing sequence from the initial marking, `final` says which markings are
-    designed ends.
+    At most `markings` markings are drawn: those nearest to the initial one, plus those of the
+    witness. `witness` is a firing sequence from the initial marking; `final` says which markings
+    are designed ends. Raises ValueError if the witness leaves the space.
     """
     steps = _steps(space, witness)
     shown = sorted(
@@ -72,22 +77,22 @@ def graph_svg(
 
 
 def _steps(space: Space, witness: Sequence[str]) -> list[tuple[int, int, int]]:
-    """(marking, transition, marking) along a firing sequence. Raises ValueError where it leaves the
+    """Return (marking, transition, marking) for each firing. Raises ValueError outside the
     space."""
     at, out = 0, []
     for name in witness:
         t = space.net.transition_index[name]
         edges = np.flatnonzero(space.label[space.row[at] : space.row[at + 1]] == t) + space.row[at]
         if not len(edges):
-            raise ValueError(f"the witness fires {name} where the space has no such edge")
+            raise ValueError(f"the witness fires {name}, but marking {at} has no such edge")
         out.append((at, t, int(space.target[edges[0]])))
         at = out[-1][2]
     return out
 
 
 def _depths(space: Space, shown: Sequence[int]) -> dict[int, int]:
-    """Distance of the shown markings from the initial one: breadth-first numbers make parents come
-    first."""
+    """Return the distance of the shown markings from the initial one."""
+    # Breadth-first numbers: the parent of a marking always has a smaller number.
     depth = np.zeros(len(space), dtype=np.int64)
     parent = space.parent_edge
     for i in range(1, max(shown) + 1):
@@ -106,7 +111,7 @@ def _edges(
                 continue
             (x, y), (u, v) = at[i], at[j]
             start, end = (x + WIDE, y + HIGH // 2), (u, v + HIGH // 2)
-            if u <= x:  # back or sideways: leave and arrive below
+            if u <= x:  # backwards or within a column: leave and arrive at the lower border
                 start, end = (x + WIDE // 2, y + HIGH), (u + WIDE // 2, v + HIGH)
                 path = (
                     f"M{start[0]} {start[1]}C{start[0]} {start[1] + 40} {end[0]} "

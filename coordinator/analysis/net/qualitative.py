@@ -1,10 +1,10 @@
-"""Boundedness, liveness, deadlocks, reversibility, home markings and soundness of a net, from one
-pass over its space.
+"""Boundedness, liveness, deadlocks, reversibility, home markings and soundness of a net.
 
-Definitions after T. Murata (1989): a transition is L0 (dead) if it never fires, L1 if it can fire,
-L2 if for every k some sequence fires it k times, L3 if some infinite sequence fires it for ever, L4
-(live) if from every reachable marking a sequence fires it. In a finite graph L2 and L3 are the
-same: it labels an edge on a cycle.
+All verdicts come from one pass over its reachability graph. Liveness levels after T. Murata, Proc.
+IEEE 77 (1989), section IV: a transition is L0 (dead) if it never fires, L1 if it can fire, L2 if
+for every k some sequence fires it k times, L3 if some infinite sequence fires it infinitely often,
+L4 (live) if from every reachable marking some sequence fires it. In a finite graph L2 and L3 are
+the same: the transition labels an edge on a cycle.
 """
 
 from __future__ import annotations
@@ -16,67 +16,70 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
+from petrobot.coordinator.analysis.net.deadlocks import (
+    Hunt,
+    controlled_siphons,
+    empty_siphon,
+    hunt_deadlock,
+)
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
 from petrobot.coordinator.analysis.net.pack import thresholds
-from petrobot.coordinator.analysis.net.siphons import controlled_siphons, empty_siphon
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
-from petrobot.coordinator.analysis.net.stubborn import Hunt, hunt_deadlock
-from petrobot.coordinator.analysis.net.verdict import Verdict, Witness
+from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
 from petrobot.coordinator.task.net import Marking, Net
 
 SAFETY = ""
-"""Every marking of the executed task is one of the ordinary net, so what never happens here never
-happens there."""
+"""No assumption: every marking of the executed task is one of the ordinary net, so what never
+happens in the net never happens in execution."""
 FAIRNESS = (
     "every awaited event eventually occurs, and every status of an action is possible "
     "again and again"
 )
-"""What liveness and progress need beyond the ordinary net."""
+"""What liveness and progress of the executed task require beyond the ordinary net."""
 HUNT = 10_000
-"""Markings that the hunt for a deadlock looks at where the space is not complete."""
+"""Markings that the search for deadlocks may visit if the space is not complete."""
 GROUPS = 100
-"""Groups of deadlocks that are told one by one."""
+"""The most groups of deadlocks that are reported one by one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deadlock:
-    """Dead markings with the same marked places: how many, a shortest way to the nearest, and what
-    can never refill."""
+    """Dead markings with the same marked places: how many, and a shortest path to the nearest."""
 
     marked: tuple[str, ...]
     count: int
     witness: Witness
     emptied: tuple[str, ...]
-    """Places of the largest empty siphon there: no firing can ever mark them again."""
+    """Places of the largest empty siphon: no firing can ever mark them again."""
 
 
 @dataclass(frozen=True)
 class Qualitative:
-    """All verdicts on one net. Levels, bounds and counts are those of the space found if it is not
-    complete."""
+    """All verdicts on one net. If the space is not complete, levels, bounds and counts are those
+    of the part that was found."""
 
     space: Space
     graph: Graph
     bounds: tuple[int | None, ...]
-    """Proven; by place. They are reached where the space is complete."""
+    """Proven upper bounds by place; if the space is complete, they are reached."""
     most: int | None
-    """The most tokens that any place ever holds; None if unknown or without end."""
-    bounded: Verdict
-    safe: Verdict
-    deadlock_free: Verdict
+    """The most tokens that any place ever holds; None if unknown or unbounded."""
+    bounded: PropertyVerdict
+    safe: PropertyVerdict
+    deadlock_free: PropertyVerdict
     deadlocks: tuple[Deadlock, ...]
     dead_markings: int
-    """Among the markings found."""
-    quasi_live: Verdict
-    live: Verdict
+    """Number of dead, not final markings among those found."""
+    quasi_live: PropertyVerdict
+    live: PropertyVerdict
     levels: tuple[int | None, ...]
-    """Liveness level 0 to 4 of each transition (2 never appears: see above); None if unknown."""
-    reversible: Verdict
+    """Liveness level 0, 1, 3 or 4 of each transition (2 equals 3, see above); None if unknown."""
+    reversible: PropertyVerdict
     home_states: int | None
-    """Number of markings that can be reached from every reachable marking."""
-    sound: Verdict | None
-    """Only with a `final` predicate."""
+    """Number of markings that can be reached from every reachable marking; None if unknown."""
+    sound: PropertyVerdict | None
+    """None without a `final` predicate."""
 
     @property
     def dead_transitions(self) -> tuple[str, ...]:
@@ -95,11 +98,11 @@ def examine(
     cover: Coverability | None = None,
     in_haste: bool = False,
 ) -> Qualitative:
-    """All verdicts on the net behind a space.
+    """Return all verdicts on the net of a space.
 
-    `final` tells the designed ends: a dead marking that is not final is a deadlock. `cover` is a
-    coverability result if one is at hand; it is computed when the space is not complete. `in_haste`
-    leaves out what takes long: then only what the markings found say at a glance is told.
+    `final` identifies the designed ends: a dead marking that is not final is a deadlock. `cover`
+    passes a coverability result that is already known; otherwise it is computed if the space is not
+    complete. `in_haste` leaves out everything that takes long and judges the markings found only.
     """
     graph = Graph(len(space), space.source, space.target)
     if in_haste and cover is None:
@@ -130,8 +133,10 @@ def examine(
 
 
 def _most(space: Space, bounds: tuple[int | None, ...]) -> int | None:
-    """The most tokens in any place: known where a bound is reached by a marking found and no other
-    is above it."""
+    """Return the most tokens in any place, if known.
+
+    Known if the space is complete, or if a marking found reaches the highest of the proven bounds.
+    """
     if None in bounds:
         return None
     highest = max((b for b in bounds if b is not None), default=0)
@@ -139,24 +144,28 @@ def _most(space: Space, bounds: tuple[int | None, ...]) -> int | None:
 
 
 def witness(space: Space, i: int, loop: tuple[str, ...] = ()) -> Witness:
-    """A shortest firing sequence to marking i."""
+    """Return a shortest firing sequence to marking i as a witness."""
     marked = {p: n for p, n in zip(space.net.places, space.marking(i), strict=True) if n}
     return Witness(tuple(space.path(i)), marked, loop)
 
 
-def _unknown(space: Space, question: str = "") -> Verdict:
-    text = f"not known: the search stopped early ({space.reason})"
-    return Verdict(None, f"{text}; {question}" if question else text, complete=False)
+def _unknown(space: Space, question: str = "") -> PropertyVerdict:
+    text = f"unknown: the search stopped early ({space.reason})"
+    return PropertyVerdict(None, f"{text}; {question}" if question else text, complete=False)
 
 
 def _boundedness(
     space: Space, cover: Coverability | None
-) -> tuple[tuple[int | None, ...], Verdict, Verdict, Coverability | None]:
-    """(bounds, bounded, safe, the coverability result that was used, if any)."""
+) -> tuple[tuple[int | None, ...], PropertyVerdict, PropertyVerdict, Coverability | None]:
+    """Return (bounds, bounded, safe, the coverability result that was used, if any).
+
+    The cheapest proof first: the complete space, then invariants and capacities, then the
+    coverability tree, then a pump among the markings found.
+    """
     if space.complete:
         bounds: tuple[int | None, ...] = space.bounds
         most = max(space.bounds, default=0)
-        bounded = Verdict(
+        bounded = PropertyVerdict(
             True,
             f"no place ever holds more than {most} token{'s' * (most != 1)}",
             assumption=SAFETY,
@@ -164,9 +173,10 @@ def _boundedness(
         return bounds, bounded, _safe(space, True), None
     proven = place_bounds(space.net)
     if all(b is not None for b in proven):
-        bounded = Verdict(
+        bounded = PropertyVerdict(
             True,
-            f"bounded by invariants and capacities, although {space.reason}",
+            "bounded by invariants and capacities, although the search stopped early "
+            f"({space.reason})",
             assumption=SAFETY,
         )
         return (
@@ -182,20 +192,27 @@ def _boundedness(
         prefix, again, grows = pump
         shown = Witness(prefix, _marked(space.net, prefix), again)
         reason = (
-            f"{', '.join(grows)} can grow without end: {' '.join(again)} can be repeated for ever"
+            f"{', '.join(grows)} can grow without bound: {' '.join(again)} can be repeated for ever"
         )
         settled = known if cover.complete else tuple(proven)
-        return settled, Verdict(False, reason, shown), Verdict(False, reason, shown), cover
+        return (
+            settled,
+            PropertyVerdict(False, reason, shown),
+            PropertyVerdict(False, reason, shown),
+            cover,
+        )
     if cover.bounded:
-        bounded = Verdict(
-            True, f"bounded by the coverability tree, although {space.reason}", assumption=SAFETY
+        bounded = PropertyVerdict(
+            True,
+            f"bounded by the coverability tree, although the search stopped early ({space.reason})",
+            assumption=SAFETY,
         )
         return known, bounded, _safe(space, max((b or 0 for b in known), default=0) <= 1), cover
     return known, _unknown(space, cover.reason), _safe(space, False), cover
 
 
 def _lower(one: int | None, other: int | None) -> int | None:
-    """The lower of two bounds; None is none."""
+    """Return the lower of two bounds; None means no bound."""
     return other if one is None else one if other is None else min(one, other)
 
 
@@ -204,14 +221,14 @@ def _marked(net: Net, firings: tuple[str, ...]) -> dict[str, int]:
     return {p: n for p, n in zip(net.places, last, strict=True) if n}
 
 
-def _safe(space: Space, proven: bool) -> Verdict:
+def _safe(space: Space, proven: bool) -> PropertyVerdict:
     for p, most in enumerate(space.bounds):
         if most > 1:
             first = int(np.argmax(space.tokens(p) > 1))
             reason = f"{space.net.places[p]} can hold {most} tokens"
-            return Verdict(False, reason, witness(space, first), complete=space.complete)
+            return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     if proven:
-        return Verdict(
+        return PropertyVerdict(
             True,
             "no place ever holds more than one token",
             assumption=SAFETY,
@@ -221,7 +238,7 @@ def _safe(space: Space, proven: bool) -> Verdict:
 
 
 def _hunted(net: Net, hunt: Hunt | None) -> tuple[Deadlock, ...]:
-    """The deadlock found through stubborn sets, if there is one."""
+    """Return the deadlock that the search by stubborn sets found, if any."""
     if hunt is None or hunt.firings is None:
         return ()
     marked = _marked(net, hunt.firings)
@@ -232,51 +249,52 @@ def _hunted(net: Net, hunt: Hunt | None) -> tuple[Deadlock, ...]:
 
 def _deadlock_free(
     space: Space, dead: NDArray[np.int64], has_final: bool, hunt: Hunt | None
-) -> Verdict:
+) -> PropertyVerdict:
     other = " that is not a designed end" if has_final else ""
     if len(dead):
         first = int(dead[0])
         reason = f"nothing can happen any more in {space.net.describe(space.marking(first))}"
-        return Verdict(False, reason, witness(space, first), complete=space.complete)
+        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     for found in _hunted(space.net, hunt):
         reason = (
             f"nothing can happen any more with {', '.join(found.marked) or 'nothing'} "
             "marked (found by stubborn sets)"
         )
-        return Verdict(False, reason, found.witness, complete=False)
+        return PropertyVerdict(False, reason, found.witness, complete=False)
     always = _never_barred(space.net)
     if not space.complete and always is not None:
-        return Verdict(
+        return PropertyVerdict(
             True,
-            f"{always} needs nothing and nothing bars it: it can always fire",
+            f"{always} needs no token and nothing disables it: it can always fire",
             assumption=FAIRNESS,
         )
     if hunt is not None and not hunt.complete and not has_final and _siphons_suffice(space.net):
         reason = (
-            "every siphon holds a trap that is marked at first, so some transition is "
-            "always enabled"
+            "every siphon contains an initially marked trap, so some transition is always enabled"
         )
-        return Verdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIRNESS)
     if hunt is not None and hunt.complete:
         reason = (
-            f"no reachable marking{other} is dead: {hunt.states} markings along "
-            "stubborn sets stand for all"
+            f"no reachable marking{other} is dead (checked {hunt.states} markings by stubborn sets)"
         )
-        return Verdict(True, reason, assumption=FAIRNESS)
+        return PropertyVerdict(True, reason, assumption=FAIRNESS)
     if not space.complete:
-        return _unknown(space, f"no dead marking{other} among the {space.expanded} looked at")
-    return Verdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
+        return _unknown(space, f"no dead marking{other} among the {space.expanded} examined")
+    return PropertyVerdict(True, f"no reachable marking{other} is dead", assumption=FAIRNESS)
 
 
 def _never_barred(net: Net) -> str | None:
-    """A transition that is enabled in every marking (or one above it in priority is)."""
+    """Return a transition that is enabled in every marking unless one of higher priority is."""
     free = (t for t in range(len(net.transitions)) if not net.consume[t] and not thresholds(net, t))
     return next((net.transitions[t] for t in free), None)
 
 
 def _siphons_suffice(net: Net) -> bool:
-    """Whether Commoner's condition rules out a dead marking: weights of one and nothing that bars a
-    firing."""
+    """Return whether Commoner's condition rules out dead markings.
+
+    It does so only if all input weights are 1 and there are no inhibitors, capacities or
+    priorities.
+    """
     plain = (
         not any(net.inhibit)
         and len(set(net.priority)) <= 1
@@ -322,34 +340,36 @@ def _levels(space: Space, graph: Graph, cover: Coverability | None) -> tuple[int
 
 def _quasi_live(
     space: Space, levels: tuple[int | None, ...], cover: Coverability | None
-) -> Verdict:
+) -> PropertyVerdict:
     fired = np.bincount(space.label, minlength=len(levels)) > 0
     if fired.all():
-        return Verdict(
+        return PropertyVerdict(
             True, "every transition can fire", assumption=FAIRNESS, complete=space.complete
         )
     idle = [space.net.transitions[t] for t in np.flatnonzero(~fired)]
     dead = [name for name, level in zip(space.net.transitions, levels, strict=True) if level == 0]
     if not space.complete and dead:
-        return Verdict(
+        return PropertyVerdict(
             False, f"can never fire: {', '.join(dead)} (by the coverability tree)", complete=False
         )
     if not space.complete and cover is not None and cover.exact:
-        return Verdict(
+        return PropertyVerdict(
             True,
             "every transition can fire (by the coverability tree)",
             assumption=FAIRNESS,
             complete=False,
         )
     if not space.complete:
-        return _unknown(space, f"not seen to fire so far: {', '.join(idle)}")
-    return Verdict(False, f"can never fire: {', '.join(idle)}")
+        return _unknown(space, f"not fired so far: {', '.join(idle)}")
+    return PropertyVerdict(False, f"can never fire: {', '.join(idle)}")
 
 
-def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None) -> Verdict:
+def _live(
+    space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt | None
+) -> PropertyVerdict:
     names = space.net.transitions
     for found in _hunted(space.net, hunt):
-        return Verdict(
+        return PropertyVerdict(
             False,
             "a dead marking is reachable (found by stubborn sets)",
             found.witness,
@@ -358,10 +378,10 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
     if len(space.dead) and names:
         first = int(space.dead[0])
         reason = f"nothing can fire any more in {space.net.describe(space.marking(first))}"
-        return Verdict(False, reason, witness(space, first), complete=space.complete)
+        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     useless = [name for name, level in zip(names, levels, strict=True) if level == 0]
     if useless and not space.complete:
-        return Verdict(
+        return PropertyVerdict(
             False,
             f"can never fire: {', '.join(useless)} (by the coverability tree)",
             complete=False,
@@ -370,7 +390,7 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
         return _unknown(space)
     lost = [t for t, level in enumerate(levels) if level != 4]
     if not lost:
-        return Verdict(
+        return PropertyVerdict(
             True, "from every marking every transition can fire again", assumption=FAIRNESS
         )
     ours = graph.components[space.source]
@@ -380,17 +400,18 @@ def _live(space: Space, graph: Graph, levels: tuple[int | None, ...], hunt: Hunt
         if never:
             first = int(np.argmax(graph.components == component))
             reason = (
-                f"after {space.net.describe(space.marking(first))} never again: {', '.join(never)}"
+                f"after {space.net.describe(space.marking(first))} these never fire again: "
+                f"{', '.join(never)}"
             )
-            return Verdict(False, reason, witness(space, first))
+            return PropertyVerdict(False, reason, witness(space, first))
     raise AssertionError("a transition that is not live is missing in some bottom component")
 
 
-def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
+def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> PropertyVerdict:
     if not space.complete:
         for found in _hunted(space.net, hunt):
             if found.witness.firings:
-                return Verdict(
+                return PropertyVerdict(
                     False,
                     "a dead marking never returns to the start",
                     found.witness,
@@ -399,7 +420,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
         stuck = space.dead[space.dead > 0]
         if len(stuck):
             first = int(stuck[0])
-            return Verdict(
+            return PropertyVerdict(
                 False,
                 "a dead marking never returns to the start",
                 witness(space, first),
@@ -408,7 +429,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
         return _unknown(space)
     away = np.flatnonzero(~graph.backward([0]))
     if not len(away):
-        return Verdict(
+        return PropertyVerdict(
             True, "the initial marking can be reached again from everywhere", assumption=FAIRNESS
         )
     first = int(away[0])
@@ -416,7 +437,7 @@ def _reversible(space: Space, graph: Graph, hunt: Hunt | None) -> Verdict:
         f"from {space.net.describe(space.marking(first))} the initial marking is never "
         "reached again"
     )
-    return Verdict(False, reason, witness(space, first))
+    return PropertyVerdict(False, reason, witness(space, first))
 
 
 def _home_states(space: Space, graph: Graph) -> int | None:
@@ -426,30 +447,32 @@ def _home_states(space: Space, graph: Graph) -> int | None:
     return int((graph.components == bottoms[0]).sum()) if len(bottoms) == 1 else 0
 
 
-def _sound(space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...]) -> Verdict:
-    """Sound: from every marking an end is reached, nothing goes on at an end, and every transition
-    is of use."""
+def _sound(
+    space: Space, graph: Graph, ends: Mask, levels: tuple[int | None, ...]
+) -> PropertyVerdict:
+    """Sound: an end is reachable from every marking, no transition is enabled at an end, and every
+    transition can fire."""
     busy = np.flatnonzero(ends[: space.expanded] & (np.diff(space.row[: space.expanded + 1]) > 0))
     if len(busy):
         first = int(busy[0])
         goes_on = space.net.transitions[space.label[space.row[first]]]
         reason = (
-            f"left over at the end {space.net.describe(space.marking(first))}: "
+            f"the task is not finished at its end {space.net.describe(space.marking(first))}: "
             f"{goes_on} can still fire"
         )
-        return Verdict(False, reason, witness(space, first), complete=space.complete)
+        return PropertyVerdict(False, reason, witness(space, first), complete=space.complete)
     if not space.complete:
         return _unknown(space)
     lost = np.flatnonzero(~graph.backward(ends))
     if len(lost):
         first = int(lost[0])
         reason = f"from {space.net.describe(space.marking(first))} no designed end can be reached"
-        return Verdict(False, reason, witness(space, first))
+        return PropertyVerdict(False, reason, witness(space, first))
     useless = [t for t, level in zip(space.net.transitions, levels, strict=True) if level == 0]
     if useless:
-        return Verdict(False, f"of no use, never fires: {', '.join(useless)}")
+        return PropertyVerdict(False, f"useless, can never fire: {', '.join(useless)}")
     reason = (
-        "an end can be reached from everywhere, nothing is left over there, every "
-        "transition is of use"
+        "an end can be reached from every marking, no transition is enabled there, and every "
+        "transition can fire"
     )
-    return Verdict(True, reason, assumption=FAIRNESS)
+    return PropertyVerdict(True, reason, assumption=FAIRNESS)

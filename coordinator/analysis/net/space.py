@@ -1,10 +1,10 @@
-"""Reachability: all markings of a net in breadth-first order with its edges in compact arrays,
-within stated limits.
+"""The reachability graph of a net: markings in breadth-first order, edges in compact arrays.
 
-Three engines give identical answers, down to the numbering of markings and the order of edges:
-marking i is expanded before marking i + 1, transitions in order, and a new marking gets the next
-number. So an engine can go on where another one stopped: `auto` starts with plain integers, which
-need no set-up, and hands over to numpy when the net proves large.
+Three engines explore it and give identical results, down to the numbers of the markings and the
+order of the edges: marking i is expanded before marking i + 1, its transitions are tried in order,
+and a new marking gets the next number. So one engine can continue where another one stopped. `auto`
+starts with plain integers, which need no preparation, and hands over to numpy when the net turns
+out to be large.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.explore import (
-    Engine,
+    ExplorationEngine,
     Explored,
     IntegerEngine,
     Labels,
@@ -31,19 +31,19 @@ from petrobot.coordinator.task.net import Marking, Net
 EngineName = Literal["auto", "integers", "numpy", "numba"]
 
 HANDOVER = 10_000
-"""Markings after which `auto` leaves plain integers."""
+"""Markings after which `auto` changes from plain integers to numpy."""
 NARROW = 8
-"""Value bits that plain integers start with for a place without a known bound: width costs them
-little."""
+"""Value bits that plain integers reserve for a place without a known bound (width costs them
+little)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """When a search stops early; None means without limit.
+class SearchLimits:
+    """Limits of a search in markings, seconds and bytes; None means no limit.
 
-    `memory` is in bytes and counts what the engine itself holds. `seconds` needs a `clock` (s),
-    since nothing here reads a clock of its own. `progress` is called now and then with (markings
-    found, markings expanded).
+    `memory` counts what the engine itself holds. `seconds` needs a `clock` (s), because nothing in
+    this package reads a clock of its own. `progress` is called after each block of markings with
+    (markings found, markings expanded).
     """
 
     states: int | None = None
@@ -53,20 +53,19 @@ class Limits:
     progress: Callable[[int, int], None] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a time limit that nobody can measure."""
+        """Refuse a time limit without a clock to measure it."""
         if self.seconds is not None and self.clock is None:
-            raise ValueError("a limit in seconds needs a clock: pass clock=time.monotonic")
+            raise ValueError("a limit in seconds needs a clock; pass clock=time.monotonic")
 
 
 @dataclass(frozen=True)
 class Space:
-    """The reachable markings found, numbered in breadth-first order (0 is the initial one), and
-    their edges.
+    """The reachable markings found, in breadth-first order (0 is the initial one), and their edges.
 
-    Edge e of marking i, `row[i] <= e < row[i + 1]`, fires transition `label[e]` and leads to
-    marking `target[e]`; the edges of a marking stand in transition order (without kept edges `row`
-    still counts them). If the search was cut short, only the first `expanded` markings have their
-    edges, `complete` is False and `reason` says why.
+    Edge e of marking i, with `row[i] <= e < row[i + 1]`, fires transition `label[e]` and leads to
+    marking `target[e]`. The edges of a marking are in transition order. If edges are not kept,
+    `row` still counts them. If the search stopped early, only the first `expanded` markings have
+    their edges, `complete` is False and `reason` says why.
     """
 
     net: Net
@@ -87,7 +86,7 @@ class Space:
 
     @property
     def edges(self) -> int:
-        """Number of edges found, also when only their count was kept."""
+        """Number of edges found, even if the edges themselves were not kept."""
         return int(self.row[-1])
 
     @property
@@ -96,22 +95,22 @@ class Space:
         return self.words.nbytes + self.row.nbytes + self.target.nbytes + self.label.nbytes
 
     def marking(self, i: int) -> Marking:
-        """Marking number i."""
+        """Return marking number i."""
         return self.layout.unpack(self.layout.join_many(self.words[i : i + 1])[0])
 
     def markings(self, block: int = 1 << 16) -> Iterator[tuple[int, Tokens]]:
-        """All markings as blocks (number of the first, array of shape (n, places))."""
+        """Yield all markings in blocks: (number of the first one, array of shape (n, places))."""
         for start in range(0, len(self), block):
             yield start, self.layout.unpack_many(self.words[start : start + block])
 
     def tokens(self, place: int) -> Tokens:
-        """Tokens of one place in every marking, shape (states,)."""
+        """Return the tokens of one place in every marking, shape (states,)."""
         if place not in self._columns:
             self._columns[place] = self.layout.tokens(self.words, place)
         return self._columns[place]
 
     def where(self, predicate: Callable[[Marking], bool]) -> NDArray[np.bool_]:
-        """In which markings the predicate holds, shape (states,)."""
+        """Return in which markings the predicate holds, shape (states,)."""
         found = [predicate(tuple(m)) for _, block in self.markings() for m in block.tolist()]
         return np.array(found, dtype=np.bool_)
 
@@ -120,7 +119,7 @@ class Space:
         return {packed: i for i, packed in enumerate(self.layout.join_many(self.words))}
 
     def number(self, marking: Marking) -> int | None:
-        """The number of a marking, None if it was not found."""
+        """Return the number of a marking, or None if it was not found."""
         if any(n >> w for n, w in zip(marking, self.layout.width, strict=True)):
             return None
         return self._numbers.get(self.layout.pack(marking))
@@ -148,7 +147,7 @@ class Space:
         return np.flatnonzero(np.diff(self.row[: self.expanded + 1]) == 0)
 
     def path(self, goal: int) -> list[str]:
-        """A shortest firing sequence from the initial marking to marking number `goal`."""
+        """Return a shortest firing sequence from the initial marking to marking number `goal`."""
         sequence = []
         while goal:
             edge = int(self.parent_edge[goal])
@@ -158,8 +157,10 @@ class Space:
 
     @cached_property
     def parent_edge(self) -> NDArray[np.int64]:
-        """The first edge that leads to each marking: breadth-first numbering makes it one of a
-        shortest path."""
+        """The first edge that leads to each marking, -1 for the initial one; shape (states,).
+
+        Breadth-first numbering makes it the last edge of a shortest path.
+        """
         parent = np.full(len(self), -1, dtype=np.int64)
         parent[self.target[::-1]] = np.arange(len(self.target) - 1, -1, -1)
         return parent
@@ -169,19 +170,19 @@ def explore(
     net: Net,
     *,
     engine: EngineName = "auto",
-    limits: Limits | None = None,
+    limits: SearchLimits | None = None,
     edges: bool = True,
     bounds: Sequence[int | None] | None = None,
 ) -> Space:
-    """The reachable markings of a net from its initial one.
+    """Return the markings that are reachable from the initial one.
 
-    `bounds` (tokens by place, None: unknown; by default from the P-invariants) only size the
-    fields; they need not be right. With `edges=False` the edges are counted, not kept. Ctrl-C,
-    limits and a place that outgrows 63 bits give the partial space found so far, marked incomplete.
-    Raises TooManyTokens if the initial marking has such a place and ImportError if numba is asked
-    for and not installed.
+    `bounds` (tokens by place, None if unknown; by default from the P-invariants) only choose the
+    width of the fields, so they need not be right. With `edges=False` the edges are counted but not
+    kept. Ctrl-C, a limit, or a place with more tokens than 63 bits can count ends the search; the
+    space found so far is returned, marked as incomplete. Raises TooManyTokens if the initial
+    marking has such a place, and ImportError if the engine "numba" is requested but not installed.
     """
-    limits = limits or Limits()
+    limits = limits or SearchLimits()
     started = limits.clock() if limits.clock else 0.0
     if engine in ("auto", "integers"):
         layout = Layout.for_net(net, bounds, NARROW)
@@ -205,19 +206,22 @@ def explore(
 
 
 INTERRUPTED = "interrupted"
-"""Reason of a search that Ctrl-C ended."""
+"""`Space.reason` of a search that was ended by Ctrl-C."""
 
 
-def _plain_engine(net: Net, layout: Layout, edges: bool) -> Engine:
+def _plain_engine(net: Net, layout: Layout, edges: bool) -> ExplorationEngine:
     return IntegerEngine(Explored.start(net, layout, edges))
 
 
 _HAND_OVER = "hand over"
 
 
-def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> Engine:
-    """An engine of machine words that goes on from what was begun, in a layout as narrow as is
-    known to suffice."""
+def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> ExplorationEngine:
+    """Return an engine of machine words that continues a search, in the narrowest safe layout.
+
+    A place gets the bits of its proven bound, or else room for twice the tokens seen so far: few
+    words per marking matter more than avoiding an overflow, after which the layout is widened.
+    """
     seen = begun.layout.unpack_many(begun.words).max(axis=0).tolist()
     known = (
         bounds
@@ -242,9 +246,13 @@ def _engine(name: str, begun: Explored, bounds: Sequence[int | None] | None) -> 
     return NumpyEngine(begun)
 
 
-def _run(engine: Engine, limits: Limits, started: float, budget: int | None) -> str:
-    """Expand until done; gives the reason why it stopped early, or an empty text. Lets
-    KeyboardInterrupt through."""
+def _run(
+    engine: ExplorationEngine, limits: SearchLimits, started: float, budget: int | None
+) -> str:
+    """Expand until the search is complete or a limit is reached.
+
+    Return the reason for stopping early, or an empty string. KeyboardInterrupt passes through.
+    """
     cap = min((n for n in (limits.states, budget) if n is not None), default=None)
     try:
         while engine.expand(cap):
@@ -275,9 +283,8 @@ def _space(found: Explored, reason: str, engine: str) -> Space:
     row = np.full(len(found.words) + 1, found.row[-1], dtype=np.int64)
     row[: len(found.row)] = found.row
     states = len(found.words)
-    if (
-        reason and found.keep_edges
-    ):  # an interruption may have left markings whose edges are not yet in
+    if reason and found.keep_edges:
+        # An interruption may have left markings to which no kept edge leads yet.
         states = int(found.target.max(initial=0)) + 1
     return Space(
         found.net,

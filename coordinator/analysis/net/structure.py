@@ -1,11 +1,10 @@
-"""What a net's arcs alone prove: invariants, bounds, conservativeness, conflicts; exact integer
-certificates.
+"""Structural analysis: invariants, bounds, conservativeness and conflicts, as exact integers.
 
-All of it reads the incidence matrix C = Post - Pre. An inhibitor, a capacity or a priority only
-removes behaviour, so what holds here for every firing sequence (bounds, P-invariants, exclusion)
-holds in the restricted net as well; T-invariants, siphons and traps are those of the net without
-them. Source of the notions: T. Murata, Petri nets: properties, analysis and applications, Proc.
-IEEE 77 (1989), sections V to VII.
+Everything here follows from the incidence matrix C = Post - Pre. Inhibitors, capacities and
+priorities only remove behaviour, so what holds for every firing sequence here (bounds,
+P-invariants, exclusion) also holds with them. T-invariants are those of the net without them.
+Definitions: T. Murata, Petri nets: properties, analysis and applications, Proc. IEEE 77 (1989),
+sections V to VII.
 """
 
 from __future__ import annotations
@@ -22,29 +21,29 @@ from petrobot.coordinator.analysis.net.pack import effect
 from petrobot.coordinator.task.net import Net
 
 EFFORT = 2_000
-"""Rows that the enumeration of semiflows may hold at a time."""
+"""The most rows that the enumeration of semiflows may hold at a time."""
 
 SMALL_EFFORT = 300
-"""Rows beyond which a linear program finds a Lyapunov function sooner than an enumeration does."""
+"""Rows above which a linear program finds a Lyapunov function faster than an enumeration."""
 
 Vector = dict[int, int]
-"""A sparse integer vector: entries that are not zero, by index."""
+"""A sparse integer vector: its non-zero entries by index."""
 
 
 @dataclass(frozen=True, slots=True)
 class Semiflows:
-    """Minimal-support non-negative integer solutions; all of them if `complete`."""
+    """Non-negative integer solutions of minimal support; all of them if `complete`."""
 
     vectors: tuple[Vector, ...]
     complete: bool
 
     def covers(self, size: int) -> bool:
-        """Whether every index below `size` stands in some vector."""
+        """Return whether every index below `size` occurs in some vector."""
         return len(set().union(*self.vectors)) == size if self.vectors else size == 0
 
 
 def incidence(net: Net) -> NDArray[np.int64]:
-    """C = Post - Pre, shape (places, transitions)."""
+    """Return C = Post - Pre, shape (places, transitions)."""
     C = np.zeros((len(net.places), len(net.transitions)), dtype=np.int64)
     for t in range(len(net.transitions)):
         for p, change in effect(net, t).items():
@@ -53,7 +52,7 @@ def incidence(net: Net) -> NDArray[np.int64]:
 
 
 def place_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
-    """Minimal y >= 0 with y^T C = 0: weighted token sums that no firing changes."""
+    """Return the minimal y >= 0 with y^T C = 0: weighted token sums that no firing changes."""
     rows: list[Vector] = [{} for _ in net.places]
     for t in range(len(net.transitions)):
         for p, change in effect(net, t).items():
@@ -62,13 +61,18 @@ def place_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
 
 
 def transition_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
-    """Minimal x >= 0 with C x = 0: firing counts that bring a marking back to itself."""
+    """Return the minimal x >= 0 with C x = 0: firing counts that reproduce a marking."""
     return _semiflows([effect(net, t) for t in range(len(net.transitions))], effort)
 
 
 def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
-    """Minimal-support non-negative combinations of the rows that give zero (Farkas' algorithm, as
-    by Colom & Silva)."""
+    """Return the minimal-support non-negative combinations of the rows that give zero.
+
+    Farkas' algorithm: eliminate one column after the other by combining each row that is positive
+    there with each that is negative. The next column is the one that adds the fewest rows. Source:
+    J. M. Colom, M. Silva, Convex geometry and semiflows in P/T nets, Advances in Petri Nets 1990,
+    LNCS 483 (1991).
+    """
     live = [({i: 1}, dict(row)) for i, row in enumerate(rows)]
     while True:
         columns = _signs(live)
@@ -84,8 +88,7 @@ def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
 
 
 def _signs(live: list[tuple[Vector, Vector]]) -> dict[int, list[int]]:
-    """For each column that is not yet zero everywhere: how many rows are positive and negative
-    there."""
+    """Return by column that is not yet zero: how many rows are positive and negative there."""
     signs: dict[int, list[int]] = {}
     for _, rest in live:
         for column, value in rest.items():
@@ -94,8 +97,10 @@ def _signs(live: list[tuple[Vector, Vector]]) -> dict[int, list[int]]:
 
 
 def _annul(live: list[tuple[Vector, Vector]], column: int) -> list[tuple[Vector, Vector]]:
-    """Replace the rows that are not zero in the column by their combinations that are; keep minimal
-    supports."""
+    """Replace the rows that are not zero in a column by their combinations that are zero there.
+
+    Of all rows only those of minimal support are kept.
+    """
     kept = [row for row in live if column not in row[1]]
     plus = [row for row in live if row[1].get(column, 0) > 0]
     minus = [row for row in live if row[1].get(column, 0) < 0]
@@ -121,8 +126,10 @@ def _combined(a: Vector, u: int, b: Vector, v: int) -> Vector:
 def _minimal_supports(
     kept: list[tuple[Vector, Vector]], fresh: list[tuple[Vector, Vector]]
 ) -> list[tuple[Vector, Vector]]:
-    """Those rows whose support contains no other one (of equal ones one stays); the kept ones are
-    minimal already."""
+    """Return the rows whose support contains no other support (one row of equal supports stays).
+
+    Supports are compared as bit masks, small ones first; `kept` is minimal in itself already.
+    """
     old = [(sum(1 << i for i in row[0]), row) for row in kept]
     new: list[tuple[int, tuple[Vector, Vector]]] = []
     for mask, row in sorted(
@@ -138,8 +145,10 @@ def _minimal_supports(
 
 
 def invariant_basis(rows: Sequence[Vector]) -> list[Vector]:
-    """An integer basis of all combinations (signs allowed) of the rows that give zero: sparse
-    elimination."""
+    """Return an integer basis of all combinations of the rows that give zero (any signs).
+
+    Sparse Gaussian elimination without fractions.
+    """
     work = [(dict(row), {i: 1}) for i, row in enumerate(rows)]
     basis, pivots = [], list[tuple[int, Vector, Vector]]()
     for rest, y in work:
@@ -157,10 +166,9 @@ def invariant_basis(rows: Sequence[Vector]) -> list[Vector]:
 
 
 def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
-    """The most tokens each place can hold by P-semiflows and capacities; None where these prove
-    nothing.
+    """Return upper bounds of the tokens by place, from P-semiflows and capacities; None if unknown.
 
-    y^T M = y^T M0 in every reachable M gives M(p) <= y^T M0 / y(p). Sound with inhibitors and
+    y^T M = y^T M0 for every reachable M gives M(p) <= y^T M0 / y(p). Also valid with inhibitors and
     priorities.
     """
     bounds = [
@@ -176,11 +184,10 @@ def place_bounds(net: Net, flows: Semiflows | None = None) -> list[int | None]:
 
 
 def linear_bound(net: Net, place: int) -> int | None:
-    """The most tokens of a place over all M = M0 + C x >= 0, x >= 0 (state equation as a linear
-    program); None: none.
+    """Return an upper bound of the tokens of a place by the state equation, or None if it has none.
 
-    The exact value may be smaller, never larger. Capacities are taken in; inhibitors and priorities
-    are relaxed.
+    A linear program: maximise M(p) over all M = M0 + C x >= 0 with x >= 0. The true maximum may be
+    smaller, never larger. Capacities are constraints; inhibitors and priorities are left out.
     """
     from scipy.optimize import linprog
 
@@ -190,29 +197,33 @@ def linear_bound(net: Net, place: int) -> int | None:
     room = [max(net.capacity[p] or 0, net.initial[p]) - net.initial[p] for p in limited]
     A, b = np.vstack([-C, C[limited]]), np.concatenate([start, np.array(room, dtype=float)])
     found = linprog(-C[place], A_ub=A, b_ub=b, method="highs")
+    # 1e-6: the solver's optimum may be a rounding error below a whole number.
     return int(np.floor(start[place] - found.fun + 1e-6)) if found.status == 0 else None
 
 
 @dataclass(frozen=True, slots=True)
 class Lyapunov:
-    """A linear Lyapunov function y.M of a net: y > 0 (by place), y^T C <= 0, so y.M never grows
-    (checked in integers)."""
+    """A linear Lyapunov function y.M of a net: y > 0 and y^T C <= 0, so no firing increases y.M.
+
+    The inequality was checked in integers, not in floating point.
+    """
 
     weights: Vector
     conserved: bool
     """Whether y^T C = 0: the net is conservative."""
 
     def value(self, marking: Sequence[int]) -> int:
-        """y.M."""
+        """Return y.M."""
         return sum(w * marking[p] for p, w in self.weights.items())
 
 
 def lyapunov(net: Net) -> Lyapunov | None:
-    """A positive integer y with y^T C <= 0, which makes the net bounded from every initial marking;
-    None if none exists.
+    """Return a positive integer y with y^T C <= 0, or None if none was found.
 
-    The sum of all P-semiflows where they cover the places, else of the minimal y >= 0 with y^T C <=
-    0 where their enumeration stays small, else a linear program whose solution is made rational and
+    Such a y proves that the net is bounded from every initial marking. Three ways, in this order:
+    the sum of all P-semiflows if they cover the places; the sum of the minimal y >= 0 with
+    y^T C <= 0 if their enumeration stays small (each transition gets a slack row, which turns the
+    inequality into an equation); a linear program whose solution is rounded to fractions and
     checked exactly.
     """
     flows = place_semiflows(net)
@@ -246,8 +257,10 @@ def lyapunov(net: Net) -> Lyapunov | None:
 
 
 def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
-    """Integer weights near a multiple of y that satisfy y^T C <= 0 exactly, if a small denominator
-    does."""
+    """Return integer weights close to a multiple of y with y^T C <= 0 exactly, or None.
+
+    Fractions with small denominators are tried first, since the weights of real nets are small.
+    """
     for largest in (1, 12, 1000, 10**6):
         near = [Fraction(float(v)).limit_denominator(largest) for v in y]
         scale = int(np.lcm.reduce([f.denominator for f in near])) if near else 1
@@ -262,13 +275,15 @@ def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
 
 
 def is_strictly_conservative(net: Net) -> bool:
-    """Whether no firing changes the number of tokens."""
+    """Return whether no firing changes the total number of tokens."""
     return all(sum(effect(net, t).values()) == 0 for t in range(len(net.transitions)))
 
 
 def conflict_sets(net: Net) -> list[tuple[int, ...]]:
-    """Groups of transitions that share an input place, directly or through others (of more than one
-    member)."""
+    """Return the groups of two or more transitions that share input places.
+
+    The relation is closed transitively (union-find).
+    """
     group = list(range(len(net.transitions)))
 
     def root(t: int) -> int:
@@ -288,7 +303,7 @@ def conflict_sets(net: Net) -> list[tuple[int, ...]]:
 
 
 def exclusive_places(net: Net, flows: Semiflows) -> set[tuple[int, int]]:
-    """Pairs of places that a P-semiflow keeps from being marked together: y(p) + y(q) > y^T M0."""
+    """Return pairs of places that are never marked together: y(p) + y(q) > y^T M0 for some y."""
     pairs: set[tuple[int, int]] = set()
     for y in flows.vectors:
         total = sum(weight * net.initial[p] for p, weight in y.items())

@@ -1,5 +1,4 @@
-"""What every answer of the analysis carries: verdict, reason, witness, assumption, and whether the
-search was complete."""
+"""The answer to one question about a net: holds or not, reason, witness, assumption."""
 
 from __future__ import annotations
 
@@ -9,11 +8,11 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A firing sequence from the initial marking that shows the verdict; `Net.replay(firings)`
-    repeats it.
+    """A firing sequence from the initial marking that demonstrates a verdict.
 
-    `loop` may be fired again and again after `firings` (a pump, or a cycle that is never left);
-    `marking` is the marked places after `firings`.
+    `Net.replay(firings)` repeats it. `marking` holds the marked places after `firings`. `loop`, if
+    not empty, can be fired again and again after `firings`: a pump that adds tokens each time, or a
+    cycle that the net never leaves.
     """
 
     firings: tuple[str, ...]
@@ -21,18 +20,18 @@ class Witness:
     loop: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         out: dict[str, Any] = {"firings": list(self.firings), "marking": dict(self.marking)}
         return out | ({"loop": list(self.loop)} if self.loop else {})
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """`holds` is True, False or None (unknown); `reason` says why in words for people.
+class PropertyVerdict:
+    """Whether a property holds (True, False, or None for unknown), and the reason as a sentence.
 
-    `assumption` is what it takes for the verdict on the ordinary net to hold for the executed task
-    (empty: nothing more); `complete` whether all reachable markings stand behind it (a False
-    verdict with a witness needs no complete search).
+    `assumption` is the condition under which the verdict on the ordinary net also holds for the
+    executed task (empty: it holds as it is). `complete` says whether all reachable markings were
+    examined; a False verdict with a witness is valid without that.
     """
 
     holds: bool | None
@@ -42,7 +41,7 @@ class Verdict:
     complete: bool = True
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data."""
+        """Return plain data."""
         return {
             "holds": self.holds,
             "reason": self.reason,

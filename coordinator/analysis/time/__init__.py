@@ -1,1 +1,1 @@
-"""How long and how likely: the stochastic view, its Markov chain, and simulation; pure."""
+"""Quantitative analysis: the stochastic view of a task, its Markov chain, simulation. Pure."""

@@ -1,10 +1,15 @@
-"""How long until a task is complete, and with what probability: moments, distribution and quantiles
-from the initial marking.
+"""Time until a task is complete, and its probability: moments, distribution, quantiles.
 
-With h the probability of ever completing, y = E[T; complete] and z = E[T^2; complete], each
-satisfies x = b + A x over the markings that can still complete (A the jump probabilities, s the
-mean sojourn): h from b = the jumps into the goal, y from b = s h, z from b = 2 s^2 h + 2 s A y. The
-law of T given completion comes from uniformisation.
+Let T be the time to completion, h the probability of completing, y = E[T; complete] and
+z = E[T^2; complete], each by marking. A holds the jump probabilities among the markings that can
+still complete, s the mean sojourn times (s). Each of the three satisfies x = b + A x:
+
+    h with b = probability of jumping into the goal
+    y with b = s h
+    z with b = 2 s^2 h + 2 s A y
+
+These are first-step equations of absorbing chains (J. G. Kemeny, J. L. Snell, Finite Markov Chains,
+1960, chapter 3). The distribution of T given completion comes from uniformisation.
 """
 
 from __future__ import annotations
@@ -15,17 +20,17 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import Plan, solve
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import Generator, poisson_weights
 
 
 @dataclass(frozen=True)
 class Completion:
-    """Completion from the initial marking. Times are in seconds and conditional on completing."""
+    """Completion from the initial marking. Times in seconds, given that the task completes."""
 
     chain: Chain
     goal: Mask
-    plan: Plan = field(repr=False)
+    plan: SolveOrder = field(repr=False)
     h: Values = field(repr=False)
     """Probability of completing, from each marking."""
     y: Values = field(repr=False)
@@ -33,7 +38,7 @@ class Completion:
     z: Values = field(repr=False)
     """E[T^2; complete] from each marking (s^2)."""
     residual: float
-    """Largest error of the three equations, relative to their largest value."""
+    """Largest error of the three equations, relative to their largest values."""
 
     @property
     def probability(self) -> float:
@@ -42,19 +47,19 @@ class Completion:
 
     @property
     def mean(self) -> float:
-        """Mean time to completion, given completion (s); nan if it is impossible."""
+        """Mean time to completion (s), given completion; nan if the task cannot complete."""
         return float(self.y[0] / self.h[0]) if self.h[0] else float("nan")
 
     @property
     def variance(self) -> float:
-        """Variance of the time to completion, given completion (s^2)."""
+        """Variance of the time to completion (s^2), given completion; nan if it is impossible."""
         return max(0.0, float(self.z[0] / self.h[0]) - self.mean**2) if self.h[0] else float("nan")
 
 
 def completion(chain: Chain, goal: Mask) -> Completion:
-    """Time and probability of reaching a marking of `goal` (shape (n,)) for the first time."""
+    """Return time and probability of first reaching a marking of `goal` (mask of shape (n,))."""
     inside = chain.graph.backward(goal) & ~goal
-    plan = Plan.of(chain.graph, inside)
+    plan = SolveOrder.of(chain.graph, inside)
     open_ = inside[chain.source]
     value = np.where(open_ & inside[chain.target], chain.probability, 0.0)
     direct = open_ & goal[chain.target]
@@ -85,28 +90,32 @@ def _error(chain: Chain, value: Values, x: Values, b: Values) -> float:
 
 
 LOOK = 16
-"""Jumps between two looks at how much is still to come."""
+"""Jumps between two checks of how much probability is still to come."""
 
 
 @dataclass(frozen=True)
-class Law:
-    """The distribution of the time to completion: after k uniform jumps at `rate` the goal is
-    reached with absorbed[k]."""
+class CompletionTime:
+    """Distribution of the time to completion, by uniformisation.
+
+    Jumps occur as a Poisson process of `rate` (1/s); absorbed[k] is the probability that the goal
+    is reached within k jumps. Source: W. K. Grassmann, Transient solutions in Markovian queueing
+    systems, Comput. Oper. Res. 4 (1977).
+    """
 
     rate: float
     absorbed: Values
     probability: float
 
     def cdf(self, time: float) -> float:
-        """P(T <= time | complete)."""
+        """Return P(T <= time | complete), with time in s."""
         low, weight = poisson_weights(self.rate * time)
         k = np.minimum(np.arange(low, low + len(weight)), len(self.absorbed) - 1)
         return min(1.0, float(weight @ self.absorbed[k]) / self.probability)
 
     def quantile(self, q: float) -> float:
-        """The time t (s) with P(T <= t | complete) = q, 0 < q < 1."""
+        """Return the time t (s) with P(T <= t | complete) = q, 0 < q < 1."""
         if not 0 < q < 1:
-            raise ValueError(f"a quantile needs 0 < q < 1, not {q}")
+            raise ValueError(f"quantile: expected 0 < q < 1, got {q}")
         low, high = 0.0, 1.0 / self.rate
         while self.cdf(high) < q:
             low, high = high, 2 * high
@@ -118,10 +127,12 @@ class Law:
         return 0.5 * (low + high)
 
 
-def law(chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000) -> Law:
-    """The law of the time to completion. `left` is the share of completing runs still under way
-    where it is cut off.
+def completion_time(
+    chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000
+) -> CompletionTime:
+    """Return the distribution of the time to completion.
 
+    The computation stops when a share of at most `left` of the completing runs is still active.
     Raises ArithmeticError if that takes more than `steps` jumps.
     """
     whole = completion(chain, goal)
@@ -131,22 +142,23 @@ def law(chain: Chain, goal: Mask, *, left: float = 1e-12, steps: int = 2_000_000
     made = Generator.of(ends)
     reached = goal[made.tangible]
     p, absorbed = made.start, [float(made.start[reached].sum())]
-    # what is still to come is weighed by itself: as a difference of sums it would never fall below
-    # their rounding
+    # What is still to come is summed directly. As the difference 1 - absorbed it would never become
+    # smaller than rounding errors.
     ahead = np.where(reached, 0.0, whole.h[made.tangible])
     while (len(absorbed) - 1) % LOOK or float(np.sum(p * ahead)) > left * whole.probability:
         if len(absorbed) > steps:
             raise ArithmeticError(
-                f"the law of completion needs more than {steps} jumps; simulate instead"
+                f"the distribution of the completion time needs more than {steps} jumps; "
+                "simulate instead"
             )
         p = made.matrix @ p
         absorbed.append(float(p[reached].sum()))
-    return Law(made.rate, np.array(absorbed), whole.probability)
+    return CompletionTime(made.rate, np.array(absorbed), whole.probability)
 
 
 def _open_edges(
     chain: Chain, whole: Completion
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Values]:
-    """The chain's edges out of markings that are not yet complete but still can be."""
+    """Return the edges of the chain that leave markings which can still complete."""
     going = (~whole.goal & (whole.h > 0))[chain.source]
     return chain.source[going], chain.target[going], chain.label[going], chain.amount[going]

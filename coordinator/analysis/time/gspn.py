@@ -1,14 +1,14 @@
-"""Generalized stochastic Petri nets and the Markov chain behind them.
+"""Generalized stochastic Petri nets (GSPN) and their Markov chains.
 
-A GSPN is a net whose transitions are timed (exponential, rate 1/s, one, k or unlimited servers) or
-immediate (weight, and the net's priorities; every immediate one ranks above every timed one).
-Source: M. Ajmone Marsan, G. Balbo, G. Conte et al., Modelling with Generalized Stochastic Petri
-Nets, Wiley 1995.
+The transitions of a GSPN are timed (exponential delay, rate in 1/s; one, k or unlimited servers) or
+immediate (weight and priority; immediate ones always fire before timed ones). Source: M. Ajmone
+Marsan, G. Balbo, G. Conte et al., Modelling with Generalized Stochastic Petri Nets, Wiley 1995.
 
-The chain is kept in its extended form, vanishing markings included with sojourn time 0: each edge e
-of marking i carries an amount r_e (rate times servers at work, or weight) and is taken with
-probability r_e / sum of the marking's amounts. So steady states, completion times and derivatives
-need no elimination, and flows through immediate transitions come for free.
+A marking that enables an immediate transition is *vanishing*: no time passes in it. All others are
+*tangible*. Textbooks eliminate vanishing markings; here the chain keeps them, with sojourn time 0.
+Each edge e carries an amount r_e (rate times busy servers, or weight) and is taken with probability
+r_e / sum of the amounts of its marking. So long run, completion times and derivatives need no
+elimination, and the flow through immediate transitions is known without extra work.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.graph import Graph, Index, Mask, sum_by
-from petrobot.coordinator.analysis.net.space import Limits, Space, explore
+from petrobot.coordinator.analysis.net.space import SearchLimits, Space, explore
 from petrobot.coordinator.task.net import Marking, Net
 
 Values = NDArray[np.float64]
 
 
 class TimelessTrap(ValueError):  # noqa: N818 - names what was found in the net
-    """Immediate transitions fire for ever and time never passes."""
+    """From some marking immediate transitions fire for ever, and time never passes again."""
 
 
 @dataclass(frozen=True)
 class Gspn:
     """A net with a rate or a weight for each transition.
 
-    `rate[t]` (1/s) is None for an immediate transition, whose `weight[t]` counts among those
-    enabled with it. `servers[t]` is how many firings of a timed transition go on at once: 1, k, or
-    None for as many as are enabled. Timed transitions have priority 0 and immediate ones at least 1
-    in `net`.
+    `rate[t]` (1/s) is None for an immediate transition, which is chosen with a probability
+    proportional to `weight[t]` among those enabled with it. `servers[t]` is how many firings of a
+    timed transition can be active at once: 1, k, or None for as many as it is enabled. In `net`,
+    timed transitions have priority 0 and immediate ones at least 1.
     """
 
     net: Net
@@ -47,16 +47,16 @@ class Gspn:
     servers: tuple[int | None, ...]
 
     def __post_init__(self) -> None:
-        """Refuse rates, weights and priorities that mean nothing."""
+        """Refuse rates, weights, priorities and servers without a meaning."""
         count = len(self.net.transitions)
         if not len(self.rate) == len(self.weight) == len(self.servers) == count:
             raise ValueError("rates, weights and servers need one entry for each transition")
         for t, name in enumerate(self.net.transitions):
             rate, weight = self.rate[t], self.weight[t]
             if rate is not None and not 0 < rate < float("inf"):
-                raise ValueError(f"{name} has the rate {rate}; a rate is positive and finite (1/s)")
+                raise ValueError(f"{name}: expected a positive, finite rate (1/s), got {rate}")
             if rate is None and not 0 < weight < float("inf"):
-                raise ValueError(f"{name} has the weight {weight}; a weight is positive and finite")
+                raise ValueError(f"{name}: expected a positive, finite weight, got {weight}")
             if (rate is None) != (self.net.priority[t] > 0):
                 raise ValueError(
                     f"{name}: timed transitions have priority 0, immediate ones 1 or more"
@@ -78,16 +78,16 @@ class Gspn:
         weights: Mapping[str, float] | None = None,
         servers: Mapping[str, int | None] | None = None,
     ) -> Gspn:
-        """Name the timed transitions with their rates; all others are immediate (weight 1, and
-        above the timed ones).
+        """Build a GSPN from the rates of the timed transitions; all others become immediate.
 
-        The net's own priorities order the immediate transitions; they are raised together if the
-        lowest is below 1.
+        A weight is 1 and a transition has one server unless given. The net's own priorities order
+        the immediate transitions; all are raised equally if the lowest is below 1. Raises
+        ValueError.
         """
         for given in (rates, weights or {}, servers or {}):
             unknown = [name for name in given if name not in net.transition_index]
             if unknown:
-                raise ValueError(f"{unknown[0]!r} is no transition of the net")
+                raise ValueError(f"{unknown[0]!r} is not a transition of the net")
         immediate = [
             own for t, own in zip(net.transitions, net.priority, strict=True) if t not in rates
         ]
@@ -106,30 +106,33 @@ class Gspn:
     def changed(
         self, rates: Mapping[str, float] | None = None, weights: Mapping[str, float] | None = None
     ) -> Gspn:
-        """What if: the same GSPN with some rates (of timed) and weights (of immediate transitions)
-        replaced."""
+        """Return the GSPN with some rates (of timed) and weights (of immediate transitions)
+        changed.
+
+        Raises ValueError for a rate of an immediate or a weight of a timed transition.
+        """
         rate, weight = list(self.rate), list(self.weight)
         for name, value in (rates or {}).items():
             t = self.net.transition_index[name]
             if rate[t] is None:
-                raise ValueError(f"{name} is immediate; it has a weight, no rate")
+                raise ValueError(f"{name} is immediate: it has a weight, not a rate")
             rate[t] = float(value)
         for name, value in (weights or {}).items():
             t = self.net.transition_index[name]
             if rate[t] is not None:
-                raise ValueError(f"{name} is timed; it has a rate, no weight")
+                raise ValueError(f"{name} is timed: it has a rate, not a weight")
             weight[t] = float(value)
         return replace(self, rate=tuple(rate), weight=tuple(weight))
 
     def marked(self, tokens: Mapping[str, int]) -> Gspn:
-        """What if: the same GSPN with other initial tokens in some places."""
+        """Return the GSPN with other initial tokens in some places."""
         initial = list(self.net.initial)
         for name, n in tokens.items():
             initial[self.net.place_index[name]] = n
         return replace(self, net=replace(self.net, initial=tuple(initial)))
 
     def degree(self, marking: Marking, t: int) -> int:
-        """How many servers of an enabled timed transition are at work in a marking."""
+        """Return how many servers of an enabled timed transition are busy in a marking."""
         servers = self.servers[t]
         if servers == 1 or not self.net.consume[t]:
             return 1
@@ -139,11 +142,10 @@ class Gspn:
 
 @dataclass(frozen=True)
 class Chain:
-    """The extended Markov chain of a GSPN over its reachable markings (vanishing ones included),
-    from marking 0.
+    """The Markov chain of a GSPN over its reachable markings, vanishing ones included.
 
-    Edges are sorted by source. `amount[e]` is a rate (1/s) where the source is tangible and a
-    weight where it vanishes. Absorbing markings have no edges.
+    It starts in marking 0. Edges are sorted by source. `amount[e]` is a rate (1/s) if the source is
+    tangible, and a weight if it is vanishing. Absorbing markings have no edges.
     """
 
     gspn: Gspn
@@ -160,12 +162,13 @@ class Chain:
         gspn: Gspn,
         *,
         space: Space | None = None,
-        limits: Limits | None = None,
+        limits: SearchLimits | None = None,
         absorbing: Callable[[Marking], bool] | None = None,
     ) -> Chain:
-        """The chain behind a GSPN; its space is explored unless given.
+        """Return the chain of a GSPN; its space is explored unless given.
 
-        Raises ValueError if the space is not complete (simulate instead) and TimelessTrap.
+        Markings in which `absorbing` holds keep no edges. Raises ValueError if the space is not
+        complete (then simulate), and TimelessTrap.
         """
         space = space or explore(gspn.net, limits=limits)
         if not space.complete:
@@ -199,6 +202,7 @@ class Chain:
         return chain
 
     def _refuse_traps(self) -> None:
+        """Raise TimelessTrap for a vanishing marking from which no tangible one is reachable."""
         if not self.vanishing.any():
             return
         trapped = self.vanishing & ~self.graph.backward(~self.vanishing)
@@ -207,8 +211,8 @@ class Chain:
             names = sorted({self.gspn.net.transitions[t] for t in self.label[trapped[self.source]]})
             where = self.gspn.net.describe(self.space.marking(first))
             raise TimelessTrap(
-                f"time never passes again from {where}: {', '.join(names)} fire for ever; "
-                "give one a rate"
+                f"from {where} time never passes again: {', '.join(names)} fire for ever without "
+                "delay; give one of them a rate"
             )
 
     @property
@@ -218,7 +222,7 @@ class Chain:
 
     @cached_property
     def graph(self) -> Graph:
-        """The chain's edges as a graph."""
+        """The edges of the chain as a graph."""
         return Graph(self.n, self.source, self.target)
 
     @cached_property
@@ -228,14 +232,14 @@ class Chain:
 
     @cached_property
     def probability(self) -> Values:
-        """Probability that each edge is the one taken from its source, shape (edges,)."""
+        """Probability of each edge among those of its source, shape (edges,)."""
         out: Values = self.amount / self.total[self.source]
         return out
 
     @cached_property
     def sojourn(self) -> Values:
-        """Mean time in each marking (s): 0 where it vanishes, infinite where it absorbs, shape
-        (n,)."""
+        """Mean sojourn time in each marking (s), shape (n,): 0 in vanishing markings, infinite in
+        absorbing ones."""
         out = np.full(self.n, np.inf)
         tangible = self.total > 0
         out[tangible] = 1.0 / self.total[tangible]
@@ -249,7 +253,7 @@ class Chain:
 
 
 def _degrees(gspn: Gspn, space: Space, label: Index) -> Values:
-    """Servers at work on each edge."""
+    """Return the number of busy servers for each edge."""
     degree = np.ones(len(label))
     for t, servers in enumerate(gspn.servers):
         if servers == 1 or gspn.rate[t] is None or not gspn.net.consume[t]:

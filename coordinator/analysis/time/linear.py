@@ -1,11 +1,14 @@
-"""Linear systems of Markov chains: x = b + A x in the order of strong components, and stationary
-vectors.
+"""Linear systems of Markov chains: x = b + A x, and stationary vectors nu = nu A.
 
-A is given by its edges: x_i = b_i + sum over edges e of i of a_e x_(target of e). Most robot tasks
-use runs up, so their graphs are long chains of small components: these are solved level by level,
-each component by itself (dense where small, Gauss-Seidel with a triangular factor where large).
-Stationary vectors: Grassmann-Taksar-Heyman elimination, which subtracts nothing and so loses no
-digits (W. K. Grassmann, M. I. Taksar, D. P. Heyman, Oper. Res. 33, 1985), or Gauss-Seidel.
+A is given by the edges of a graph: x_i = b_i + sum over the edges e of i of a_e x_(target of e).
+
+Most robot tasks use up their runs, so their graphs are long sequences of small strong components.
+The components are solved in that order, successors first: small ones by dense elimination, large
+ones by Gauss-Seidel.
+
+Stationary vectors of up to DENSE vertices come from Grassmann-Taksar-Heyman (GTH) elimination. It
+contains no subtraction, so no digits cancel (W. K. Grassmann, M. I. Taksar, D. P. Heyman, Oper.
+Res. 33, 1985). Larger ones come from Gauss-Seidel.
 """
 
 from __future__ import annotations
@@ -21,27 +24,32 @@ from petrobot.coordinator.analysis.time.gspn import Values
 DENSE = 600
 """Vertices up to which a component is solved by dense elimination."""
 SWEEPS = 20_000
+"""The most sweeps of Gauss-Seidel."""
 TOLERANCE = 1e-14
+"""Largest change in a sweep, relative to the largest entry, at which the iteration stops."""
 
 
 class NotConverged(ArithmeticError):  # noqa: N818 - a fact about an iteration
-    """An iteration did not reach its tolerance; the message gives the residual that it reached."""
+    """An iteration did not reach its tolerance; the message says how far it came."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """The order in which the components of a graph are solved: successors first. Built once, used
-    for many sides."""
+class SolveOrder:
+    """The order in which the strong components of a graph are solved: successors first.
+
+    Built once and used for many right-hand sides.
+    """
 
     graph: Graph
     waves: tuple[tuple[Index, tuple[Index, ...]], ...]
-    """Each wave: vertices that are components of their own, and the larger components, as vertex
-    numbers."""
+    """Waves of vertices that do not depend on each other: (single vertices, larger components).
+
+    A wave depends only on earlier waves, so its single vertices are solved in one numpy operation.
+    """
 
     @classmethod
-    def of(cls, graph: Graph, inside: Mask | None = None) -> Plan:
-        """The plan for the vertices marked `inside` (all by default); others count as known
-        zeros."""
+    def of(cls, graph: Graph, inside: Mask | None = None) -> SolveOrder:
+        """Return the order for the vertices in `inside` (by default all); the others count as 0."""
         keep = np.ones(graph.n, dtype=np.bool_) if inside is None else inside
         component = graph.components
         ours, theirs = component[graph.source], component[graph.target]
@@ -61,7 +69,7 @@ def _sorted_edges(source: Any, target: Any) -> tuple[Any, Any]:
 
 
 def _waves(outer: Graph) -> Index:
-    """Length of the longest way out of each vertex of an acyclic graph."""
+    """Return the length of the longest path from each vertex of an acyclic graph."""
     left = np.diff(outer.row)
     first, order = outer.into
     wave = np.zeros(outer.n, dtype=np.int64)
@@ -78,7 +86,7 @@ def _waves(outer: Graph) -> Index:
 def _split(
     members: Index, component: Any, wave: Index, loops: Mask
 ) -> list[tuple[Index, tuple[Index, ...]]]:
-    """Members, sorted by wave and component, as waves of single vertices and larger components."""
+    """Split the vertices, sorted by wave and component, into waves."""
     waves = []
     for part in np.split(members, np.flatnonzero(np.diff(wave[component[members]])) + 1):
         if not len(part):
@@ -92,9 +100,8 @@ def _split(
     return waves
 
 
-def solve(plan: Plan, value: Values, b: Values) -> Values:
-    """x = b + A x with A given by `value` on the plan's edges; b and x have shape (n,) or (n,
-    k)."""
+def solve(plan: SolveOrder, value: Values, b: Values) -> Values:
+    """Solve x = b + A x, with A given by `value` on the edges; b and x of shape (n,) or (n, k)."""
     graph = plan.graph
     x = np.zeros_like(b, dtype=np.float64)
     for single, groups in plan.waves:
@@ -106,7 +113,7 @@ def solve(plan: Plan, value: Values, b: Values) -> Values:
 
 
 def _gather(graph: Graph, value: Values, x: Values, vertices: Index) -> Values:
-    """Sum of value * x over the edges of each vertex."""
+    """Return the sum of value * x over the edges of each vertex."""
     first, last = graph.row[vertices], graph.row[vertices + 1]
     edges = ranges(first, last)
     terms = (value[edges] * x[graph.target[edges]].T).T
@@ -117,9 +124,8 @@ def _gather(graph: Graph, value: Values, x: Values, vertices: Index) -> Values:
 
 
 def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index) -> None:
-    """Solve one component; what it leads to is known already and the component itself still stands
-    at zero."""
-    x[group] = 0.0
+    """Solve one component in place; everything that it leads to is known already."""
+    x[group] = 0.0  # so that _gather adds only what comes from other components
     right = b[group] + _gather(graph, value, x, group)
     edges = ranges(graph.row[group], graph.row[group + 1])
     number = np.full(graph.n, -1, dtype=np.int64)
@@ -135,8 +141,11 @@ def _solve_group(graph: Graph, value: Values, x: Values, b: Values, group: Index
 
 
 def triangular(n: int, rows: Index, columns: Index, value: Values) -> tuple[Any, Any]:
-    """(solver of I - upper part, lower part) of a sparse matrix: one backward Gauss-Seidel
-    sweep."""
+    """Return (solver of I - upper part, lower part): the two halves of a Gauss-Seidel sweep.
+
+    The upper part is triangular already. scipy's LU without reordering and pivoting turns it into
+    a compiled triangular solver.
+    """
     from scipy.sparse import csc_array, csr_array, eye_array
     from scipy.sparse.linalg import splu
 
@@ -150,11 +159,11 @@ def triangular(n: int, rows: Index, columns: Index, value: Values) -> tuple[Any,
 
 
 def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) -> Values:
-    """x = right + A x by backward Gauss-Seidel: successors mostly have higher numbers, so news
-    travels in one sweep.
+    """Solve x = right + A x by backward Gauss-Seidel.
 
-    Where that is slow, the part of the error that is nearly constant over blocks of neighbours is
-    solved for now and then.
+    Backward, because successors mostly have higher numbers (breadth-first), so one sweep carries a
+    change through the whole component. Where that converges slowly, a coarse step (see Coarse)
+    removes the part of the error that is nearly constant over blocks of neighbours.
     """
     factor, lower = triangular(n, rows, columns, value)
     coarse, x = Coarse(n, rows, columns), factor.solve(right)
@@ -173,11 +182,12 @@ def _sweep(n: int, rows: Index, columns: Index, value: Values, right: Values) ->
 
 
 def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
-    """The probability vector nu = nu P of an irreducible stochastic matrix given by its entries.
+    """Return the probability vector nu = nu P of an irreducible stochastic matrix P.
 
-    Gauss-Seidel, with aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F.
-    McAllister, W. J. Stewart, Iterative methods for computing stationary distributions, SIAM J.
-    Alg. Disc. Meth. 5, 1984).
+    P is given by its entries. Small ones by GTH elimination, others by Gauss-Seidel with
+    aggregation over blocks of neighbours where it is slow (J. R. Koury, D. F. McAllister, W. J.
+    Stewart, Iterative methods for computing stationary distributions, SIAM J. Alg. Disc. Meth. 5,
+    1984). Raises NotConverged.
     """
     if n == 1:
         return np.ones(1)
@@ -185,7 +195,8 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
         matrix = np.zeros((n, n))
         np.add.at(matrix, (rows, columns), value)
         return gth(matrix)
-    # The transposed matrix with numbers turned round makes the backward sweep a forward one.
+    # nu = nu P is a system with the transposed matrix. Reversing the numbers as well makes the
+    # backward sweep run forward along the edges.
     factor, lower = triangular(n, n - 1 - columns, n - 1 - rows, value)
     coarse, x = Coarse(n, n - 1 - rows, n - 1 - columns), np.full(n, 1.0 / n)
     for k in range(SWEEPS):
@@ -204,34 +215,40 @@ def stationary(n: int, rows: Index, columns: Index, value: Values) -> Values:
 
 
 class Coarse:
-    """Vertices in blocks of consecutive numbers, neighbours in breadth-first order, for systems
-    that converge slowly."""
+    """Aggregation for systems on which Gauss-Seidel converges slowly.
+
+    Vertices are grouped into blocks of consecutive numbers, which are neighbours in breadth-first
+    order. A small system over the blocks finds the error that is constant within each block; this
+    is the part that sweeps remove slowest (as in multigrid methods).
+    """
 
     PATIENCE, EVERY, BLOCKS = 60, 5, 128
+    """Sweeps before the first coarse step, sweeps between two of them, number of blocks."""
 
     def __init__(self, n: int, rows: Index, columns: Index) -> None:
-        """Entries are (rows, columns); the blocks are equally large."""
+        """Assign n vertices to blocks of equal size; the entries of the matrix are (rows,
+        columns)."""
         self.count = min(self.BLOCKS, n)
         self.block = np.arange(n) * self.count // n
         self.rows, self.pair = rows, self.block[rows] * self.count + self.block[columns]
 
     def is_due(self, sweep: int) -> bool:
-        """Whether a coarse step follows this sweep."""
+        """Return whether a coarse step follows this sweep."""
         return sweep >= self.PATIENCE and sweep % self.EVERY == 0
 
     def _matrix(self, weights: Values) -> Values:
         return sum_by(self.pair, weights, self.count**2).reshape(self.count, self.count)
 
     def scale(self, value: Values, x: Values) -> Values:
-        """By how much each vertex' block is off, up to a common factor, for a stationary vector:
-        the chain of the blocks
+        """Return the factor that corrects the block of each vertex, for a stationary vector x.
 
-        has the probabilities flow(I, J) / sum of x over I, so its stationary vector over these sums
-        is that of the flows.
+        The chain of blocks has the transition probabilities flow(I, J) / sum of x over I. Its
+        stationary vector divided by these sums is the stationary vector of the flow matrix itself,
+        so GTH runs on the flows directly. The factors are correct up to a common factor.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             factor = gth(self._matrix(value * x[self.rows]))
-        # A block whose probability underflows has no flow to judge by: then the sweeps go on alone.
+        # A block whose probability underflows has no flow: then continue with sweeps alone.
         return (
             np.asarray(factor[self.block])
             if np.isfinite(factor).all() and factor.min() > 0
@@ -239,10 +256,10 @@ class Coarse:
         )
 
     def inverse(self, value: Values, pinned: bool = False) -> Values:
-        """The inverse of I - A seen from the blocks, for `correction`.
+        """Return the inverse of I - A aggregated over the blocks, for `correction`.
 
-        `pinned` for a stochastic A: the first block keeps its values, since a solution is then free
-        up to a constant.
+        `pinned` is for a stochastic A, where solutions differ by a constant: the first block keeps
+        its values.
         """
         size, first = np.bincount(self.block, minlength=self.count), int(pinned)
         matrix = np.diag(size.astype(float)) - self._matrix(value)
@@ -251,14 +268,18 @@ class Coarse:
         return out
 
     def correction(self, inverse: Values, left: Values) -> Values:
-        """What to add to a solution of x = right + A x whose residual is `left`: constant over each
-        block."""
+        """Return what to add to x, constant over each block, if x = right + A x has the residual
+        `left`."""
         return np.asarray((inverse @ sum_by(self.block, left, self.count))[self.block])
 
 
 def gth(matrix: Values) -> Values:
-    """The stationary vector of an irreducible stochastic matrix or generator, shape (n, n), without
-    a subtraction."""
+    """Return the stationary vector of an irreducible stochastic matrix or generator.
+
+    GTH elimination. The last state is removed and its flow is passed on to the others, in
+    proportion to where it goes; then the probabilities are computed from the first state upwards.
+    The diagonal, which would need subtractions, is never used.
+    """
     work = matrix.copy()
     n = len(work)
     for k in range(n - 1, 0, -1):

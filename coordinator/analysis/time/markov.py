@@ -1,9 +1,8 @@
-"""The long run of a GSPN: stationary probabilities, throughput, mean tokens, utilisation,
-bottleneck; and the transient.
+"""The long run of a GSPN (throughput, mean tokens, utilisation) and its transient behaviour.
 
-Each number comes with the residual of the equation that it solves. From the initial marking the
-long run is the mixture of the bottom components' stationary vectors, weighted by the probabilities
-of ending up in each.
+In the long run the chain stays in one of the bottom components of its graph. Seen from the initial
+marking, the long run is the mixture of their stationary vectors, weighted with the probabilities of
+ending in each. The result carries the residual of its balance equations.
 """
 
 from __future__ import annotations
@@ -18,16 +17,15 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Graph, Index, sum_by
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import Plan, solve, stationary
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve, stationary
 
 
 @dataclass(frozen=True)
 class LongRun:
     """Stationary behaviour from the initial marking.
 
-    `probability[i]` is the share of time in marking i (0 where it vanishes), `flow[e]` how often
-    edge e is taken (1/s) and `residual` the largest imbalance of flow into and out of a marking
-    (1/s).
+    `probability[i]` is the share of time in marking i (0 if vanishing), `flow[e]` the frequency of
+    edge e (1/s), `residual` the largest difference of flow into and out of a marking (1/s).
     """
 
     chain: Chain
@@ -53,8 +51,10 @@ class LongRun:
 
     @cached_property
     def occupancy(self) -> dict[str, float]:
-        """Share of time in which each place is marked: the utilisation of a resource is 1 minus
-        that of its free place."""
+        """Share of time in which each place is marked.
+
+        The utilisation of a resource is 1 minus the share of the place that holds it while free.
+        """
         space = self.chain.space
         return {
             name: float(self.probability @ (space.tokens(p) > 0))
@@ -63,8 +63,7 @@ class LongRun:
 
     @cached_property
     def utilisation(self) -> dict[str, float]:
-        """Mean number of servers at work of each timed transition (its load; below 1 with a single
-        server)."""
+        """Mean number of busy servers of each timed transition (with one server: its load)."""
         rates = self.chain.gspn.rate
         return {
             name: self.throughput[name] / r
@@ -75,15 +74,16 @@ class LongRun:
     def reward(
         self, state: Values | None = None, impulse: Mapping[str, float] | None = None
     ) -> float:
-        """Mean reward per second: `state[i]` per second in marking i, plus so much at each firing
-        of a transition."""
+        """Return a mean reward per second.
+
+        `state[i]` is earned per second in marking i, `impulse[t]` at each firing of transition t.
+        """
         total = float(self.probability @ state) if state is not None else 0.0
         return total + sum(gain * self.throughput[name] for name, gain in (impulse or {}).items())
 
 
 def long_run(chain: Chain) -> LongRun:
-    """Stationary behaviour. An absorbing (dead) marking that is reached counts as a place to stay
-    for ever."""
+    """Return the stationary behaviour. The chain stays in an absorbing (dead) marking for ever."""
     graph = chain.graph
     visits = np.zeros(chain.n)
     time = np.zeros(chain.n)
@@ -103,7 +103,7 @@ def long_run(chain: Chain) -> LongRun:
 
 
 def _embedded(chain: Chain, members: Index) -> Values:
-    """Stationary vector of the jump chain of one bottom component."""
+    """Return the stationary vector of the jump chain of one bottom component."""
     number = np.full(chain.n, -1, dtype=np.int64)
     number[members] = np.arange(len(members))
     edges = np.flatnonzero(number[chain.source] >= 0)
@@ -116,7 +116,7 @@ def _embedded(chain: Chain, members: Index) -> Values:
 
 
 def _absorption(chain: Chain) -> dict[int, float]:
-    """Probability of ending up in each bottom component that can be reached."""
+    """Return the probability of ending in each bottom component that can be reached."""
     graph = chain.graph
     bottoms = np.flatnonzero(graph.bottom)
     if len(bottoms) == 1:
@@ -132,20 +132,22 @@ def _absorption(chain: Chain) -> dict[int, float]:
 
 
 def visits_before(chain: Chain, transient: Any, start: Values | None = None) -> Values:
-    """Expected visits to each transient marking (adjoint solve): v = start + v A, by default from
-    the initial marking."""
+    """Return the expected visits to each transient marking: v = start + v A (adjoint solve).
+
+    By default the chain starts in the initial marking.
+    """
     order = np.argsort(chain.target, kind="stable")
     backward = Graph(chain.n, chain.target[order], chain.source[order])
     begin = np.zeros(chain.n)
     begin[0] = 1.0
     inside = transient[chain.source[order]] & transient[chain.target[order]]
     value = np.where(inside, chain.probability[order], 0.0)
-    return solve(Plan.of(backward, transient), value, begin if start is None else start)
+    return solve(SolveOrder.of(backward, transient), value, begin if start is None else start)
 
 
 @dataclass(frozen=True)
 class Generator:
-    """The chain over tangible markings only, ready for uniformisation: P = I + Q / rate."""
+    """The chain over tangible markings only, uniformised: P = I + Q / rate, Q its generator."""
 
     chain: Chain
     tangible: Index
@@ -156,8 +158,7 @@ class Generator:
 
     @classmethod
     def of(cls, chain: Chain) -> Generator:
-        """Eliminate the vanishing markings: flows through them are followed level by level, cycles
-        solved for."""
+        """Eliminate the vanishing markings, since uniformisation needs a sojourn time above 0."""
         from scipy.sparse import csr_array, eye_array
 
         tangible = chain.tangible
@@ -182,8 +183,12 @@ class Generator:
 
 
 def _jumps(chain: Chain) -> Any:
-    """Probability of entering each tangible marking next, from each marking (identity for tangible
-    ones), sparse (n, n)."""
+    """Return the probability of each tangible marking to be the next one, from each marking.
+
+    Sparse, shape (n, n); the identity for tangible markings. Probability is pushed through the
+    vanishing markings step by step until none is left there. Cycles among them are removed first,
+    so the number of steps is bounded by the longest path of vanishing markings.
+    """
     from scipy.sparse import csr_array, eye_array
 
     eye = csr_array(eye_array(chain.n, format="csr"))
@@ -216,8 +221,11 @@ def _jumps(chain: Chain) -> Any:
 
 
 def _without_cycles(chain: Chain, step: Any) -> Any:
-    """The steps out of vanishing markings with every cycle among them replaced by its exits (LU of
-    each component)."""
+    """Return the steps out of vanishing markings, with every cycle replaced by what it leads to.
+
+    For a strong component with the matrix W inside and R to the outside, the probabilities of
+    leaving it are (I - W)^-1 R.
+    """
     from scipy.sparse import csr_array
 
     inner = np.flatnonzero(chain.vanishing[chain.source] & chain.vanishing[chain.target])
@@ -239,8 +247,12 @@ def _without_cycles(chain: Chain, step: Any) -> Any:
 
 
 def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
-    """(first k, probabilities from there on) of a Poisson law, with less than epsilon left out on
-    both sides."""
+    """Return (first k, probabilities from there on) of a Poisson distribution.
+
+    Less than `epsilon` is left out on both sides. Starting at the mode and multiplying outwards
+    avoids overflow and underflow of mean^k / k!. Source: B. L. Fox, P. W. Glynn, Computing Poisson
+    probabilities, Commun. ACM 31 (1988).
+    """
     if mean == 0:
         return 0, np.ones(1)
     reach = ceil(sqrt(mean) * sqrt(-2 * log(epsilon)) + 10 - log(epsilon))
@@ -257,14 +269,16 @@ def poisson_weights(mean: float, epsilon: float = 1e-13) -> tuple[int, Values]:
 
 
 def transient(chain: Chain, times: list[float], *, generator: Generator | None = None) -> Values:
-    """Probabilities of the tangible markings at the given times (s), by uniformisation: shape
-    (times, n); 0 if vanishing."""
+    """Return the probabilities of the markings at the given times (s), shape (times, n).
+
+    By uniformisation; vanishing markings have probability 0.
+    """
     made = generator or Generator.of(chain)
-    laws = [poisson_weights(made.rate * t) for t in times]
+    jumps = [poisson_weights(made.rate * t) for t in times]
     out = np.zeros((len(times), chain.n))
     p = made.start
-    for k in range(max(low + len(w) for low, w in laws)):
-        for i, (low, weight) in enumerate(laws):
+    for k in range(max(low + len(w) for low, w in jumps)):
+        for i, (low, weight) in enumerate(jumps):
             if low <= k < low + len(weight):
                 out[i, made.tangible] += weight[k - low] * p
         p = made.matrix @ p

@@ -1,10 +1,15 @@
-"""Durations as phases: Erlang mixtures and hyper-exponential laws fitted to a mean and a variance.
+"""Duration distributions made of exponential phases, fitted to a mean and a variance.
 
-cv^2 <= 1: a mixture of Erlang laws of k - 1 and k stages with one rate, which meets both moments
-exactly for any 1 / k <= cv^2 <= 1 / (k - 1). cv^2 > 1: two exponentials with balanced means.
-Source: H. C. Tijms, Stochastic Models: An Algorithmic Approach, Wiley 1994, section A.4. Where the
-wanted stages exceed a limit, the mean is kept and the variance is too large; the error at the 90 %
-quantile says what that costs.
+A Markov chain knows only exponential durations, so other durations are built from several phases.
+With cv the coefficient of variation (standard deviation / mean):
+
+- cv^2 <= 1: a mixture of Erlang distributions of k - 1 and k stages with the same rate. It meets
+  both moments exactly for 1 / k <= cv^2 <= 1 / (k - 1).
+- cv^2 > 1: two exponential branches with balanced means (hyper-exponential).
+
+Source: H. C. Tijms, Stochastic Models: An Algorithmic Approach, Wiley 1994, section A.4. If cv^2
+asks for more stages than allowed, the mean is kept and the variance is too large; the error of the
+90 % quantile says by how much.
 """
 
 from __future__ import annotations
@@ -16,12 +21,12 @@ from math import ceil, exp, sqrt
 import numpy as np
 
 STAGES = 64
-"""Stages allowed for one duration unless told otherwise."""
+"""Default limit of the stages of one duration."""
 
 
 @dataclass(frozen=True, slots=True)
-class Branch:
-    """With `probability`, `stages` exponential phases of `rate` (1/s) one after the other."""
+class ErlangBranch:
+    """Taken with `probability`: `stages` exponential phases of `rate` (1/s) in a row."""
 
     probability: float
     stages: int
@@ -30,10 +35,12 @@ class Branch:
 
 @dataclass(frozen=True, slots=True)
 class PhaseType:
-    """A duration: `shift` (s) and then one of the branches. A Markov chain can only hold laws with
-    shift 0."""
+    """A duration distribution: `shift` (s), then one of the branches.
 
-    branches: tuple[Branch, ...]
+    A Markov chain can represent it only if the shift is 0.
+    """
+
+    branches: tuple[ErlangBranch, ...]
     shift: float = 0.0
 
     @property
@@ -48,7 +55,7 @@ class PhaseType:
         return second - (self.mean - self.shift) ** 2
 
     def cdf(self, time: float) -> float:
-        """P(T <= time)."""
+        """Return P(T <= time), with time in s."""
         if time <= self.shift:
             return 0.0
         return sum(
@@ -57,9 +64,9 @@ class PhaseType:
         )
 
     def quantile(self, q: float) -> float:
-        """The time (s) by which a share q of the durations is over, 0 < q < 1."""
+        """Return the time (s) within which a share q of the durations ends, 0 < q < 1."""
         if not 0 < q < 1:
-            raise ValueError(f"a quantile needs 0 < q < 1, not {q}")
+            raise ValueError(f"quantile: expected 0 < q < 1, got {q}")
         low, high = self.shift, self.shift + max(b.stages / b.rate for b in self.branches)
         while self.cdf(high) < q:
             low, high = high, 2 * high
@@ -69,15 +76,16 @@ class PhaseType:
         return 0.5 * (low + high)
 
     def error_at_90(self, quantile: float) -> float:
-        """Relative error of the 90 % quantile against the true one (s)."""
+        """Return the relative error of the 90 % quantile against the given true one (s)."""
         return self.quantile(0.9) / quantile - 1.0
 
 
 def _erlang_cdf(stages: int, x: float) -> float:
-    """P(a Poisson variable of mean x is at least `stages`), summed from the side of the smaller
-    terms."""
+    """Return P(Erlang(stages, rate 1) <= x) = P(a Poisson variable of mean x is >= stages)."""
     if x <= 0:
         return 0.0
+    # Below 600 the first Poisson term exp(-x) is far from underflow (at about 745), so the direct
+    # sum is accurate and scipy is not needed.
     if x < 600:
         term, total = exp(-x), 0.0
         for k in range(stages):
@@ -90,51 +98,57 @@ def _erlang_cdf(stages: int, x: float) -> float:
 
 
 def fit(mean: float, variance: float, *, stages: int = STAGES, shift: float = 0.0) -> PhaseType:
-    """The law with this mean (s) and variance (s^2), at most `stages` phases in a row behind a
-    fixed `shift` (s).
+    """Return the distribution with this mean (s) and variance (s^2), shift (s) included.
 
-    A variance of 0 asks for a fixed duration: as many stages as allowed, or the shift alone if it
-    is the whole mean.
+    It has at most `stages` phases in a row. A variance of 0 stands for a fixed duration and gets as
+    many stages as allowed. Raises ValueError unless mean > shift >= 0 and variance >= 0.
     """
     rest = mean - shift
     if not rest > 0 or variance < 0 or shift < 0:
         raise ValueError(
-            f"no law has the mean {mean} s, variance {variance} s^2 and shift {shift} s"
+            "expected mean > shift >= 0 and variance >= 0, got "
+            f"mean {mean} s, variance {variance} s^2, shift {shift} s"
         )
     cv2 = variance / rest**2
     if cv2 > 1:
         p = 0.5 * (1 + sqrt((cv2 - 1) / (cv2 + 1)))
-        return PhaseType((Branch(p, 1, 2 * p / rest), Branch(1 - p, 1, 2 * (1 - p) / rest)), shift)
+        return PhaseType(
+            (ErlangBranch(p, 1, 2 * p / rest), ErlangBranch(1 - p, 1, 2 * (1 - p) / rest)), shift
+        )
+    # The 1e-9 keep rounding errors from adding a stage when cv^2 is exactly 1 / k.
     wanted = ceil(1 / cv2 - 1e-9) if cv2 * stages >= 1 else stages
     if cv2 * stages < 1 or abs(cv2 * wanted - 1) < 1e-9:
-        return PhaseType((Branch(1.0, wanted, wanted / rest),), shift)
+        return PhaseType((ErlangBranch(1.0, wanted, wanted / rest),), shift)
     p = (wanted * cv2 - sqrt(wanted * (1 + cv2) - wanted**2 * cv2)) / (1 + cv2)
     rate = (wanted - p) / rest
-    return PhaseType((Branch(p, wanted - 1, rate), Branch(1 - p, wanted, rate)), shift)
+    return PhaseType((ErlangBranch(p, wanted - 1, rate), ErlangBranch(1 - p, wanted, rate)), shift)
 
 
 def fit_samples(
     durations: Sequence[float], *, stages: int = STAGES, shifted: bool = False
 ) -> tuple[PhaseType, float]:
-    """The law fitted to measured durations (s) by mean and variance, and its relative error at the
-    90 % quantile.
+    """Fit measured durations (s) by mean and variance.
 
-    With `shifted` the shortest duration is taken as a fixed shift, less one mean gap so that it is
-    not hit exactly.
+    Return the distribution and the relative error of its 90 % quantile. With `shifted` the shortest
+    duration becomes a fixed shift, minus (mean - shortest) / n, because the shortest of n
+    observations overestimates the true minimum. Raises ValueError for fewer than two positive
+    durations.
     """
     sample = np.asarray(durations, dtype=float)
     if len(sample) < 2 or sample.min() <= 0:
-        raise ValueError("at least two positive durations are needed to fit a law")
+        raise ValueError("expected at least two positive durations to fit a distribution")
     mean, variance = float(sample.mean()), float(sample.var(ddof=1))
     gap = (mean - float(sample.min())) / len(sample)
     shift = max(0.0, float(sample.min()) - gap) if shifted else 0.0
-    law = fit(mean, variance, stages=stages, shift=min(shift, mean * (1 - 1e-9)))
-    return law, law.error_at_90(float(np.quantile(sample, 0.9)))
+    fitted = fit(mean, variance, stages=stages, shift=min(shift, mean * (1 - 1e-9)))
+    return fitted, fitted.error_at_90(float(np.quantile(sample, 0.9)))
 
 
 def gamma_quantile(mean: float, variance: float, q: float = 0.9) -> float:
-    """The quantile (s) of the gamma law with this mean and variance: what a declared mean and cv
-    are compared with."""
+    """Return the quantile (s) of the gamma distribution with this mean (s) and variance (s^2).
+
+    Declared estimates give only mean and cv; the gamma distribution is their reference.
+    """
     if variance == 0:
         return mean
     from scipy.special import gammaincinv

@@ -1,11 +1,14 @@
-"""What is worth improving: exact derivatives of completion and throughput with respect to each rate
-and weight.
+"""Exact derivatives of completion and throughput with respect to each rate and weight.
 
-With jump probabilities a_e = r_e / q, a change d(log theta) of a transition's rate or weight scales
-its edges' amounts. For x = b + A x this gives dx_0 / d(log theta) = sum over its edges of v_i a_e
-(x_j - x_i) with v the expected visits before the end (one adjoint solve for all parameters; the
-sojourn's own change is inside, since x_i contains it). For the long run the same holds with flows
-in the place of visits and with the bias g of the Poisson equation g = (f - R) s + A (g + gain).
+Let a_e = r_e / q be the probability of edge e from marking i to j, where r_e is its amount and q
+the sum of amounts of its marking. A change d(log theta) of a transition's rate or weight scales the
+amounts of its edges. For x = b + A x this gives
+
+    dx_0 / d(log theta) = sum over the edges of the transition of v_i a_e (x_j - x_i)
+
+with v the expected visits before the end: one adjoint solve serves all parameters. The change of
+the sojourn time needs no term of its own, because x_i contains it. In the long run, flows take the
+role of visits, and the bias g of the Poisson equation g = (f - R) s + A (g + gain) that of x.
 Source: X.-R. Cao, Stochastic Learning and Optimization, Springer 2007, chapter 2.
 """
 
@@ -31,11 +34,11 @@ from petrobot.coordinator.analysis.time.markov import LongRun, visits_before
 
 @dataclass(frozen=True, slots=True)
 class Slope:
-    """How a number answers to one parameter: `derivative` in its own unit, `elasticity` in per cent
-    per per cent.
+    """How a number changes with one parameter.
 
-    For immediate transitions of one random switch whose weights are probabilities, `derivative` is
-    per weight; move probability between two branches by taking the difference of their derivatives.
+    `derivative` is per unit of the parameter, `elasticity` in per cent per per cent. If the weights
+    of immediate transitions are the probabilities of a random switch, moving probability from one
+    branch to another changes the number by the difference of their derivatives.
     """
 
     transition: str
@@ -46,7 +49,7 @@ class Slope:
 
 
 def slopes_of(chain: Chain, by_edge: Values, whole: float) -> dict[str, Slope]:
-    """Derivatives from the contribution of each edge to d / d(log theta)."""
+    """Return the derivatives by transition, from each edge's contribution to d / d(log theta)."""
     gspn = chain.gspn
     logs = sum_by(chain.label, by_edge, len(gspn.net.transitions))
     out = {}
@@ -60,19 +63,19 @@ def slopes_of(chain: Chain, by_edge: Values, whole: float) -> dict[str, Slope]:
 
 
 def reliability_slopes(done: Completion) -> dict[str, Slope]:
-    """Derivatives of the probability of completing, by transition."""
+    """Return the derivatives of the probability of completing, by transition."""
     chain, h = done.chain, done.h
     by_edge = _flow(done) * (h[chain.target] - h[chain.source])
     return slopes_of(chain, by_edge, done.probability)
 
 
 def time_slopes(done: Completion) -> dict[str, Slope]:
-    """Derivatives of the mean time to completion given completion (s), by transition."""
+    """Return the derivatives of the mean time to completion (s), given completion."""
     chain, h, y = done.chain, done.h, done.y
     flow = _flow(done)
     transient = _transient(done)
-    # y = s h + A y: h itself moves too, weighted with the time spent: a second adjoint solve
-    # collects that.
+    # y = s h + A y also changes through h, weighted with the time spent in each marking. A second
+    # adjoint solve adds up that part; the quotient rule for y / h follows below.
     weighted = np.where(transient, _visits(done) * np.where(transient, chain.sojourn, 0.0), 0.0)
     second = visits_before(chain, transient, weighted)
     second_flow = second[chain.source] * chain.probability
@@ -93,30 +96,31 @@ def _visits(done: Completion) -> Values:
 
 
 def _flow(done: Completion) -> Values:
-    """Expected number of times each edge is taken by a run that can still complete."""
+    """Return the expected number of times each edge is taken while the run can still complete."""
     visits = np.where(_transient(done), _visits(done), 0.0)
     out: Values = visits[done.chain.source] * done.chain.probability
     return out
 
 
 def throughput_slopes(run: LongRun, transition: str) -> dict[str, Slope]:
-    """Derivatives of the throughput of one transition (1/s), by transition."""
+    """Return the derivatives of the throughput of one transition (1/s), by transition."""
     return reward_slopes(run, impulse={transition: 1.0})
 
 
 def reward_slopes(
     run: LongRun, state: Values | None = None, impulse: Mapping[str, float] | None = None
 ) -> dict[str, Slope]:
-    """Derivatives of a mean reward per second (see `LongRun.reward`), by transition.
+    """Return the derivatives of a mean reward per second (see `LongRun.reward`), by transition.
 
-    Raises ValueError where several bottom components are reached: then the mixture's weights would
-    move as well.
+    Raises ValueError if several bottom components can be reached: their probabilities would change
+    as well, which is not computed here.
     """
     chain = run.chain
     components = np.unique(chain.graph.components[np.flatnonzero(run.probability > 0)])
     if len(components) != 1:
         raise ValueError(
-            "the long run settles in one of several components; ask for derivatives in each"
+            "the long run may end in one of several bottom components; derivatives need a net "
+            "with one"
         )
     members = np.flatnonzero(chain.graph.components == components[0])
     gain = np.zeros(len(chain.gspn.net.transitions))
@@ -131,9 +135,10 @@ def reward_slopes(
 def _bias(
     chain: Chain, members: Index, reward: float, state: Values | None, gain: Values
 ) -> Values:
-    """g = (f - R) s + A (g + gain) on one bottom component, with g = 0 at its first member."""
+    """Solve g = (f - R) s + A (g + gain) on one bottom component, with g = 0 at its first
+    member."""
     if not chain.total[members].any():
-        return np.zeros(chain.n)  # an absorbing marking: nothing moves, so nothing can be moved
+        return np.zeros(chain.n)  # an absorbing marking has no rate to change
     number = np.full(chain.n, -1, dtype=np.int64)
     number[members] = np.arange(len(members))
     edges = np.flatnonzero(number[chain.source] >= 0)
@@ -148,8 +153,10 @@ def _bias(
 
 
 def _singular(n: int, rows: Index, columns: Index, value: Values, right: Values) -> Values:
-    """A solution of x = right + A x for a stochastic A and a consistent right side, with x_0 =
-    0."""
+    """Return the solution of x = right + A x with x_0 = 0, for a stochastic matrix A.
+
+    I - A is singular: solutions differ by a constant, which x_0 = 0 fixes.
+    """
     if n <= DENSE:
         matrix = np.eye(n)
         np.subtract.at(matrix, (rows, columns), value)

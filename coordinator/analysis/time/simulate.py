@@ -1,8 +1,7 @@
-"""Token game and stochastic simulation, for nets whose chain is too large to solve; results carry
-confidence intervals.
+"""Simulation of a GSPN, for chains that are too large to solve; results with confidence intervals.
 
-Many independent replicas are played side by side, a row of numpy operations moving all of them by
-one firing. The generator is passed in; the same generator gives the same result.
+Many independent replicas are played side by side: one sequence of numpy operations moves all of
+them by one firing. The random generator is passed in; the same generator gives the same result.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from petrobot.coordinator.analysis.time.gspn import Gspn, Values
 from petrobot.coordinator.task.net import Marking, Net
 
 Stop = Callable[[Tokens], Mask]
-"""Tokens of shape (places, replicas) to which replicas have reached their goal, shape
+"""From tokens of shape (places, replicas) to which replicas have reached their goal, shape
 (replicas,)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class IntervalEstimate:
     """A simulated number with its confidence interval."""
 
     mean: float
@@ -35,8 +34,8 @@ class Estimate:
     high: float
 
     @classmethod
-    def of(cls, sample: Values, confidence: float) -> Estimate:
-        """Normal interval for the mean of independent observations."""
+    def of(cls, sample: Values, confidence: float) -> IntervalEstimate:
+        """Return the normal interval for the mean of independent observations."""
         mean = float(sample.mean())
         if len(sample) < 2:
             return cls(mean, -np.inf, np.inf)
@@ -44,8 +43,12 @@ class Estimate:
         return cls(mean, mean - half, mean + half)
 
     @classmethod
-    def share(cls, hits: int, n: int, confidence: float) -> Estimate:
-        """Wilson interval for a probability."""
+    def share(cls, hits: int, n: int, confidence: float) -> IntervalEstimate:
+        """Return the Wilson interval for a probability.
+
+        Unlike the normal interval it stays within 0 and 1 and works for few hits (E. B. Wilson,
+        J. Am. Stat. Assoc. 22, 1927).
+        """
         z, p = _z(confidence), hits / n
         middle, half = p + z * z / (2 * n), z * sqrt(p * (1 - p) / n + z * z / (4 * n * n))
         return cls(
@@ -55,7 +58,7 @@ class Estimate:
         )
 
     def covers(self, value: float) -> bool:
-        """Whether the interval holds a value."""
+        """Return whether the interval contains a value."""
         return self.low <= value <= self.high
 
 
@@ -65,31 +68,31 @@ def _z(confidence: float) -> float:
 
 @dataclass(frozen=True)
 class Simulation:
-    """What was seen. Long-run numbers are per replica over its observed time; completion is None
-    without a goal.
+    """The result of a simulation.
 
-    `complete` is False where replicas were cut off by the limit of firings; `firings` counts all of
-    them.
+    Throughput (1/s) and mean tokens are per replica, over its observed time. `completed` is None
+    without a goal. `firings` counts those of all replicas; `complete` is False if the limit of
+    firings or Ctrl-C ended the simulation early.
     """
 
     replicas: int
     firings: int
-    throughput: dict[str, Estimate]
-    mean_tokens: dict[str, Estimate]
-    completed: Estimate | None
-    time: Estimate | None
+    throughput: dict[str, IntervalEstimate]
+    mean_tokens: dict[str, IntervalEstimate]
+    completed: IntervalEstimate | None
+    time: IntervalEstimate | None
     """Mean time to the goal of the replicas that reached it (s)."""
     times: Values
-    """Their times, sorted (s)."""
+    """The times of these replicas, sorted (s)."""
     complete: bool
 
     def quantile(self, q: float) -> float:
-        """Quantile of the time to the goal (s)."""
+        """Return a quantile of the time to the goal (s)."""
         return float(np.quantile(self.times, q))
 
 
 class _Replicas:
-    """Replicas of a GSPN as columns: tokens, clocks, and what was counted."""
+    """Replicas of a GSPN as columns of a token matrix, and the firing rule for all of them."""
 
     def __init__(self, gspn: Gspn, count: int) -> None:
         net = gspn.net
@@ -107,8 +110,10 @@ class _Replicas:
         self.tokens = np.repeat(np.array(net.initial, dtype=np.int64)[:, None], count, axis=1)
 
     def amounts(self) -> tuple[Values, Mask]:
-        """Amount of each enabled transition, shape (transitions, replicas), and which replicas are
-        tangible."""
+        """Return (amounts of the enabled transitions, which replicas are in a tangible marking).
+
+        Amounts have the shape (transitions, replicas): rate times busy servers, or weight.
+        """
         count = self.tokens.shape[1]
         amount = np.zeros((len(self.net.transitions), count))
         beaten = np.zeros(count, dtype=np.bool_)
@@ -158,17 +163,16 @@ def simulate(
     progress: Callable[[int, float], None] | None = None,
     engine: Literal["numpy", "numba"] = "numpy",
 ) -> Simulation:
-    """Play replicas from the initial marking until `horizon` (s) or their goal, at most `firings`
-    in total.
+    """Play replicas from the initial marking until `horizon` (s) or their goal.
 
-    The engine "numba" (an extra) needs a horizon and knows no goal; its draws come in another
-    order, so its numbers differ from those of "numpy" within their intervals. Raises ImportError
-    where it is not installed.
+    All replicas together fire at most `firings` times. Throughput and mean tokens count from
+    `warmup` (s) on. Without a horizon a goal is required; replicas that are dead before it count as
+    not completed. `progress` is called with (firings, share of replicas still played). Ctrl-C ends
+    the simulation; its result is then marked as not complete.
 
-    Throughput and mean tokens are taken from `warmup` (s) on. Without a horizon a goal is needed,
-    and replicas that are dead before it count as not completed. `progress` is called with (firings,
-    share of replicas still played). Ctrl-C ends the play; the result is then marked as not
-    complete.
+    The engine "numba" (an optional extra) needs a horizon and does not support goals. It draws
+    random numbers in another order, so its results differ from those of "numpy" within their
+    intervals. Raises ValueError for a missing horizon or goal, ImportError without numba.
     """
     if goal is None and not horizon < np.inf:
         raise ValueError("a simulation needs a horizon (s) or a goal")
@@ -198,7 +202,7 @@ def _compiled(
     confidence: float,
     progress: Callable[[int, float], None] | None,
 ) -> Simulation:
-    """Replicas one after the other by the compiled kernel."""
+    """Play replicas one after the other with the compiled loop."""
     from petrobot.coordinator.analysis.time.simulate_kernel import Tables, play
     from petrobot.services.host.numba_kernels import plain
 
@@ -242,8 +246,8 @@ def _summed(
     complete: bool,
     confidence: float,
 ) -> Simulation:
-    """Estimates from counts of shape (transitions, n), areas (places, n) and observed times
-    (n,)."""
+    """Return estimates from firing counts (transitions, n), areas under the tokens in token
+    seconds (places, n), and observed times in s (n,)."""
     net = gspn.net
     rates = fires / observed if len(observed) else np.full((len(net.transitions), 1), np.nan)
     tokens = area / observed if len(observed) else np.full((len(net.places), 1), np.nan)
@@ -251,10 +255,13 @@ def _summed(
         replicas,
         fired,
         {
-            name: Estimate.of(row, confidence)
+            name: IntervalEstimate.of(row, confidence)
             for name, row in zip(net.transitions, rates, strict=True)
         },
-        {name: Estimate.of(row, confidence) for name, row in zip(net.places, tokens, strict=True)},
+        {
+            name: IntervalEstimate.of(row, confidence)
+            for name, row in zip(net.places, tokens, strict=True)
+        },
         None,
         None,
         np.zeros(0),
@@ -263,7 +270,7 @@ def _summed(
 
 
 class _Play:
-    """One simulation under way; `alive` are the replicas still played (columns of `state`)."""
+    """A running simulation; `alive` are the replicas still played (the columns of `state`)."""
 
     def __init__(
         self,
@@ -287,7 +294,11 @@ class _Play:
         self._arrive()
 
     def step(self) -> None:
-        """One firing of every replica that is still played."""
+        """Fire once in every replica that is still played.
+
+        The sojourn time is exponential with the sum of the amounts, and 0 in a vanishing marking.
+        The transition is drawn by comparing one uniform number with the cumulative amounts.
+        """
         amount, tangible = self.state.amounts()
         total = np.add.accumulate(amount, axis=0)
         whole = total[-1]
@@ -329,7 +340,7 @@ class _Play:
         self.state.tokens = self.state.tokens[:, which]
 
     def result(self, confidence: float) -> Simulation:
-        """Everything seen so far, as estimates."""
+        """Return the estimates so far."""
         seen = self.observed > 0
         complete = not len(self.alive) and not self.interrupted
         fires, area = self.fires[:, seen], self.area[:, seen]
@@ -347,16 +358,16 @@ class _Play:
         judged = self.count - len(self.alive)
         return replace(
             bare,
-            completed=Estimate.share(len(times), judged, confidence)
+            completed=IntervalEstimate.share(len(times), judged, confidence)
             if self.goal is not None and judged
             else None,
-            time=Estimate.of(times, confidence) if len(times) else None,
+            time=IntervalEstimate.of(times, confidence) if len(times) else None,
             times=times,
         )
 
 
 def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
-    """A goal for `simulate` from a predicate on single markings; each marking is judged once."""
+    """Return a goal for `simulate` from a predicate, which is called once per distinct marking."""
     known: dict[bytes, bool] = {}
 
     def stop(tokens: NDArray[np.int64]) -> Mask:
@@ -373,8 +384,8 @@ def goal_by_marking(predicate: Callable[[Marking], bool]) -> Stop:
 
 
 def token_game(net: Net, random: np.random.Generator, firings: int) -> tuple[list[str], Marking]:
-    """A random firing sequence, each enabled transition equally likely, and the marking that it
-    ends in."""
+    """Return a random firing sequence and its last marking; enabled transitions are equally
+    likely."""
     marking, played = net.initial, []
     for _ in range(firings):
         enabled = net.enabled(marking)

@@ -1,7 +1,6 @@
-"""The loop of the compiled simulation: one replica after the other, only the transitions that a
-firing touches are looked at.
+"""The simulation loop that numba compiles: one replica, only the transitions that a firing touches.
 
-Plain enough for numba, and the same, only slow, without it (services/host/numba_kernels.py).
+Without numba the same code runs in Python: same results, but slow (services/host/numba_kernels.py).
 """
 
 from __future__ import annotations
@@ -18,11 +17,12 @@ from petrobot.services.host.numba_kernels import kernel
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 UNLIMITED = 1 << 60
-"""Stands for infinitely many servers."""
+"""Number that stands for unlimited servers."""
 
 
 class Tables(NamedTuple):
-    """A GSPN as ragged arrays: the entries of transition t are first[t] <= k < first[t + 1]."""
+    """A GSPN as flat arrays: the entries of transition t are those with first[t] <= k < first[t +
+    1]."""
 
     need_first: Ints
     need_place: Ints
@@ -35,18 +35,18 @@ class Tables(NamedTuple):
     move_change: Ints
     touch_first: Ints
     touch: Ints
-    """Transitions to look at again after a firing; behind the last transition's entries stand all
-    of them, for the start."""
+    """Transitions to test again after a firing of t. One further row lists all transitions, for
+    the initial marking."""
     base: Floats
     """Rate of a timed, weight of an immediate transition."""
     servers: Ints
-    """Servers of a timed transition; UNLIMITED; 1 for immediate ones and those that consume
-    nothing."""
+    """Servers of a timed transition or UNLIMITED; 1 for immediate transitions and those that
+    consume nothing."""
     priority: Ints
 
     @classmethod
     def of(cls, gspn: Gspn) -> Tables:
-        """The tables of a GSPN."""
+        """Return the tables of a GSPN."""
         net = gspn.net
         count = range(len(net.transitions))
         need = [list(net.consume[t]) for t in count]
@@ -83,7 +83,7 @@ def _ragged(rows: list[list[tuple[int, int]]]) -> tuple[Ints, Ints, Ints]:
 
 @kernel
 def settle(area: Floats, tokens: Ints, since: Floats, now: float) -> None:
-    """Add what every place has held since its tokens last changed."""
+    """Add the token seconds of every place since its tokens last changed."""
     for p in range(len(tokens)):
         if now > since[p]:
             area[p] += tokens[p] * (now - since[p])
@@ -100,11 +100,11 @@ def play(
     fires: Floats,
     area: Floats,
 ) -> tuple[int, float]:
-    """One replica until the horizon (s) or its budget of firings; gives (firings, time observed
-    from warmup on).
+    """Play one replica until the horizon (s) or its budget of firings.
 
-    `fires` and `area` (tokens x s) get what happened from warmup on. One loop without helpers: a
-    compiled call counts references.
+    Return (firings, time observed from warmup on in s). `fires` and `area` (token seconds) receive
+    what happened from warmup on. One loop without helpers, because a compiled call would count the
+    references of its arrays every time.
     """
     need_first, need_place, need_weight, bar_first, bar_place, bar_threshold = tables[:6]
     move_first, move_place, move_change, touch_first, touch = tables[6:11]

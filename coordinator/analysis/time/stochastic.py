@@ -1,12 +1,13 @@
-"""The stochastic view of a task: its ordinary net refined by choices, statuses, durations, events
-and timers (docs/analysis.md).
+"""The stochastic view of a task: its ordinary net with choices, statuses, durations and events.
 
-Every place and arc of the ordinary net stays, so dropping the added places projects each firing
-sequence on one of the ordinary net. An action place p gets, beside itself, `p.going` (a run goes
-on), `p.success`, `p.failure` and `p.error` (a run has ended and waits to be taken). Preselection:
-an immediate choice of the alternative (weight pi_a), an immediate choice of the status (q_as), then
-a phase-type delay of that status. Preempting events race with it. A preempted run's phases are
-flushed at once, and a repeated run draws afresh.
+The result is a GSPN (docs/analysis.md, section 4). Every place and arc of the ordinary net stays,
+so dropping the added places projects each firing sequence on one of the ordinary net. An action
+place p gets, beside itself, `p.going` (a run is active) and `p.success`, `p.failure`, `p.error` (a
+run has finished and waits for an outgoing transition).
+
+A run first chooses its alternative (immediate, weight pi_a), then its status (immediate, q_as),
+then takes a phase-type delay that belongs to this status (preselection). Preempting events race
+with the delay. What is left of a preempted run is flushed at once; a repeated run draws again.
 """
 
 from __future__ import annotations
@@ -23,28 +24,28 @@ from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.net import Marking, Net
 
 FLUSH, CHOICE = 3_000_000, 2_000_000
-"""Priorities of flushing and choosing; transitions of the task stand around TASK, moved by their
-own priorities."""
+"""Priorities of flushing and choosing, far above those of the task's transitions, which are TASK
+plus their own priority: choices are made before the task fires again."""
 TASK = 1_000_000
 STAGES = 8
-"""Phases of one duration at most unless told otherwise: several run side by side, so their product
-counts."""
+"""Default limit of the phases of one duration. Phases of parallel runs multiply the number of
+markings, so it is small."""
 
 Weights = dict[str, int]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known from runs; whatever is missing falls back on the task file's declared
-    estimates.
+    """Numbers measured in runs. Missing ones are replaced by the estimates in the task file.
 
-    `runs[(place or primitive task, action)]` gives share, mean (s) and cv by status;
-    `choice[primitive task][action]` the current probability of each alternative; `waits[event]` the
-    mean wait (s) of a transition for it; `switches[transition]` the relative frequency of a
-    condition among the transitions that compete with it. `preempted[(place, action)]` gives share,
-    mean and cv of the runs that each transition preempted; where all actions of a place have it,
-    the preempting event is one of the causes by which a run ends (its shares and those of `runs`
-    sum to 1), not an independent race.
+    - `runs[(place or primitive task, action)]`: share, mean (s) and cv by status.
+    - `choice[primitive task][action]`: current probability of each alternative.
+    - `waits[event]`: mean time (s) that a transition waits for the event.
+    - `switches[transition]`: how often its condition is true, relative to the transitions that
+      compete with it.
+    - `preempted[(place, action)]`: share, mean (s) and cv of the runs that each transition
+      preempted. If all actions of a place have it, the preempting event is one of the causes by
+      which a run ends (the shares here and in `runs` sum to 1), not an independent race.
     """
 
     runs: Mapping[tuple[str, str], Mapping[Status, Estimate]] = field(default_factory=dict)
@@ -55,12 +56,11 @@ class Measured:
 
 
 def is_cause(transition: Transition) -> bool:
-    """Whether a preemption by this transition is a cause of its own by which a run ends, at a time
-    of its own since it began.
+    """Return whether a preemption by this transition is a cause of its own by which a run ends.
 
-    So it is where an event or a timer takes one run and looks at no other one. A transition that
-    fires as soon as its arcs allow it (another run has ended, a token has come) only cuts the run
-    off: the net says when, and the run would have ended otherwise.
+    It is one if an event or a timer takes exactly one run: then it has its own distribution of the
+    time since the run began. A transition that fires as soon as its arcs allow it (another run has
+    finished, a token has arrived) only cuts the run short: the net determines when.
     """
     runs = [a for a in transition.inputs if a.end is not None]
     waits = bool(transition.events) or transition.after is not None
@@ -68,8 +68,7 @@ def is_cause(transition: Transition) -> bool:
 
 
 class NoEstimate(ValueError):  # noqa: N818 - names what is missing
-    """Neither a measurement nor a declared estimate gives a number that the stochastic view
-    needs."""
+    """A number that the stochastic view needs was neither measured nor declared."""
 
 
 @dataclass(frozen=True)
@@ -79,23 +78,23 @@ class StochasticView:
     task: Task
     gspn: Gspn
     origin: Mapping[str, str]
-    """By transition of the GSPN: the task's transition that it is a case of (choices, delays and
-    flushes have none)."""
+    """By transition of the GSPN: the transition of the task that it is a case of. Choices, delays
+    and flushes are not in it."""
     statuses: Mapping[str, tuple[str, str, Status]]
-    """By immediate transition that draws a status: (place, action, status)."""
+    """By immediate transition that chooses a status: (place, action, status)."""
     assumptions: tuple[str, ...]
-    """What was assumed because nothing was measured or declared, and approximations made."""
+    """Assumptions where nothing was measured or declared, and approximations."""
     fit_errors: Mapping[str, float]
-    """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or
+    """Relative error of the 90 % quantile of each fitted duration, by `place.action.status` or by
     timer."""
 
     def projected(self, marking: Marking) -> Marking:
-        """The marking of the ordinary net behind a marking of the GSPN."""
+        """Return the marking of the ordinary net that a marking of the GSPN projects to."""
         return marking[: len(self.task.net.places)]
 
     @cached_property
     def cases(self) -> dict[str, tuple[str, ...]]:
-        """By task transition: its cases in the GSPN."""
+        """By transition of the task: its cases in the GSPN."""
         out: dict[str, list[str]] = {}
         for case, name in self.origin.items():
             out.setdefault(name, []).append(case)
@@ -109,13 +108,16 @@ def stochastic_view(
     stages: int = STAGES,
     timer_stages: int = STAGES,
 ) -> StochasticView:
-    """The GSPN of a task. Raises NoEstimate, and ValueError for what this view cannot express
-    (named, with a remedy)."""
+    """Return the GSPN of a task.
+
+    `stages` and `timer_stages` limit the phases of one duration and of one timer. Raises
+    NoEstimate, and ValueError for what a GSPN cannot express.
+    """
     return _Derivation(task.flat, measured or Measured(), stages, timer_stages).result()
 
 
 class _Derivation:
-    """The GSPN being put together."""
+    """Builds the GSPN place by place and transition by transition."""
 
     def __init__(self, task: Task, measured: Measured, stages: int, timer_stages: int) -> None:
         self.task, self.measured = task, measured
@@ -142,7 +144,7 @@ class _Derivation:
             self._transition(transition)
 
     def result(self) -> StochasticView:
-        """The finished view."""
+        """Return the finished view."""
         capacity = {
             p: c
             for p, c in zip(self.task.net.places, self.task.net.capacity, strict=True)
@@ -181,7 +183,7 @@ class _Derivation:
         if place.servers is not None:
             self.places[f"{name}.server"] = place.servers
         self.possible[name], self.phases[name] = set(), []
-        laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
+        shared: dict[tuple[Status, PhaseType], list[tuple[str, float]]] = {}
         alternatives = self._alternatives(place)
         if alternatives and all(
             (name, action) in self.measured.preempted for action in alternatives
@@ -191,8 +193,8 @@ class _Derivation:
             self._choice(place, action, chosen)
             known = {s: e for s, e in self._estimates(place, action).items() if e.share > 0}
             for status, estimate in known.items():
-                self._status(place, action, status, estimate, laws)
-            if not known:  # it was never seen to end by itself: it goes on until something takes it
+                self._status(place, action, status, estimate, shared)
+            if not known:  # no run ever ended by itself: it stays active until it is preempted
                 self.phases[name].append(f"{name}.{action}")
         preempted = any(
             a.place == name and a.end is End.PREEMPT
@@ -201,16 +203,16 @@ class _Derivation:
         )
         if preempted and place.servers is not None and place.servers > 1:
             raise ValueError(
-                f"places.{name}: which of its {place.servers} runs a preempting transition "
-                "takes is not kept in a GSPN; "
-                "give the place one server for the forecast, or measure"
+                f"places.{name}: it has {place.servers} servers and a preempting transition, but a "
+                "GSPN does not know which of its runs is the oldest; give the place one server for "
+                "the forecast, or measure with mission runs"
             )
         if preempted:
             self._flush(name)
 
     def _causes(self, place: Place, actions: Iterable[str]) -> None:
-        """Preemption as a cause by which a run ends: `p.by.t` waits for t to take the run, which
-        goes on until then."""
+        """Add preemption as a cause by which a run ends: a token in `p.by.t` means that t takes
+        it."""
         name = place.name
         for t in self.task.transitions.values():
             if is_cause(t) and any(a.place == name for a in t.inputs if a.end is not None):
@@ -223,10 +225,12 @@ class _Derivation:
                     self._cause(name, action, transition, estimate)
 
     def _cause(self, name: str, action: str, transition: str, estimate: Estimate) -> None:
-        """The draw of a preemption and the phases of the time until it comes."""
+        """Add the choice of a preemption, and the phases of the time until it happens."""
         key, end = f"{name}.{action}.by.{transition}", self.by[name, transition]
-        law = self._law(key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages)
-        for i, branch in enumerate(law.branches):
+        duration = self._duration(
+            key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
+        )
+        for i, branch in enumerate(duration.branches):
             chain = [f"{end}.{action}{'abc'[i]}{k}" for k in range(1, branch.stages + 1)]
             self.places |= dict.fromkeys(chain, 0)
             self.phases[name] += chain
@@ -261,12 +265,12 @@ class _Derivation:
                 return self.measured.runs[key]
         if not primitive.estimates:
             raise NoEstimate(
-                f"primitive_tasks.{primitive.name}: no run of {action} was measured and "
-                "nothing is declared; "
+                f"primitive_tasks.{primitive.name}: the duration of {action} is unknown: it was "
+                "neither measured nor declared; "
                 f"add [primitive_tasks.{primitive.name}.estimates] or give measurements"
             )
         self.assumptions.append(
-            f"{primitive.name}: declared estimates of the task file, for want of measured runs"
+            f"{primitive.name}: estimates declared in the task file, not measured"
         )
         return primitive.estimates
 
@@ -282,16 +286,20 @@ class _Derivation:
         action: str,
         status: Status,
         estimate: Estimate,
-        laws: dict[tuple[Status, PhaseType], list[tuple[str, float]]],
+        shared: dict[tuple[Status, PhaseType], list[tuple[str, float]]],
     ) -> None:
-        """The draw of a status and the phases of its delay; equal laws of several actions share
-        their phases."""
+        """Add the choice of a status, and the phases of its delay.
+
+        Actions with equal distributions share their phases, which keeps the chain small.
+        """
         name, key = place.name, f"{place.name}.{action}.{status}"
         self.possible[name].add(status)
-        law = self._law(key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages)
-        if (status, law) not in laws:
-            laws[status, law] = self._phases(place, status, law, len(laws))
-        entries = laws[status, law]
+        duration = self._duration(
+            key, estimate.mean, (estimate.cv * estimate.mean) ** 2, self.stages
+        )
+        if (status, duration) not in shared:
+            shared[status, duration] = self._phases(place, status, duration, len(shared))
+        entries = shared[status, duration]
         for i, (entry, share) in enumerate(entries):
             label = key if len(entries) == 1 else f"{key}.{i + 1}"
             self.statuses[label] = (name, action, status)
@@ -299,24 +307,26 @@ class _Derivation:
                 label, {f"{name}.{action}": 1}, {entry: 1}, estimate.share * share, CHOICE
             )
 
-    def _law(self, key: str, mean: float, variance: float, stages: int) -> PhaseType:
+    def _duration(self, key: str, mean: float, variance: float, stages: int) -> PhaseType:
         if not mean > 0:
             raise NoEstimate(
-                f"{key}: a mean duration of {mean} s for a status that occurs; declare a "
-                "positive one"
+                f"{key}: expected a positive mean duration, got {mean} s, although this status "
+                "occurs; declare or measure one"
             )
-        law = fit(mean, variance, stages=stages)
-        self.errors[key] = law.error_at_90(gamma_quantile(mean, variance))
-        return law
+        duration = fit(mean, variance, stages=stages)
+        self.errors[key] = duration.error_at_90(gamma_quantile(mean, variance))
+        return duration
 
     def _phases(
-        self, place: Place, status: Status, law: PhaseType, number: int
+        self, place: Place, status: Status, duration: PhaseType, number: int
     ) -> list[tuple[str, float]]:
-        """Chains of phases with one rate each; gives the places where a run enters and with which
-        probability."""
+        """Add chains of phases; return the places where a run enters, with their probabilities.
+
+        Branches of the same rate share one chain: a branch of fewer stages enters it later.
+        """
         entries: list[tuple[str, float]] = []
-        for j, rate in enumerate(dict.fromkeys(b.rate for b in law.branches)):
-            branches = [b for b in law.branches if b.rate == rate]
+        for j, rate in enumerate(dict.fromkeys(b.rate for b in duration.branches)):
+            branches = [b for b in duration.branches if b.rate == rate]
             longest = max(b.stages for b in branches)
             stem = f"{place.name}.{status}.{number}{'abc'[j]}"
             chain = [f"{stem}{i}" for i in range(1, longest + 1)]
@@ -333,8 +343,7 @@ class _Derivation:
         return entries
 
     def _flush(self, name: str) -> None:
-        """What is left of a preempted run vanishes at once: its phase, and its server comes
-        free."""
+        """Remove what is left of a preempted run at once, and release its server."""
         served = f"{name}.server" in self.places
         give = {f"{name}.server": 1} if served else {}
         for p in self.phases[name]:
@@ -354,8 +363,7 @@ class _Derivation:
             self._fires(t, name, need, give)
 
     def _cases(self, t: Transition) -> list[tuple[Weights, Weights]]:
-        """What a firing takes and gives, once for each combination of the statuses of the runs that
-        it takes."""
+        """Return what a firing takes and gives, for each combination of statuses of its runs."""
         net, index = self.task.net, self.task.net.transition_index[t.name]
         base_need = {net.places[p]: w for p, w in net.consume[index]}
         base_give = {net.places[p]: w for p, w in net.produce[index]}
@@ -381,8 +389,7 @@ class _Derivation:
     def _takings(
         self, t: Transition, arc: Input
     ) -> list[tuple[str, Status | None, Weights, Weights]]:
-        """The ways in which an arc may take its runs: (place, status if all have one, taken, given
-        back)."""
+        """Return how an arc may take its runs: (place, common status if any, taken, given back)."""
         p, w = arc.place, arc.weight
         if arc.end is End.PREEMPT:
             cause = {self.by[p, t.name]: 1} if (p, t.name) in self.by else {}
@@ -405,8 +412,10 @@ class _Derivation:
         return out
 
     def _may_hold(self, t: Transition, status: Mapping[str, Status]) -> bool:
-        """Whether the condition can be true for these statuses (judged where it reads nothing
-        else)."""
+        """Return whether the condition can be true for these statuses.
+
+        True as well if it reads anything else: then it becomes a random switch.
+        """
         if t.when is None:
             return True
         values = {f"{place}.status": str(s) for place, s in status.items()}
@@ -418,7 +427,8 @@ class _Derivation:
             return False
 
     def _fires(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
-        """How the case fires: after a delay, with its events, or at once."""
+        """Add a case: it fires at once, after an exponential wait for its events, or after a
+        timer."""
         share = self._switch(t)
         if any((a.place, t.name) in self.by for a in t.inputs):
             self._immediate(name, need, give, 1.0, TASK + t.priority)
@@ -431,33 +441,38 @@ class _Derivation:
             self._immediate(name, need, give, weight, TASK + t.priority)
 
     def _switch(self, t: Transition) -> float:
-        """Relative frequency with which a condition on variables is true."""
+        """Return how often a condition on variables is true, relative to its competitors."""
         if t.when is None or all(n.endswith((".status", ".reason")) for n in t.when.names):
             return 1.0
         known = self.measured.switches.get(t.name)
         if known is None:
             self.assumptions.append(
-                f"{t.name}: its condition is as often true as those that compete with it"
+                f"{t.name}: its condition is assumed to be true as often as those it competes with"
             )
         return 1.0 if known is None else known
 
     def _wait(self, t: Transition) -> float:
-        """Mean time (s) until all events of a transition have come: the mean of the latest of
-        exponentials."""
+        """Return the mean time (s) until all events of a transition have occurred.
+
+        The mean of the maximum of independent exponentials, by inclusion and exclusion over all
+        non-empty subsets: E[max] = sum of (-1)^(size + 1) / (sum of the rates in the subset).
+        """
         means = []
         for event in t.events:
             mean = self.measured.waits.get(event, self.task.events[event].mean_wait)
             if mean is None:
                 raise NoEstimate(
-                    f"events.{event}: no wait was measured and no mean_wait is declared; add "
+                    f"events.{event}: its mean wait is unknown: neither measured nor declared; add "
                     "mean_wait = SECONDS"
                 )
             if event not in self.measured.waits:
-                self.assumptions.append(f"{event}: declared mean wait of the task file")
+                self.assumptions.append(
+                    f"{event}: mean wait declared in the task file, not measured"
+                )
             means.append(mean)
         if len(means) > 1:
             self.assumptions.append(
-                f"{t.name}: the wait for all its events is taken as one exponential"
+                f"{t.name}: the wait for all its events is approximated by one exponential"
             )
         whole = 0.0
         for chosen in range(1, 1 << len(means)):
@@ -466,11 +481,14 @@ class _Derivation:
         return whole
 
     def _timer(self, t: Transition, name: str, need: Weights, give: Weights) -> None:
-        """A fixed delay as Erlang phases counted in a place of its own, set back as soon as the
-        transition is disabled."""
+        """Add a fixed delay as Erlang phases, counted by tokens in a place of its own.
+
+        The count is reset as soon as the transition is disabled: an immediate transition empties it
+        when a needed token is missing or an inhibitor place is marked.
+        """
         assert t.after is not None
-        law = self._law(f"{t.name}.after", t.after, 0.0, self.timer_stages)
-        (branch,) = law.branches
+        duration = self._duration(f"{t.name}.after", t.after, 0.0, self.timer_stages)
+        (branch,) = duration.branches
         count, last = f"{name}.phase", branch.stages - 1
         self._timed(name, need | ({count: last} if last else {}), give, branch.rate, 1)
         if not last:

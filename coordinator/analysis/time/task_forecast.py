@@ -1,9 +1,11 @@
-"""The forecast of a task from its stochastic view: three reliabilities, time, firings, and what is
-worth improving.
+"""The forecast of a task: three reliabilities, times, firings, and what is worth improving.
 
-R_conj: the task is completed and every run ended with SUCCESS. R_goal: expected met goals for each
-run token. P_complete: `final` is reached at all. Long-run numbers are those of mission runs back to
-back (renewal reward): expected firings, or time-weighted tokens, of one mission run over its mean
+- P_complete: probability that `final` is reached.
+- R_goal: expected number of met goals per run token.
+- R_conj: probability that the task completes and every run ends with SUCCESS.
+
+Long-run numbers assume that mission runs follow each other without a pause. By the renewal reward
+theorem they are the expected firings (or tokens times time) of one mission run, divided by its mean
 length.
 """
 
@@ -18,10 +20,15 @@ import numpy as np
 
 from petrobot.coordinator.analysis.net.graph import Mask, sum_by
 from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
-from petrobot.coordinator.analysis.net.space import Limits
-from petrobot.coordinator.analysis.time.completion import Completion, Law, completion, law
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time.completion import (
+    Completion,
+    CompletionTime,
+    completion,
+    completion_time,
+)
 from petrobot.coordinator.analysis.time.gspn import Chain, Values
-from petrobot.coordinator.analysis.time.linear import Plan, solve
+from petrobot.coordinator.analysis.time.linear import SolveOrder, solve
 from petrobot.coordinator.analysis.time.markov import visits_before
 from petrobot.coordinator.analysis.time.sensitivity import (
     Slope,
@@ -36,11 +43,12 @@ from petrobot.coordinator.task.net import Marking
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """What improving one action of a place would bring; the derivatives are exact.
+    """What an improvement of one action of a place would bring (exact derivatives).
 
-    `time_share`: per cent of mean mission time saved per per cent of its durations (the bottleneck
-    has the largest). `completion_gain`, `goal_gain`: change of P_complete and of the expected met
-    goals for each unit of probability moved from ERROR to SUCCESS (0 where it never ends in ERROR).
+    `time_share`: per cent of the mean mission time saved per per cent of its durations; the
+    bottleneck has the largest. `completion_gain`, `goal_gain`: change of P_complete and of the
+    expected met goals per unit of probability moved from ERROR to SUCCESS (0 if it never ends with
+    ERROR).
     """
 
     place: str
@@ -52,14 +60,14 @@ class Worth:
 
 @dataclass(frozen=True)
 class Forecast:
-    """All numbers of one stochastic view. Times are in seconds, conditional on completing."""
+    """All numbers of one stochastic view. Times in seconds, given that the task completes."""
 
     view: StochasticView
     chain: Chain
     done: Completion
     transient: Mask
     flow: Values
-    """Expected number of times that each edge is taken in one mission run."""
+    """Expected number of times that a mission run takes each edge."""
 
     @property
     def completion_probability(self) -> float:
@@ -78,7 +86,7 @@ class Forecast:
 
     @cached_property
     def mission_time(self) -> float:
-        """Mean length of a mission run, however it ends (s)."""
+        """Mean length of a mission run (s), whether it completes or not."""
         return float(self._time.sum())
 
     @cached_property
@@ -91,20 +99,20 @@ class Forecast:
 
     @cached_property
     def throughput(self) -> dict[str, float]:
-        """Firings per second of each transition of the task, mission runs back to back."""
+        """Firings per second of each transition of the task, mission runs without pauses."""
         return {name: n / self.mission_time for name, n in self.firings.items()}
 
     @cached_property
     def mean_tokens(self) -> dict[str, float]:
-        """Time average of the tokens of each place of the task, mission runs back to back."""
+        """Time average of the tokens of each place of the task, mission runs without pauses."""
         space = self.chain.space
         places = enumerate(self.view.task.net.places)
         return {name: float(self._time @ space.tokens(p)) / self.mission_time for p, name in places}
 
     @cached_property
     def goal_reliability(self) -> float | None:
-        """R_goal: expected met goals for each run token; None if the task names no goal transitions
-        or runs place."""
+        """R_goal: expected met goals per run token; None if the task names no goal transitions or
+        no runs place."""
         task = self.view.task
         if not task.goal_transitions or not task.runs_place:
             return None
@@ -113,18 +121,20 @@ class Forecast:
 
     @cached_property
     def conjunctive_reliability(self) -> float:
-        """R_conj: probability of completing with every run ended in SUCCESS."""
+        """R_conj: probability of completing while every run ends with SUCCESS."""
         spoilt = np.isin(self.chain.label, self._spoiling)
         open_ = self.transient[self.chain.source] & ~spoilt
         value = np.where(open_ & self.transient[self.chain.target], self.chain.probability, 0.0)
         direct = open_ & self.done.goal[self.chain.target]
         arrive = sum_by(self.chain.source[direct], self.chain.probability[direct], self.chain.n)
-        return float(solve(Plan.of(self.chain.graph, self.transient), value, arrive)[0])
+        return float(solve(SolveOrder.of(self.chain.graph, self.transient), value, arrive)[0])
 
     @property
     def _spoiling(self) -> list[int]:
-        """Transitions of the GSPN by which a run ends other than with SUCCESS; one that was
-        preempted before has not ended so."""
+        """Transitions of the GSPN by which a run ends without SUCCESS.
+
+        A preempted run counts only if its arc declares that it counts as a failure or an error.
+        """
         net, flat = self.chain.gspn.net, self.view.task.flat
         index = net.transition_index
         bad = {Counts.FAILURE, Counts.ERROR}
@@ -145,7 +155,7 @@ class Forecast:
 
     @cached_property
     def worth(self) -> tuple[Worth, ...]:
-        """What is worth improving, the largest share of time first."""
+        """The actions worth improving, the largest share of time first."""
         time, complete, goals = (
             time_slopes(self.done),
             reliability_slopes(self.done),
@@ -168,7 +178,7 @@ class Forecast:
         return tuple(sorted(found, key=lambda w: -w.time_share))
 
     def _phases(self, place: str) -> list[str]:
-        """Timed transitions that are phases of a place's runs."""
+        """Return the timed transitions that are phases of the runs of a place."""
         gspn = self.chain.gspn
         return [
             name
@@ -179,8 +189,11 @@ class Forecast:
         ]
 
     def _use(self, keys: list[tuple[str, str]]) -> dict[tuple[str, str], float]:
-        """Share of a place's runs that each action takes (actions with equal laws share their
-        phases)."""
+        """Return the share of each action in the runs of its place.
+
+        Actions with equal duration distributions share their phases, so the time cannot be measured
+        per action and is divided by these shares.
+        """
         count = sum_by(self.chain.label, self.flow, len(self.chain.gspn.net.transitions))
         index = self.chain.gspn.net.transition_index
         runs = {key: float(count[index[f"{key[0]}.{key[1]}"]]) for key in keys}
@@ -188,7 +201,7 @@ class Forecast:
         return {key: n / total if total else 0.0 for key, n in runs.items()}
 
     def _move(self, key: tuple[str, str], slopes: Mapping[str, Slope]) -> float:
-        """Derivative for probability moved from ERROR to SUCCESS of one action of a place."""
+        """Return the derivative for probability moved from ERROR to SUCCESS of one action."""
 
         def gain(status: Status) -> float | None:
             names = [
@@ -207,7 +220,7 @@ class Forecast:
         return better - worse if better is not None and worse is not None else 0.0
 
     def _goal_slopes(self) -> dict[str, Slope]:
-        """Derivatives of the expected number of met goals."""
+        """Return the derivatives of the expected number of met goals, by transition."""
         chain, goals = self.chain, set(self.view.task.goal_transitions)
         hits = np.array(
             [self.view.origin.get(name) in goals for name in chain.gspn.net.transitions]
@@ -215,14 +228,14 @@ class Forecast:
         inside = self.transient[chain.source]
         value = np.where(inside & self.transient[chain.target], chain.probability, 0.0)
         gain = sum_by(chain.source, np.where(inside & hits, chain.probability, 0.0), chain.n)
-        g = solve(Plan.of(chain.graph, self.transient), value, gain)
+        g = solve(SolveOrder.of(chain.graph, self.transient), value, gain)
         ahead = np.where(self.transient[chain.target], g[chain.target], 0.0)
         by_edge = self.flow * (hits + ahead - g[chain.source])
         return slopes_of(chain, by_edge, float(g[0]))
 
     @cached_property
     def recovery_time(self) -> float:
-        """The longest mean time back to the nominal flow over all markings that lead there (s)."""
+        """The longest mean time back to the nominal flow (s), over all markings that can return."""
         ordinary = OrdinaryView(self.view.task)
         nominal = (
             self.chain.space.where(lambda m: ordinary.is_nominal(self.view.projected(m)))
@@ -232,13 +245,13 @@ class Forecast:
         able = (back.h > 0) & ~nominal
         return float(np.max(back.y[able] / back.h[able], initial=0.0))
 
-    def law(self) -> Law:
-        """The distribution of the time to completion."""
-        return law(self.chain, self.done.goal)
+    def completion_time(self) -> CompletionTime:
+        """Return the distribution of the time to completion."""
+        return completion_time(self.chain, self.done.goal)
 
     def to_json(self, quantiles: tuple[float, ...] = (0.5, 0.9, 0.99)) -> dict[str, Any]:
-        """Plain data. Quantiles take a pass of uniformisation; give none to leave them out."""
-        shape = self.law() if quantiles and self.completion_probability > 0 else None
+        """Return plain data. Quantiles need a uniformisation; pass none to save its time."""
+        shape = self.completion_time() if quantiles and self.completion_probability > 0 else None
         return {
             "P_complete": self.completion_probability,
             "R_goal": self.goal_reliability,
@@ -260,9 +273,11 @@ class Forecast:
         }  # fmt: skip
 
 
-def forecast(view: StochasticView, *, limits: Limits | None = None) -> Forecast:
-    """Solve a stochastic view. Raises ValueError if its space is not complete within the limits
-    (simulate instead)."""
+def forecast(view: StochasticView, *, limits: SearchLimits | None = None) -> Forecast:
+    """Solve a stochastic view.
+
+    Raises ValueError if its space is not complete within the limits (then simulate).
+    """
     chain = Chain.of(view.gspn, limits=limits)
     ordinary = OrdinaryView(view.task)
     known: dict[Marking, bool] = {}

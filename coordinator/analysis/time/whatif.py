@@ -1,14 +1,14 @@
-"""What if: a place's tokens, an action's times and shares, or a transition's rate changed without
-editing the file.
+"""What if: change tokens, times, shares or rates of a model without editing its file.
 
 A change is written SUBJECT=NUMBER:
 
-    runs=10                                tokens of a resource or control place
-    locate_ball.error.share=0.05           a status of every action of a primitive task (`share`,
-                                           `mean` in s, `cv`);
-    locate_ball.locate_hough.success.mean=0.4    of one of its actions. The other shares keep their
-                                                 proportions.
-    serve.rate=2.5, serve.weight=3         a transition of a net with rates
+    runs=10                                      tokens of a resource or control place
+    locate_ball.error.share=0.05                 one status of all actions of a primitive task:
+                                                 `share`, `mean` (s) or `cv`
+    locate_ball.locate_hough.success.mean=0.4    the same for one action
+    serve.rate=2.5, serve.weight=3               a transition of a net with rates (1/s)
+
+When a share changes, the other shares of the action keep their proportions.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from petrobot.coordinator.analysis.formats.netfile import FormatError
+from petrobot.coordinator.analysis.formats.netfile import NetFileError
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.coordinator.analysis.time.stochastic import Measured
 from petrobot.coordinator.task import Estimate, Kind, Status, Task
@@ -33,42 +33,44 @@ Runs = dict[tuple[str, str], Mapping[Status, Estimate]]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One change: which number, and what it becomes."""
+    """One change: the name of a number, and its new value."""
 
     subject: tuple[str, ...]
     value: float
 
     @property
     def text(self) -> str:
-        """As it is written."""
+        """The change as it is written on the command line."""
         return f"{'.'.join(self.subject)}={self.value:g}"
 
-    def fault(self, problem: str, remedy: str = FORM) -> FormatError:
-        """The error about this change."""
-        return FormatError("what if", self.text, problem, remedy)
+    def fault(self, problem: str, remedy: str = FORM) -> NetFileError:
+        """Return an error about this change, for the caller to raise."""
+        return NetFileError("what if", self.text, problem, remedy)
 
     def count(self) -> int:
-        """The value as a number of tokens. Raises FormatError."""
+        """Return the value as a number of tokens. Raises NetFileError."""
         if self.value < 0 or self.value != int(self.value):
-            raise self.fault("tokens are counted", "give a whole number, 0 or more")
+            raise self.fault("a number of tokens is expected", "give a whole number, 0 or more")
         return int(self.value)
 
 
 def read_change(text: str) -> Change:
-    """A change from its text. Raises FormatError."""
+    """Parse a change. Raises NetFileError."""
     subject, sign, value = text.partition("=")
     try:
         number = float(value)
     except ValueError:
         number = float("nan")
     if not sign or not subject.strip() or not abs(number) < float("inf"):
-        raise FormatError("what if", text, "no change of one number", FORM)
+        raise NetFileError("what if", text, "not of the form NAME=NUMBER", FORM)
     return Change(tuple(part.strip() for part in subject.split(".")), number)
 
 
 def change_task(task: Task, measured: Measured, changes: Sequence[Change]) -> tuple[Task, Measured]:
-    """The task with other tokens, and what is known of its runs with other estimates. Raises
-    FormatError."""
+    """Return the task with changed tokens, and the measurements with changed estimates.
+
+    Raises NetFileError.
+    """
     runs: Runs = dict(measured.runs)
     for change in changes:
         if len(change.subject) == 1:
@@ -82,7 +84,7 @@ def _other_tokens(task: Task, change: Change) -> Task:
     name, n = change.subject[0], change.count()
     place = task.places.get(name)
     if place is None or place.kind not in (Kind.RESOURCE, Kind.CONTROL):
-        raise change.fault(f"{name} is no resource or control place of {task.name}")
+        raise change.fault(f"{name} is not a resource or control place of {task.name}")
     capacity = None if place.capacity is None else max(place.capacity, n)
     return replace(task, places={**task.places, name: replace(place, tokens=n, capacity=capacity)})
 
@@ -92,12 +94,13 @@ def _other_estimate(task: Task, runs: Runs, change: Change) -> None:
     *subject, word, key = change.subject
     primitive = task.primitive_tasks.get(subject[0]) if subject else None
     if primitive is None or len(subject) > 2 or word not in list(Status) or key not in FIELDS:
-        raise change.fault(f"no number of {task.name}")
+        raise change.fault(f"{task.name} has no such number")
     actions = primitive.alternatives if len(subject) == 1 else (subject[1],)
     for action in actions:
         if action not in primitive.alternatives:
             raise change.fault(
-                f"{action} is no alternative of {primitive.name}", " ".join(primitive.alternatives)
+                f"{action} is not an alternative of {primitive.name}",
+                f"its alternatives are {', '.join(primitive.alternatives)}",
             )
         known = runs.get((primitive.name, action), primitive.estimates)
         runs[primitive.name, action] = _altered(known, Status(word), key, change)
@@ -108,12 +111,10 @@ def _altered(
 ) -> Mapping[Status, Estimate]:
     value = change.value
     if value < 0 or (key == "share" and value > 1) or (key == "mean" and value == 0):
-        raise change.fault(
-            "out of range", "shares lie between 0 and 1, means above 0, cv is not negative"
-        )
+        raise change.fault("out of range", "a share is from 0 to 1, a mean above 0, a cv 0 or more")
     if status not in known:
         if key != "share":
-            raise change.fault(f"nothing is known of runs that end with {status}")
+            raise change.fault(f"no estimate is known for status {status}; set its share first")
         mean = max((e.mean for e in known.values()), default=1.0)
         known = {**known, status: Estimate(0.0, mean)}
     found = {**known, status: replace(known[status], **{key: value})}
@@ -121,13 +122,13 @@ def _altered(
         return found
     rest = sum(e.share for s, e in known.items() if s is not status)
     if rest == 0 and value < 1:
-        raise change.fault("nothing else is known that the rest could end with")
+        raise change.fault("no other status is known for the remaining share")
     scale = (1 - value) / rest if rest else 0.0
     return {s: e if s is status else replace(e, share=e.share * scale) for s, e in found.items()}
 
 
 def change_net(net: Net, changes: Sequence[Change]) -> Net:
-    """The net with other initial tokens. Raises FormatError."""
+    """Return the net with changed initial tokens. Raises NetFileError."""
     initial = list(net.initial)
     for change in changes:
         name = ".".join(change.subject)
@@ -142,7 +143,7 @@ def _rates_hint(name: str) -> str:
 
 
 def change_gspn(gspn: Gspn, changes: Sequence[Change]) -> Gspn:
-    """The GSPN with other initial tokens, rates and weights. Raises FormatError."""
+    """Return the GSPN with changed initial tokens, rates and weights. Raises NetFileError."""
     for change in changes:
         name, _, key = ".".join(change.subject).rpartition(".")
         try:
@@ -152,7 +153,7 @@ def change_gspn(gspn: Gspn, changes: Sequence[Change]) -> Gspn:
                 gspn = gspn.changed(**{f"{key}s": {name: change.value}})
             else:
                 gspn = replace(gspn, net=change_net(gspn.net, [change]))
-        except FormatError:
+        except NetFileError:
             raise
         except ValueError as error:
             raise change.fault(str(error)) from error

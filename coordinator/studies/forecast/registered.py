@@ -11,8 +11,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from petrobot.coordinator.analysis.net.space import Limits
-from petrobot.coordinator.analysis.time.completion import law
+from petrobot.coordinator.analysis.net.space import SearchLimits
+from petrobot.coordinator.analysis.time.completion import completion_time
 from petrobot.coordinator.analysis.time.stochastic import NoEstimate, stochastic_view
 from petrobot.coordinator.analysis.time.task_forecast import forecast as solve
 from petrobot.coordinator.learning.learning import Estimates
@@ -134,12 +134,12 @@ def exact(task: Task, estimates: Estimates, regime: str, choice: ChoiceShares) -
         view = stochastic_view(task, measured_from(task, estimates, context_of(regime), choice))
         if task.runs_place:
             view = replace(view, gspn=view.gspn.marked({task.runs_place: 1}))
-        found = solve(view, limits=Limits(states=LARGEST))
+        found = solve(view, limits=SearchLimits(states=LARGEST))
     except (NoEstimate, ValueError, ArithmeticError) as fault:
         return {"why": str(fault)}
     try:
         q90 = (
-            law(found.chain, found.done.goal, steps=JUMPS).quantile(0.9)
+            completion_time(found.chain, found.done.goal, steps=JUMPS).quantile(0.9)
             if found.completion_probability > 0
             else None
         )
