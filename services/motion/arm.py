@@ -29,7 +29,7 @@ import numpy as np
 from petrobot.services.device import Ports, Setpoint
 from petrobot.services.motion.arm_settings import Settings, drive_settings, numbers
 from petrobot.services.motion.barrier import Barrier
-from petrobot.services.motion.drive_master import DriveMaster, Phase
+from petrobot.services.motion.drive_master import DriveMaster, MasterPhase
 from petrobot.services.motion.following import Follower
 from petrobot.services.motion.interception import STRATEGIES, Interceptor, Strategy
 from petrobot.services.motion.kinematics import Puma, branch_of
@@ -186,7 +186,7 @@ class Arm:
         """Whether the arm stands still, held by its drives or its brakes."""
         if self._mode == "off":
             return (
-                self._master.phase is not Phase.RUNNING
+                self._master.phase is not MasterPhase.RUNNING
                 or max(map(abs, self._measured_speed)) < _STANDING
             )
         return self._trajectory.still and self._standing()

@@ -8,14 +8,14 @@ from typing import Final
 
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import SdoClient, Transfer, Type
+from petrobot.services.comm.canopen.cia301 import DataType, SdoClient, Transfer
 from petrobot.services.comm.canopen.cia402 import (
     ENABLING,
     RECEIVED,
     SENT,
-    Mode,
-    Object,
-    State,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     from_units,
     state_of,
@@ -35,13 +35,13 @@ SPEED_POLL: Final = 1.0
 LIMITED_POLL: Final = 0.02
 """The same while a drive says that it is too slow for its set points."""
 
-_MODE: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION
+_MODE: Final = OperationMode.CYCLIC_SYNCHRONOUS_POSITION
 _U8, _U16, _U32, _I8, _I32 = (
-    Type.UNSIGNED8,
-    Type.UNSIGNED16,
-    Type.UNSIGNED32,
-    Type.INTEGER8,
-    Type.INTEGER32,
+    DataType.UNSIGNED8,
+    DataType.UNSIGNED16,
+    DataType.UNSIGNED32,
+    DataType.INTEGER8,
+    DataType.INTEGER32,
 )
 _TPDO: Final = canopen.pdo_struct(SENT)
 _RPDO: Final = canopen.pdo_struct(RECEIVED)
@@ -65,7 +65,7 @@ class DriveLink:
         self.node = node
         self.settings = settings
         self.sdo = SdoClient(node)
-        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         self.limited = False
         """Whether the drive cuts its set points because they are faster than it goes."""
@@ -89,14 +89,18 @@ class DriveLink:
         settings = self.settings
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
-            Transfer(Object.MAX_SPEED, 0, _U32),
-            Transfer(Object.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
-            Transfer(Object.INTERPOLATION_PERIOD, 2, _I8, -3),
-            Transfer(Object.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
-            Transfer(Object.SOFTWARE_LIMITS, 2, _I32, to_units(settings.upper)),
-            Transfer(Object.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)),
-            Transfer(Object.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)),
-            Transfer(Object.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
+            Transfer(ObjectIndex.MAX_SPEED, 0, _U32),
+            Transfer(ObjectIndex.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
+            Transfer(ObjectIndex.INTERPOLATION_PERIOD, 2, _I8, -3),
+            Transfer(ObjectIndex.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
+            Transfer(ObjectIndex.SOFTWARE_LIMITS, 2, _I32, to_units(settings.upper)),
+            Transfer(
+                ObjectIndex.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)
+            ),
+            Transfer(
+                ObjectIndex.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)
+            ),
+            Transfer(ObjectIndex.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
             *pdo_transfers(self.node, RECEIVED),
         ]
 
@@ -105,7 +109,7 @@ class DriveLink:
         greatest speed."""
         wrong = unfit(self.node, self.sdo.results, _MODE)
         if not wrong:
-            self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
+            self.max_speed = from_units(self.sdo.results[ObjectIndex.MAX_SPEED, 0])
         return wrong
 
     def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
@@ -116,12 +120,12 @@ class DriveLink:
                 return self.sdo.advance(now)
             self._reading = False
             self.max_speed = from_units(
-                self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed))
+                self.sdo.results.get((ObjectIndex.MAX_SPEED, 0), to_units(self.max_speed))
             )
         if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
             return []
         self._asked, self._reading = now, True
-        self.sdo.begin([Transfer(Object.MAX_SPEED, 0, _U32)])
+        self.sdo.begin([Transfer(ObjectIndex.MAX_SPEED, 0, _U32)])
         return self.sdo.advance(now)
 
     def take(self, data: bytes) -> bool:
@@ -146,7 +150,7 @@ class DriveLink:
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """The RPDO: a controlword that leads to where the master wants the drive, and the target
         position (rad)."""
-        if wanted and self.state is State.OPERATION_ENABLED:
+        if wanted and self.state is DriveState.OPERATION_ENABLED:
             self._power.stopping = 0
             self.controlword = _GO_ON
         else:
@@ -162,5 +166,5 @@ class DriveLink:
         return sent[2]
 
 
-_GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
+_GO_ON: Final = ENABLING[DriveState.OPERATION_ENABLED].word
 """Controlword to a drive that follows its set points."""

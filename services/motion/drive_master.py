@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from typing import Final
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import Mapped, Type
-from petrobot.services.comm.canopen.cia402 import Fault
+from petrobot.services.comm.canopen.cia301 import DataType, Mapped
+from petrobot.services.comm.canopen.cia402 import DriveFault
 from petrobot.services.comm.canopen.master import (
     CanopenMaster,
     Companion,
-    Manner,
-    Phase,
+    MasterPhase,
+    Supervision,
     Trouble,
     companion_transfers,
 )
@@ -26,7 +26,7 @@ from petrobot.services.motion.drive_link import HEARTBEAT_PATIENCE, DriveLink, D
 SILENT_CYCLES: Final = 10
 """Cycles without a drive's TPDO after which it counts as lost."""
 INPUT_TIMER_MS: Final = 100
-INPUT_OBJECTS: Final = (Mapped(0x6000, 1, Type.UNSIGNED8),)
+INPUT_OBJECTS: Final = (Mapped(0x6000, 1, DataType.UNSIGNED8),)
 
 
 class DriveMaster(CanopenMaster[DriveLink]):
@@ -42,7 +42,11 @@ class DriveMaster(CanopenMaster[DriveLink]):
         transfers = companion_transfers(inputs, INPUT_TIMER_MS, INPUT_OBJECTS)
         companion = Companion(inputs, transfers, self._take_inputs)
         super().__init__(
-            drives, (companion,), cycle, Manner(SILENT_CYCLES, HEARTBEAT_PATIENCE), enable=enable
+            drives,
+            (companion,),
+            cycle,
+            Supervision(SILENT_CYCLES, HEARTBEAT_PATIENCE),
+            enable=enable,
         )
 
     @property
@@ -56,7 +60,7 @@ class DriveMaster(CanopenMaster[DriveLink]):
         return tuple([drive.max_speed for drive in self.drives])
 
     def give_up(
-        self, why: str, cause: str = "drive_fault", code: int = Fault.FOLLOWING_ERROR
+        self, why: str, cause: str = "drive_fault", code: int = DriveFault.FOLLOWING_ERROR
     ) -> None:
         """The servo itself stops the drives quickly, with the next cycle: they do not follow, or in
         an emergency."""
@@ -65,7 +69,7 @@ class DriveMaster(CanopenMaster[DriveLink]):
     def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
         """Frames of one cycle: configuration, or set points (rad), SYNC and now and then the
         question how fast a drive goes."""
-        configuring = self.phase is Phase.CONFIGURING
+        configuring = self.phase is MasterPhase.CONFIGURING
         frames = super().advance(now, targets)
         if not configuring:
             hurry = self.limited
@@ -80,4 +84,4 @@ class DriveMaster(CanopenMaster[DriveLink]):
             self.inputs = data[0]
 
 
-__all__ = ["DriveMaster", "Phase", "Trouble"]
+__all__ = ["DriveMaster", "MasterPhase", "Trouble"]

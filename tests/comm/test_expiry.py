@@ -20,10 +20,9 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.node_status import ask_all
-from petrobot.services.comm.calls.callee import Callee, Offer
+from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.orders import Order
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m

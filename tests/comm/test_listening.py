@@ -10,8 +10,12 @@ from pathlib import Path
 import pytest
 
 from petrobot.services.__main__ import main
-from petrobot.services.comm.calls.listening import cannot_listen, listening, refuse_unusable
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.comm.location_file.host_checks import (
+    cannot_listen,
+    listening,
+    refuse_unusable,
+)
 from petrobot.services.comm.lockstep.cell import CellError
 from petrobot.services.comm.lockstep.mesh import Member
 from tests.ports import free_ports

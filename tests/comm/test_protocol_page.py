@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.calls.active import Patience
-from petrobot.services.comm.calls.link import Timing
-from petrobot.services.comm.calls.results import Keeping
+from petrobot.services.comm.calls.link import LinkTiming
+from petrobot.services.comm.calls.pending import Patience
+from petrobot.services.comm.calls.runs import Retention
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS
 from tests.comm.conftest import KINDS
@@ -66,15 +66,20 @@ def test_the_codes_and_causes_are_the_codes() -> None:
 
 
 def test_the_times() -> None:
-    assert (Timing().heartbeat, Timing().silence, Timing().handshake, Timing().user_timeout) == (
+    assert (
+        LinkTiming().heartbeat,
+        LinkTiming().silence,
+        LinkTiming().handshake,
+        LinkTiming().user_timeout,
+    ) == (
         0.25,
         1.0,
         2.0,
         1.5,
     )
     assert (Patience().reconnect, Patience().accept, Patience().stop) == (2.0, 1.0, 5.0)
-    assert (Keeping().results, Keeping().result_count, Keeping().lease) == (600.0, 1_000, 2.0)
-    assert Keeping().id_groups == 100_000
+    assert (Retention().results, Retention().result_count, Retention().lease) == (600.0, 1_000, 2.0)
+    assert Retention().id_groups == 100_000
     for said in (
         "after 0.25 s",
         "for 1.0 s",

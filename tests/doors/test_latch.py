@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.calls.latch import ALL, STATE, Latch, LatchError, latch_of
+from petrobot.services.host.emergency_latch import ALL, STATE, Latch, LatchError, latch_of
 from petrobot.services.node.emergency_stops import LOOK, NEVER, EmergencyStops
 
 DEVICES = ("arm", "camera", "gripper")
@@ -78,7 +78,7 @@ def test_a_node_that_can_keep_no_latch_comes_up_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It cannot know whether it was stopped: no file is no proof where none can be."""
-    monkeypatch.setattr("petrobot.services.comm.calls.latch._writable", lambda folder: False)
+    monkeypatch.setattr("petrobot.services.host.emergency_latch._writable", lambda folder: False)
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == list(DEVICES)
     assert stops.clear(DEVICES) == "" and stops.names == (), (

@@ -9,7 +9,7 @@ reports back with `finish`, `feedback`, `raise_event` and `answer`. What it prom
   whose result is gone is remembered as an id. Once the memory for ids was full
   (`FinishedIds.complete`), a call that may have been sent before (`Call.again`) and is not known
   does not run: it may be among those forgotten.
-- Every run ends with one outcome, kept until its caller acknowledges it or `Keeping.results` is
+- Every run ends with one outcome, kept until its caller acknowledges it or `Retention.results` is
   over.
 - A run goes on no longer than its deadline, and no longer without its caller than its offer's
   `orphan_time`.
@@ -25,14 +25,24 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from petrobot.services.comm.calls.deadlines import DEADLINE, NEVER, GoingRuns, Run
 from petrobot.services.comm.calls.events import EventBoard
-from petrobot.services.comm.calls.orders import CancelRun, Commanded, Inline, Offer, Order, StartRun
-from petrobot.services.comm.calls.peers import COORDINATOR, Peers
-from petrobot.services.comm.calls.results import Keeping, ResultStore
+from petrobot.services.comm.calls.peers import (
+    COORDINATOR,
+    Inline,
+    Offer,
+    Peers,
+)
+from petrobot.services.comm.calls.runs import (
+    DEADLINE,
+    NEVER,
+    ActiveRun,
+    ActiveRuns,
+    ResultStore,
+    Retention,
+)
 from petrobot.services.comm.protocol.messages import (
     Accept,
     Answer,
@@ -57,13 +67,51 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, negotiate
 
-__all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Order", "StartRun"]
+__all__ = [
+    "Callee",
+    "CancelOrder",
+    "CommandOrder",
+    "Inline",
+    "Offer",
+    "Order",
+    "Retention",
+    "StartOrder",
+]
 
 ERROR: Final = "error"
 HOLD, RELEASE, HELD = "hold", "release", "held"
 ANSWERS: Final = 64
 """Answers to commands that are kept. A command is repeated at once or never, and an answer is some
 hundred bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class StartOrder:
+    """Order: begin this run, report back with `finish`."""
+
+    call: Call
+    peer: str
+
+
+@dataclass(frozen=True, slots=True)
+class CancelOrder:
+    """Order: stop this run (stop routine first); `finish` still reports its end. Given once a
+    run."""
+
+    id: str
+    reason: str
+    """"cancelled", "deadline" or "orphan", or the caller's own words."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandOrder:
+    """Order: carry out a command, report back with `answer`."""
+
+    command: Command
+    peer: str
+
+
+Order = StartOrder | CancelOrder | CommandOrder
 
 
 class Callee:
@@ -82,7 +130,7 @@ class Callee:
         *,
         directory: str = "",
         any_directory: bool = False,
-        keeping: Keeping | None = None,
+        keeping: Retention | None = None,
     ) -> None:
         self.name = name
         self.boot = boot
@@ -92,9 +140,9 @@ class Callee:
         self.soonest = NEVER
         """Never later than `due` (s): a shell whose timer is set for no later time need not ask for
         that."""
-        self._keeping = keeping or Keeping()
+        self._keeping = keeping or Retention()
         self._peers = Peers(name, directory, any_directory, self._keeping.lease)
-        self._running = GoingRuns()
+        self._running = ActiveRuns()
         self._results = ResultStore(self._keeping, self.events.forget_run)
         self._commands: dict[str, tuple[str, str]] = {}
         """Peer and verb of each command that waits for its answer."""
@@ -270,13 +318,13 @@ class Callee:
             return Outcome(call.id, ERROR, {}, "crashed", text, Executed.UNKNOWN)
 
     def _start(self, now: float, peer: str, call: Call, offer: Offer) -> None:
-        self._running[call.id] = Run(call, peer, now, offer.device, offer.orphan_time)
+        self._running[call.id] = ActiveRun(call, peer, now, offer.device, offer.orphan_time)
         deadline = call.deadline if call.deadline is not None else offer.deadline
         if deadline is not None:
             self._running.limit(call.id, now + deadline)
             self.soonest = min(self.soonest, now + deadline)
         self._messages.append((peer, Accept(call.id)))
-        self._orders.append(StartRun(call, peer))
+        self._orders.append(StartOrder(call, peer))
 
     def _take_ack(self, now: float, peer: str, ack: ResultAck) -> None:
         self._results.acknowledge(peer, (ack.id, *ack.more))
@@ -313,7 +361,7 @@ class Callee:
         if command.verb == RELEASE:
             self._running.release_all(now, [command.target] if command.target else None)
             self.soonest = min(self.soonest, self._running.due())
-        self._orders.append(Commanded(command, peer))
+        self._orders.append(CommandOrder(command, peer))
 
     def _known_command(self, peer: str, id_: str) -> None:
         """A command that came before is not carried out again: its answer is said again, or comes
@@ -451,7 +499,7 @@ class Callee:
                 self._stop(id_, run, kind, kind)
         self._results.advance(now)
 
-    def _is_orphan(self, run: Run, now: float) -> bool:
+    def _is_orphan(self, run: ActiveRun, now: float) -> bool:
         return run.orphan_time is not None and self._peers.is_away(now, run.peer, run.orphan_time)
 
     def due(self) -> float | None:
@@ -461,10 +509,10 @@ class Callee:
         self.soonest = soonest if results is None else min(soonest, results)
         return self.soonest if self.soonest < NEVER else None
 
-    def _stop(self, id_: str, run: Run, reason: str, cause: str) -> None:
+    def _stop(self, id_: str, run: ActiveRun, reason: str, cause: str) -> None:
         if not run.stopping:
             run.stopping, run.reason = True, cause
-            self._orders.append(CancelRun(id_, reason))
+            self._orders.append(CancelOrder(id_, reason))
 
     def _end(self, now: float, peer: str, outcome: Outcome) -> None:
         self._results.add(now, peer, outcome)

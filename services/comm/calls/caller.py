@@ -4,7 +4,7 @@ in.
 Used alike in real time (`client.py` drives it) and in lock step (its messages travel in envelopes).
 What it promises:
 
-- Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
+- Every call ends with exactly one `CallEnded`, whatever happens to the link or the peer.
 - No call is ever made again under another id. After a lost link the same call is sent again under
   the same id to the same
   boot of the peer, marked `again`: the peer knows the id, or says that it may have forgotten it,
@@ -18,39 +18,118 @@ What it promises:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from petrobot.services.comm.calls.acknowledgements import Settled
-from petrobot.services.comm.calls.active import NEVER, Patience, Pending, UnderWay, Waiter
 from petrobot.services.comm.calls.events import EventIntake
-from petrobot.services.comm.calls.notices import (
-    Accepted,
-    Answered,
-    Ended,
-    EventArrived,
-    Late,
-    Notice,
-    PeerBack,
-    PeerLost,
-    Progress,
+from petrobot.services.comm.calls.pending import (
+    LOST,
+    NEVER,
+    REFUSED,
+    UNREACHABLE,
+    FinishedCalls,
+    Patience,
+    PeerAbsence,
+    PendingCall,
+    PendingCalls,
+    Waiter,
 )
-from petrobot.services.comm.calls.reconnect import LOST, REFUSED, UNREACHABLE, Absence
 from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Answer, Event, Outcome
 from petrobot.services.comm.protocol.plain import plain
 
+# What a caller tells its owner.
+
+
+@dataclass(frozen=True, slots=True)
+class CallAccepted:
+    """The peer took the call; its run begins."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class CallProgress:
+    """How far a run is (0 to 1)."""
+
+    id: str
+    fraction: float
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CallEnded:
+    """The one end of a call."""
+
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class LateResult:
+    """The peer's own result of a call that had ended here before (lost, given up): to be recorded;
+    it moves nothing."""
+
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class EventArrived:
+    """An event, each number of a source once."""
+
+    event: Event
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAnswered:
+    """Answer to a command; `ok` False with data `cause` when the peer gave none."""
+
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLost:
+    """The link is down."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PeerBack:
+    """The link is up. `runs` are ids that the peer still runs or whose results it keeps for this
+    caller's name."""
+
+    name: str
+    boot: str
+    same_boot: bool
+    """Whether it is the boot of the last link (False at the first)."""
+    offers: tuple[str, ...]
+    runs: tuple[str, ...]
+
+
+Notice = (
+    CallAccepted
+    | CallProgress
+    | CallEnded
+    | LateResult
+    | EventArrived
+    | CommandAnswered
+    | PeerLost
+    | PeerBack
+)
+
+
 __all__ = [
-    "Accepted",
-    "Answered",
+    "CallAccepted",
+    "CallEnded",
     "Caller",
-    "Ended",
+    "CommandAnswered",
     "EventArrived",
-    "Late",
+    "LateResult",
     "Notice",
     "Patience",
     "PeerBack",
 ]
-__all__ += ["PeerLost", "Progress"]
+__all__ += ["CallProgress", "PeerLost"]
 
 ERROR: Final = "error"
 
@@ -76,12 +155,12 @@ class Caller:
         that."""
         self._auto_ack = auto_ack
         self._patience = patience or Patience()
-        self._absence = Absence(peer, self._patience)
-        self._pending = UnderWay()
+        self._absence = PeerAbsence(peer, self._patience)
+        self._pending = PendingCalls()
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
-        self._settled = Settled(self._patience.acknowledge)
+        self._settled = FinishedCalls(self._patience.acknowledge)
         self._messages: list[m.Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
@@ -159,16 +238,16 @@ class Caller:
         )
         if self.up:
             due = now + self._patience.accept
-            self._pending[id] = Pending(call, not boot, now, waiter, True, False, None, due)
+            self._pending[id] = PendingCall(call, not boot, now, waiter, True, False, None, due)
             self._pending.watch_new(due, id)
             self._messages.append(call)
             if due < self.soonest:
                 self.soonest = due
         else:
-            self._begin_unsent(now, Pending(call, not boot, now, waiter))
+            self._begin_unsent(now, PendingCall(call, not boot, now, waiter))
         return len(self._messages)
 
-    def _begin_unsent(self, now: float, pending: Pending) -> None:
+    def _begin_unsent(self, now: float, pending: PendingCall) -> None:
         self._pending[pending.call.id] = pending
         away = self._absence.new_call(now)
         self.soonest = min(self.soonest, self._absence.until)
@@ -176,7 +255,7 @@ class Caller:
             self._end(pending.call.id, *away, pending.if_unsent)
 
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
-        """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the
+        """Ask for a call's run to be stopped; it still ends with one `CallEnded`, `no_answer` if the
         peer does not say so `within` seconds (None: `Patience.stop`). An id that is not under way
         is left alone.
         """
@@ -231,7 +310,7 @@ class Caller:
 
     def disown(self, now: float, id: str) -> None:  # noqa: A002
         """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes
-        as `Late`."""
+        as `LateResult`."""
         if id not in self._pending and self.up:
             self._settled.give_up(id)
             self._messages.append(m.Cancel(id, "disowned"))
@@ -347,7 +426,7 @@ class Caller:
                 safe.append(id_)
             else:
                 self._settled.end(id_, False)
-            self._notices.append(Ended(outcome))
+            self._notices.append(CallEnded(outcome))
         if safe:
             self._ack(now, *safe)
 
@@ -357,7 +436,7 @@ class Caller:
         if safe is None:
             self._settled.turn_up(id_)
             if outcome.executed is not m.Executed.UNKNOWN:
-                self._notices.append(Late(outcome))
+                self._notices.append(LateResult(outcome))
         if safe is not False:
             self._ack(now, id_)
 
@@ -366,13 +445,13 @@ class Caller:
         if pending is None or pending.accepted:
             return
         pending.accepted = True
-        self._notices.append(Accepted(accept.id))
+        self._notices.append(CallAccepted(accept.id))
         if pending.call.deadline is not None:
             self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
 
     def _take_feedback(self, now: float, feedback: m.Feedback) -> None:
         if feedback.id in self._pending:
-            self._notices.append(Progress(feedback.id, feedback.fraction, feedback.data))
+            self._notices.append(CallProgress(feedback.id, feedback.fraction, feedback.data))
 
     def _take_event(self, now: float, event: m.Event) -> None:
         new, ack = self._events.take(event, self._auto_ack)
@@ -383,7 +462,7 @@ class Caller:
 
     def _take_answer(self, now: float, answer: m.Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
-            self._notices.append(Answered(answer))
+            self._notices.append(CommandAnswered(answer))
 
     def advance(self, now: float) -> None:
         """End what has waited too long."""
@@ -431,7 +510,7 @@ class Caller:
         notices, self._notices = self._notices, []
         return notices
 
-    def _send(self, now: float, pending: Pending) -> None:
+    def _send(self, now: float, pending: PendingCall) -> None:
         call = pending.call
         if pending.any_boot and call.boot != self.boot:
             call = pending.call = replace(call, boot=self.boot)
@@ -443,7 +522,7 @@ class Caller:
         self._messages.append(call)
         self.soonest = min(self.soonest, due)
 
-    def _watch(self, pending: Pending, due: float) -> None:
+    def _watch(self, pending: PendingCall, due: float) -> None:
         self._pending.watch_result(pending, due)
         self.soonest = min(self.soonest, due)
 
@@ -468,10 +547,10 @@ class Caller:
             self._settled.give_up(id_)
         outcome, waiter = m.Outcome(id_, ERROR, {}, cause, text, executed), pending.waiter
         if waiter is None:
-            self._notices.append(Ended(outcome))
+            self._notices.append(CallEnded(outcome))
         elif not waiter.done():
             waiter.set_result(outcome)
 
     def _no_answer(self, id_: str, cause: str) -> None:
         self._commands.pop(id_, None)
-        self._notices.append(Answered(m.Answer(id_, False, {"cause": cause})))
+        self._notices.append(CommandAnswered(m.Answer(id_, False, {"cause": cause})))

@@ -18,16 +18,16 @@ import ssl
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-from petrobot.services.comm.calls.active import NEVER
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.link import (
     READ_BUFFER,
-    Limits,
-    Link,
-    Timing,
+    AsyncLink,
+    LinkLimits,
+    LinkTiming,
     clock_of,
     futures_of,
 )
+from petrobot.services.comm.calls.pending import NEVER
 from petrobot.services.comm.protocol.messages import (
     Bye,
     Call,
@@ -38,7 +38,7 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
 )
 from petrobot.services.comm.protocol.security import UNPROVEN, Keys
-from petrobot.services.comm.protocol.wire import ProtocolError, Side, State
+from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
 
 OnNotices = Callable[[float, list[Notice]], None]
 NOT_TRUSTED = (
@@ -58,7 +58,7 @@ AT_ONCE = 32
 """Calls that share one write: the peer takes them in while the next ones are made."""
 
 
-class _ClientLink(Link):
+class _ClientLink(AsyncLink):
     """One connection to the peer."""
 
     def __init__(self, client: Client) -> None:
@@ -121,8 +121,8 @@ class Client:
         on_notices: OnNotices | None = None,
         key: Keys | None = None,
         tls: ssl.SSLContext | None = None,
-        timing: Timing | None = None,
-        limits: Limits | None = None,
+        timing: LinkTiming | None = None,
+        limits: LinkLimits | None = None,
     ) -> None:
         """`key`: the shared key, or all that are accepted. `tls`: mutual TLS; the other end must
         show the certificate of the caller's peer. With any of them, and without, the other end must
@@ -140,8 +140,8 @@ class Client:
         self.answered = False
         """Whether somebody answered the last attempt, be it by a refusal: then nobody needs to be
         launched there."""
-        self.timing = timing or Timing()
-        self.limits = limits or Limits()
+        self.timing = timing or LinkTiming()
+        self.limits = limits or LinkLimits()
         self.buffer = bytearray(READ_BUFFER)
         self._on_notices = on_notices
         self._link: _ClientLink | None = None
@@ -183,7 +183,7 @@ class Client:
             await asyncio.gather(self._task, return_exceptions=True)
         link = self._link
         if link is not None:
-            link.end(text, Bye(text) if link.connection.state is State.OPEN else None)
+            link.end(text, Bye(text) if link.connection.state is ConnectionState.OPEN else None)
             await link.finished.wait()
         if self._timer is not None:
             self._timer.cancel()

@@ -24,7 +24,7 @@ from petrobot.services.comm.protocol.messages import (
     Refuse,
 )
 from petrobot.services.comm.protocol.security import NONCE_BYTES, Keys
-from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side, State
+from petrobot.services.comm.protocol.wire import Connection, ConnectionState, ProtocolError, Side
 
 READ_BUFFER = 1 << 16
 """Bytes read at once. What is in them is taken apart before another link is read: so many empty
@@ -39,7 +39,7 @@ _OWN = frozenset((Ping, Pong, Bye, Refuse))
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
+class LinkTiming:
     """Of a link (s)."""
 
     heartbeat: float = 0.25
@@ -55,7 +55,7 @@ class Timing:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class LinkLimits:
     """Of a server and its links."""
 
     connections: int = 256
@@ -88,12 +88,12 @@ class Beat(Enum):
     LOST = auto()
 
 
-class Heart:
+class Heartbeat:
     """Silence of the other side, as a machine without clock."""
 
     __slots__ = ("_due", "_timing", "heard")
 
-    def __init__(self, now: float, timing: Timing) -> None:
+    def __init__(self, now: float, timing: LinkTiming) -> None:
         self._timing = timing
         self.heard = now
         """When something last came (s); set by whoever takes it in."""
@@ -117,7 +117,7 @@ class Heart:
         return self._due
 
 
-class Link(asyncio.BufferedProtocol):
+class AsyncLink(asyncio.BufferedProtocol):
     """Base of both ends. Subclasses take messages in `took`, the end of the link in `over`.
 
     `buffer` is what bytes are read into, shared by all links of an owner: they are taken out before
@@ -130,8 +130,8 @@ class Link(asyncio.BufferedProtocol):
         side: Side,
         server: str,
         key: Keys | None,
-        timing: Timing,
-        limits: Limits,
+        timing: LinkTiming,
+        limits: LinkLimits,
         buffer: bytearray,
     ) -> None:
         nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
@@ -150,7 +150,7 @@ class Link(asyncio.BufferedProtocol):
         go before all else."""
         self._view = memoryview(buffer)
         self._transport: asyncio.Transport | None = None
-        self._heart = Heart(0.0, timing)
+        self._heart = Heartbeat(0.0, timing)
         self._unheard = 0
         """Bytes of a frame that is not complete, since something was last heard."""
         self._timer: asyncio.TimerHandle | None = None
@@ -261,7 +261,7 @@ class Link(asyncio.BufferedProtocol):
         """The handshake is over: the heart beats from now on."""
         self._opening = False
         now = self.now()
-        self._heart = Heart(now, self.timing)
+        self._heart = Heartbeat(now, self.timing)
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
@@ -313,7 +313,7 @@ class Link(asyncio.BufferedProtocol):
         try:
             return self.connection.send(message)
         except ProtocolError as fault:
-            if self.connection.state is not State.OPEN:
+            if self.connection.state is not ConnectionState.OPEN:
                 return (
                     b""  # its last word came with what is being answered: nobody listens any more
                 )
@@ -399,7 +399,7 @@ def _host(address: object) -> str:
     return str(address[0]) if isinstance(address, tuple) and address else ""
 
 
-def _tune(sock: socket.socket, timing: Timing) -> None:
+def _tune(sock: socket.socket, timing: LinkTiming) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)

@@ -6,9 +6,31 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from petrobot.services.comm.calls.orders import Offer
-from petrobot.services.comm.protocol.messages import Call, Hello, Refuse
+from petrobot.services.comm.protocol.messages import Call, Hello, Outcome, Refuse
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
+
+# What a node offers to its callers, and what its callee orders it to do.
+
+Inline = Callable[[float, Call], Outcome]
+"""A service answered on the spot, in the node's loop: (now, call) to outcome. It must neither wait
+nor compute for long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """An action or service of this node."""
+
+    scope: str = "network"
+    """"network", or "local": for callers on this host alone."""
+    device: str = ""
+    orphan_time: float | None = None
+    """Seconds that a run goes on without its caller; None: for ever."""
+    deadline: float | None = None
+    """Seconds for a call that names none."""
+    inline: Inline | None = None
+    roles: frozenset[str] = frozenset()
+    """Roles of the callers that may call it; none: all."""
+
 
 COORDINATOR: Final = "coordinator"
 NODE: Final = "node"

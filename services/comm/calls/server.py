@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections import OrderedDict
 from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import Final
 
 from petrobot.services.comm.calls.callee import Callee, Order
-from petrobot.services.comm.calls.connection_limits import Bucket, Knocks
-from petrobot.services.comm.calls.link import READ_BUFFER, Limits, Link, Timing
+from petrobot.services.comm.calls.link import READ_BUFFER, AsyncLink, LinkLimits, LinkTiming
 from petrobot.services.comm.protocol.messages import (
     Answer,
     Bye,
@@ -30,10 +31,65 @@ from petrobot.services.comm.protocol.messages import (
     Refuse,
 )
 from petrobot.services.comm.protocol.security import Keys, is_loopback, require_key
-from petrobot.services.comm.protocol.wire import ProtocolError, Side, State
+from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
 from petrobot.services.comm.tls.credentials import may_speak_as, name_on
 from petrobot.services.comm.tls.expiry import DAY, look_again
 from petrobot.services.comm.tls.listener import Admission, TlsListener
+
+# Who may knock, and how fast one may speak: limits of a listening end as machines without
+# clock.
+
+KNOWN: Final = 1_024
+"""Addresses whose failures are remembered; then the one that failed longest ago is forgotten."""
+
+
+class TokenBucket:
+    """A token bucket: on average `rate` a second, at once at most `burst`."""
+
+    __slots__ = ("_at", "_burst", "_level", "_rate")
+
+    def __init__(self, rate: float, burst: float, now: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._level, self._at = burst, now
+
+    def level(self, now: float) -> float:
+        """What is left; below 0 it is owed."""
+        self._level = min(self._burst, self._level + (now - self._at) * self._rate)
+        self._at = now
+        return self._level
+
+    def take(self, now: float, amount: float) -> float:
+        """Take so much; gives the seconds after which it is no longer owed (0: it was there)."""
+        self._level = self.level(now) - amount
+        return max(0.0, -self._level / self._rate)
+
+
+class FailedHandshakes:
+    """Handshakes that failed, by address: a stranger who tries keys, or only connects, is not even
+    listened to for a while.
+
+    A good caller fails none, so it is never kept waiting by its own address; `rate` a second and
+    `burst` at once are allowed.
+    """
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
+
+    def admits(self, now: float, address: str) -> bool:
+        """Whether this address may try a handshake."""
+        bucket = self._buckets.get(address)
+        return bucket is None or bucket.level(now) >= 1.0
+
+    def failed(self, now: float, address: str) -> None:
+        """A handshake of this address came to nothing."""
+        bucket = self._buckets.pop(address, None) or TokenBucket(self._rate, self._burst, now)
+        self._buckets[address] = bucket
+        if bucket.level(now) >= 1.0:
+            bucket.take(now, 1.0)
+        if len(self._buckets) > KNOWN:
+            self._buckets.popitem(last=False)
+
 
 OnOrders = Callable[[float, list[Order]], None]
 AT_ONCE = 16
@@ -47,7 +103,7 @@ COUNTED = 256
 """Messages of a caller after which its rate is looked at."""
 
 
-class _ServerLink(Link):
+class _ServerLink(AsyncLink):
     """A caller's connection."""
 
     def __init__(self, server: Server) -> None:
@@ -60,7 +116,7 @@ class _ServerLink(Link):
         self.address = ""
         limits = server.limits
         self._taken = 0
-        self._budget = Bucket(limits.messages, limits.messages_at_once, self.now())
+        self._budget = TokenBucket(limits.messages, limits.messages_at_once, self.now())
 
     def made(self) -> None:
         self.address, _ = self.ends()
@@ -103,7 +159,7 @@ class _ServerLink(Link):
         try:
             return answer, self.connection.send(answer)
         except ProtocolError as fault:
-            if self.connection.state is not State.OPEN:
+            if self.connection.state is not ConnectionState.OPEN:
                 return (
                     answer,
                     b"",
@@ -199,15 +255,15 @@ class Server:
         on_orders: OnOrders | None = None,
         key: Keys | None = None,
         tls: ssl.SSLContext | None = None,
-        timing: Timing | None = None,
-        limits: Limits | None = None,
+        timing: LinkTiming | None = None,
+        limits: LinkLimits | None = None,
     ) -> None:
         """`tls`: mutual TLS; each caller speaks under the name on its certificate."""
         self.callee = callee
         self.key = key
         self.tls = tls
-        self.timing = timing or Timing()
-        self.limits = limits or Limits()
+        self.timing = timing or LinkTiming()
+        self.limits = limits or LinkLimits()
         self.faults: dict[str, int] = {}
         """How often callers broke the protocol, by code."""
         self.buffer = bytearray(READ_BUFFER)
@@ -216,7 +272,7 @@ class Server:
         self._opening: dict[_ServerLink, None] = {}
         self._all: set[_ServerLink] = set()
         self._server: asyncio.Server | TlsListener | None = None
-        self._knocks = Knocks(self.limits.handshakes, self.limits.handshakes_at_once)
+        self._knocks = FailedHandshakes(self.limits.handshakes, self.limits.handshakes_at_once)
         self._timer: asyncio.TimerHandle | None = None
         self._daily: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -264,7 +320,7 @@ class Server:
         if self._server is not None:
             self._server.close()
         for link in list(self._all):
-            if link.connection.state is State.OPEN:
+            if link.connection.state is ConnectionState.OPEN:
                 link.end(text, Bye(text))
             else:
                 link.cut(text)

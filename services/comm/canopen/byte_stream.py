@@ -129,7 +129,7 @@ def _is_loopback(host: str) -> bool:
     return host == "localhost"
 
 
-class Line:
+class FrameSocket:
     """A connected non-blocking socket that carries frames."""
 
     def __init__(self, sock: socket.socket) -> None:
@@ -194,7 +194,7 @@ class Line:
         self.sock.close()
 
 
-def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> Line:
+def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> FrameSocket:
     """A line to the hub of a channel; raises ConnectionError if there is none, ValueError for a bad
     channel."""
     family, address = parse_channel(channel, allow_remote)
@@ -202,7 +202,7 @@ def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> L
     try:
         sock.settimeout(timeout)
         sock.connect(address)
-        return Line(sock)
+        return FrameSocket(sock)
     except OSError as reason:
         sock.close()
         raise ConnectionError(

@@ -48,7 +48,7 @@ class NmtState(IntEnum):
     PREOPERATIONAL = 0x7F
 
 
-class Type(IntEnum):
+class DataType(IntEnum):
     """Static data types and their codes in EDS files (CiA 301, table 44)."""
 
     BOOLEAN = 0x01
@@ -81,17 +81,17 @@ class Type(IntEnum):
 
 
 _STRUCT: Final = {
-    Type.BOOLEAN: struct.Struct("<?"),
-    Type.INTEGER8: struct.Struct("<b"),
-    Type.INTEGER16: struct.Struct("<h"),
-    Type.INTEGER32: struct.Struct("<i"),
-    Type.UNSIGNED8: struct.Struct("<B"),
-    Type.UNSIGNED16: struct.Struct("<H"),
-    Type.UNSIGNED32: struct.Struct("<I"),
+    DataType.BOOLEAN: struct.Struct("<?"),
+    DataType.INTEGER8: struct.Struct("<b"),
+    DataType.INTEGER16: struct.Struct("<h"),
+    DataType.INTEGER32: struct.Struct("<i"),
+    DataType.UNSIGNED8: struct.Struct("<B"),
+    DataType.UNSIGNED16: struct.Struct("<H"),
+    DataType.UNSIGNED32: struct.Struct("<I"),
 }
 
 
-class Abort(IntEnum):
+class AbortCode(IntEnum):
     """SDO abort codes (CiA 301, table 22)."""
 
     TOGGLE = 0x05030000
@@ -121,8 +121,8 @@ class SdoAbortError(Exception):
 
     def __init__(self, code: int, index: int = 0, sub: int = 0) -> None:
         name = (
-            Abort(code).name.lower().replace("_", " ")
-            if code in Abort._value2member_map_
+            AbortCode(code).name.lower().replace("_", " ")
+            if code in AbortCode._value2member_map_
             else "unknown"
         )
         super().__init__(f"SDO abort {code:#010x} ({name}) at {index:#06x}:{sub}")
@@ -227,7 +227,7 @@ def parse_sdo(frame: Frame) -> SdoMessage:
     if kind in (0x20, 0x40) and command & 0x02:
         size = 4 - (command >> 2 & 0x03) if command & 0x01 else 4
         return SdoMessage(kind, index, sub, frame.data[4 : 4 + size])
-    raise SdoAbortError(Abort.COMMAND, index, sub)
+    raise SdoAbortError(AbortCode.COMMAND, index, sub)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +236,7 @@ class Mapped:
 
     index: int
     sub: int
-    type: Type
+    type: DataType
 
     @property
     def entry(self) -> int:
@@ -258,7 +258,7 @@ class Transfer:
 
     index: int
     sub: int
-    type: Type
+    type: DataType
     value: int | None = None
 
 
@@ -274,7 +274,7 @@ def map_pdo(
     `parameters` and `mapping` are the indices of its two records (1400h and 1600h, or 1800h and
     1A00h).
     """
-    u8, u32 = Type.UNSIGNED8, Type.UNSIGNED32
+    u8, u32 = DataType.UNSIGNED8, DataType.UNSIGNED32
     return [
         Transfer(parameters, 1, u32, cob_id | PDO_OFF),
         Transfer(parameters, 2, u8, transmission),
@@ -325,7 +325,10 @@ class SdoClient:
                 )
                 return [
                     sdo_abort(
-                        SDO_REQUEST_BASE + self.node, transfer.index, transfer.sub, Abort.TIMEOUT
+                        SDO_REQUEST_BASE + self.node,
+                        transfer.index,
+                        transfer.sub,
+                        AbortCode.TIMEOUT,
                     )
                 ]
             return []
@@ -355,7 +358,7 @@ class SdoClient:
         if reply.command == 0x80:
             raise SdoAbortError(int.from_bytes(reply.data, "little"), reply.index, reply.sub)
         if reply.command != (0x40 if transfer.value is None else 0x60):
-            raise SdoAbortError(Abort.COMMAND, reply.index, reply.sub)
+            raise SdoAbortError(AbortCode.COMMAND, reply.index, reply.sub)
         if transfer.value is None:
             self.results[transfer.index, transfer.sub] = transfer.type.unpack(reply.data)
         self._queue.popleft()

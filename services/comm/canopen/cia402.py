@@ -10,7 +10,7 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Final
 
-from petrobot.services.comm.canopen.cia301 import Mapped, Type
+from petrobot.services.comm.canopen.cia301 import DataType, Mapped
 
 UNITS: Final = 1e6
 """Position units in a radian and speed units in a radian per second."""
@@ -26,7 +26,7 @@ def from_units(units: int) -> float:
     return units / UNITS
 
 
-class State(Enum):
+class DriveState(Enum):
     """The power drive system's states; the value is (mask, pattern) of the statusword's low byte
     (CiA 402-2, table 31)."""
 
@@ -57,7 +57,7 @@ class StatusBit(IntEnum):
     FOLLOWING_ERROR = 1 << 13
 
 
-class Command(Enum):
+class DriveCommand(Enum):
     """Commands; the value is (mask, pattern) of the controlword (CiA 402-2, table 29). FAULT_RESET
     acts on its rising edge."""
 
@@ -73,7 +73,7 @@ class Command(Enum):
         """A controlword that gives this command."""
 
 
-class Mode(IntEnum):
+class OperationMode(IntEnum):
     """Modes of operation (6060h)."""
 
     NONE = 0
@@ -86,14 +86,14 @@ class Mode(IntEnum):
         return 1 << (self.value - 1)
 
 
-SUPPORTED_MODES: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION.bit
+SUPPORTED_MODES: Final = OperationMode.CYCLIC_SYNCHRONOUS_POSITION.bit
 """Object 6502h of a drive that knows cyclic synchronous position alone."""
 
 DEVICE_TYPE: Final = 0x0002_0192
 """Object 1000h of a servo drive (profile 402)."""
 
 
-class Fault(IntEnum):
+class DriveFault(IntEnum):
     """Error codes of EMCY and 603Fh (CiA 301 table 26, CiA 402-2 annex)."""
 
     NONE = 0x0000
@@ -109,27 +109,29 @@ class Fault(IntEnum):
 
 
 FAULT_TEXT: Final = {
-    Fault.NONE: "no error",
-    Fault.OVERCURRENT: "over-current at the motor",
-    Fault.UNDERVOLTAGE: "no power at the drive: the arm-power chain is open",
-    Fault.OVERHEATED: "drive too hot",
-    Fault.ENCODER: "encoder fault",
-    Fault.CAN_PASSIVE: "too many bus errors",
-    Fault.HEARTBEAT: "the master's heartbeat was lost",
-    Fault.BUS_OFF_RECOVERED: "the bus was off",
-    Fault.SYNC_LOST: "SYNC was lost",
-    Fault.FOLLOWING_ERROR: "following error too large",
+    DriveFault.NONE: "no error",
+    DriveFault.OVERCURRENT: "over-current at the motor",
+    DriveFault.UNDERVOLTAGE: "no power at the drive: the arm-power chain is open",
+    DriveFault.OVERHEATED: "drive too hot",
+    DriveFault.ENCODER: "encoder fault",
+    DriveFault.CAN_PASSIVE: "too many bus errors",
+    DriveFault.HEARTBEAT: "the master's heartbeat was lost",
+    DriveFault.BUS_OFF_RECOVERED: "the bus was off",
+    DriveFault.SYNC_LOST: "SYNC was lost",
+    DriveFault.FOLLOWING_ERROR: "following error too large",
 }
 
 
 def fault_text(code: int) -> str:
     """An error code in words."""
     return (
-        FAULT_TEXT[Fault(code)] if code in Fault._value2member_map_ else f"error code {code:#06x}"
+        FAULT_TEXT[DriveFault(code)]
+        if code in DriveFault._value2member_map_
+        else f"error code {code:#06x}"
     )
 
 
-class Object(IntEnum):
+class ObjectIndex(IntEnum):
     """Indices of the objects in use."""
 
     DEVICE_TYPE = 0x1000
@@ -165,36 +167,36 @@ class Object(IntEnum):
 
 
 RECEIVED: Final = (
-    Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
-    Mapped(Object.TARGET_POSITION, 0, Type.INTEGER32),
+    Mapped(ObjectIndex.CONTROLWORD, 0, DataType.UNSIGNED16),
+    Mapped(ObjectIndex.TARGET_POSITION, 0, DataType.INTEGER32),
 )
 """Objects of the RPDO that the master sends each drive in each cycle, in cyclic synchronous
 position mode."""
 
 VELOCITY_RECEIVED: Final = (
-    Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
-    Mapped(Object.TARGET_VELOCITY, 0, Type.INTEGER32),
+    Mapped(ObjectIndex.CONTROLWORD, 0, DataType.UNSIGNED16),
+    Mapped(ObjectIndex.TARGET_VELOCITY, 0, DataType.INTEGER32),
 )
 """The same in cyclic synchronous velocity mode."""
 
 SENT: Final = (
-    Mapped(Object.STATUSWORD, 0, Type.UNSIGNED16),
-    Mapped(Object.POSITION, 0, Type.INTEGER32),
-    Mapped(Object.TORQUE, 0, Type.INTEGER16),
+    Mapped(ObjectIndex.STATUSWORD, 0, DataType.UNSIGNED16),
+    Mapped(ObjectIndex.POSITION, 0, DataType.INTEGER32),
+    Mapped(ObjectIndex.TORQUE, 0, DataType.INTEGER16),
 )
 """Objects of the TPDO that each drive sends on SYNC, in either mode."""
 
 
-def _state(statusword: int) -> State | None:
-    for state in State:
+def _state(statusword: int) -> DriveState | None:
+    for state in DriveState:
         mask, pattern = state.value
         if statusword & mask == pattern:
             return state
     return None
 
 
-def _command(controlword: int) -> Command | None:
-    for command in reversed(Command):
+def _command(controlword: int) -> DriveCommand | None:
+    for command in reversed(DriveCommand):
         mask, pattern = command.value
         if controlword & mask == pattern:
             return command
@@ -205,7 +207,7 @@ _STATES: Final = tuple(_state(low) for low in range(256))
 _COMMANDS: Final = tuple(_command(low) for low in range(256))
 
 
-def state_of(statusword: int) -> State:
+def state_of(statusword: int) -> DriveState:
     """The state that a statusword shows; raises ValueError for a pattern that is none."""
     state = _STATES[statusword & 0xFF]
     if state is None:
@@ -213,48 +215,63 @@ def state_of(statusword: int) -> State:
     return state
 
 
-def command_of(controlword: int) -> Command | None:
+def command_of(controlword: int) -> DriveCommand | None:
     """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive
     to see)."""
     return _COMMANDS[controlword & 0xFF]
 
 
 TRANSITIONS: Final = {
-    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,  # 2
-    (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): State.SWITCHED_ON,  # 3
-    (State.READY_TO_SWITCH_ON, Command.ENABLE_OPERATION): State.SWITCHED_ON,  # 3, then 4 of itself
-    (State.SWITCHED_ON, Command.ENABLE_OPERATION): State.OPERATION_ENABLED,  # 4
-    (State.OPERATION_ENABLED, Command.SWITCH_ON): State.SWITCHED_ON,  # 5, "disable operation"
-    (State.SWITCHED_ON, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,  # 6
-    (State.READY_TO_SWITCH_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 7
-    (State.READY_TO_SWITCH_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,  # 7
-    (State.OPERATION_ENABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,  # 8
-    (State.OPERATION_ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 9
-    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 10
-    (State.SWITCHED_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,  # 10
-    (State.OPERATION_ENABLED, Command.QUICK_STOP): State.QUICK_STOP_ACTIVE,  # 11
-    (State.QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 12
-    (State.FAULT, Command.FAULT_RESET): State.SWITCH_ON_DISABLED,  # 15
+    (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 2
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.SWITCH_ON): DriveState.SWITCHED_ON,  # 3
     (
-        State.QUICK_STOP_ACTIVE,
-        Command.ENABLE_OPERATION,
-    ): State.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
+        DriveState.READY_TO_SWITCH_ON,
+        DriveCommand.ENABLE_OPERATION,
+    ): DriveState.SWITCHED_ON,  # 3, then 4 of itself
+    (DriveState.SWITCHED_ON, DriveCommand.ENABLE_OPERATION): DriveState.OPERATION_ENABLED,  # 4
+    (
+        DriveState.OPERATION_ENABLED,
+        DriveCommand.SWITCH_ON,
+    ): DriveState.SWITCHED_ON,  # 5, "disable operation"
+    (DriveState.SWITCHED_ON, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 6
+    (
+        DriveState.READY_TO_SWITCH_ON,
+        DriveCommand.DISABLE_VOLTAGE,
+    ): DriveState.SWITCH_ON_DISABLED,  # 7
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,  # 7
+    (DriveState.OPERATION_ENABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 8
+    (
+        DriveState.OPERATION_ENABLED,
+        DriveCommand.DISABLE_VOLTAGE,
+    ): DriveState.SWITCH_ON_DISABLED,  # 9
+    (DriveState.SWITCHED_ON, DriveCommand.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,  # 10
+    (DriveState.SWITCHED_ON, DriveCommand.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,  # 10
+    (DriveState.OPERATION_ENABLED, DriveCommand.QUICK_STOP): DriveState.QUICK_STOP_ACTIVE,  # 11
+    (
+        DriveState.QUICK_STOP_ACTIVE,
+        DriveCommand.DISABLE_VOLTAGE,
+    ): DriveState.SWITCH_ON_DISABLED,  # 12
+    (DriveState.FAULT, DriveCommand.FAULT_RESET): DriveState.SWITCH_ON_DISABLED,  # 15
+    (
+        DriveState.QUICK_STOP_ACTIVE,
+        DriveCommand.ENABLE_OPERATION,
+    ): DriveState.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
 }
 """The transitions that commands cause, with their numbers in CiA 402-2 figure 9. Any other command
 changes nothing. 0, 1 (power on), 13 (fault) and 14 (fault reaction over) happen of themselves."""
 
 ENABLING: Final = {
-    State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
-    State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
-    State.SWITCHED_ON: Command.ENABLE_OPERATION,
-    State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
-    State.QUICK_STOP_ACTIVE: Command.DISABLE_VOLTAGE,
-    State.FAULT: Command.FAULT_RESET,
+    DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
+    DriveState.READY_TO_SWITCH_ON: DriveCommand.SWITCH_ON,
+    DriveState.SWITCHED_ON: DriveCommand.ENABLE_OPERATION,
+    DriveState.OPERATION_ENABLED: DriveCommand.ENABLE_OPERATION,
+    DriveState.QUICK_STOP_ACTIVE: DriveCommand.DISABLE_VOLTAGE,
+    DriveState.FAULT: DriveCommand.FAULT_RESET,
 }
 """Which command leads from a state towards OPERATION_ENABLED. FAULT_RESET needs a word without its
 bit before."""
 
 
-def after(state: State, command: Command) -> State:
+def after(state: DriveState, command: DriveCommand) -> DriveState:
     """The state after a command."""
     return TRANSITIONS.get((state, command), state)

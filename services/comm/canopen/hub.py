@@ -17,7 +17,7 @@ from petrobot.services.comm.canopen.byte_stream import (
     ERROR,
     EXTENDED,
     REMOTE,
-    Line,
+    FrameSocket,
     encode,
     parse_channel,
 )
@@ -29,7 +29,7 @@ _UNSEEN: Final = EXTENDED | REMOTE | ERROR
 """Flags of frames that a `CanBus` does not carry."""
 
 
-class Hub:
+class CanHub:
     """The bus itself: relays between any number of ports on a channel, and gives ports within this
     process.
 
@@ -48,7 +48,7 @@ class Hub:
         self._listener.listen()
         self._listener.setblocking(False)
         self._family = family
-        self._lines: dict[int, Line] = {}
+        self._lines: dict[int, FrameSocket] = {}
         self._locals: list[LocalPort] = []
         self.dropped: list[str] = []
 
@@ -79,7 +79,7 @@ class Hub:
         writable = [number for number, line in self._lines.items() if line.pending]
         ready, flushable, _ = select.select(readable, writable, [], timeout)
         for number in flushable:
-            self._attempt(number, Line.flush)
+            self._attempt(number, FrameSocket.flush)
         for number in ready:
             if number == self._listener.fileno():
                 self._accept()
@@ -116,11 +116,11 @@ class Hub:
                 sock.close()
                 return
             try:
-                self._lines[sock.fileno()] = Line(sock)
+                self._lines[sock.fileno()] = FrameSocket(sock)
             except ConnectionError:
                 sock.close()
 
-    def _relay(self, line: Line) -> None:
+    def _relay(self, line: FrameSocket) -> None:
         source = line.sock.fileno()
         for word, dlc, data in line.read():
             self._spread(encode(word, data, dlc), (word, dlc, data), source, None)
@@ -136,7 +136,7 @@ class Hub:
                 if other is not port:
                     other.waiting.append(Frame(word, data))
 
-    def _attempt(self, number: int, what: Callable[[Line], None]) -> None:
+    def _attempt(self, number: int, what: Callable[[FrameSocket], None]) -> None:
         """Do something with a line; drop it if that fails."""
         line = self._lines.get(number)
         if line is None:
@@ -166,8 +166,8 @@ def _remove_dead_socket(path: str) -> None:
 class LocalPort(CanBus):
     """A port of a hub in the same process (`CanBus`)."""
 
-    def __init__(self, hub: Hub) -> None:
-        self._hub: Hub | None = hub
+    def __init__(self, hub: CanHub) -> None:
+        self._hub: CanHub | None = hub
         self.waiting: deque[Frame] = deque()
 
     def send(self, frame: Frame) -> None:

@@ -2,7 +2,7 @@
 supervises, cycle by cycle.
 
 A machine: frames in, frames out, times passed in. What a drive is set to and what is sent to it in
-a cycle, its `DriveLink` knows; nodes that are no drives (inputs, sensors) are `Companion`s. CiA 301
+a cycle, its `DriveInterface` knows; nodes that are no drives (inputs, sensors) are `Companion`s. CiA 301
 (NMT, heartbeat, SDO, SYNC, EMCY) and CiA 402-2.
 """
 
@@ -16,22 +16,22 @@ from typing import Final, Generic, Protocol, TypeVar
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import (
+    DataType,
     Mapped,
     NmtCommand,
     NmtState,
     SdoClient,
     Transfer,
-    Type,
 )
 from petrobot.services.comm.canopen.cia402 import (
     DEVICE_TYPE,
     ENABLING,
     SENT,
-    Command,
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveCommand,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     fault_text,
 )
 
@@ -44,11 +44,16 @@ RETRY: Final = 1.0
 SETTLE: Final = 0.05
 """s that nodes are given after a reset of their communication."""
 
-_U8, _U16, _U32, _I8 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8
-_MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+_U8, _U16, _U32, _I8 = (
+    DataType.UNSIGNED8,
+    DataType.UNSIGNED16,
+    DataType.UNSIGNED32,
+    DataType.INTEGER8,
+)
+_MOVING: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
-class Phase(Enum):
+class MasterPhase(Enum):
     """What the master is doing."""
 
     CONFIGURING = "configuring"
@@ -74,7 +79,7 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
-class Manner:
+class Supervision:
     """How strict a master is: chosen by its cycle and by what a drive may do alone meanwhile."""
 
     silent_cycles: int
@@ -85,13 +90,13 @@ class Manner:
     """Whether an EMCY that comes during a reset is passed over: a fault that stays will show."""
 
 
-class DriveLink(Protocol):
+class DriveInterface(Protocol):
     """What the master needs of one drive's link; see `Power`, `usual_transfers`, `pdo_transfers`
     and `unfit` to make one."""
 
     node: int
     sdo: SdoClient
-    state: State
+    state: DriveState
     limited: bool
     """Whether the drive cuts its set points because they are faster than it goes."""
     silent: int
@@ -115,7 +120,7 @@ class DriveLink(Protocol):
         """Its RPDO of this cycle."""
 
 
-Link = TypeVar("Link", bound=DriveLink)
+Link = TypeVar("Link", bound=DriveInterface)
 
 
 @dataclass(frozen=True)
@@ -143,32 +148,36 @@ class Power:
         self.stopping = 0
         """Cycles since the drive was last wanted."""
 
-    def word(self, state: State, wanted: bool, resetting: bool) -> int:
+    def word(self, state: DriveState, wanted: bool, resetting: bool) -> int:
         """The controlword of this cycle; `resetting`: whether faults may be reset."""
         self.stopping = 0 if wanted else self.stopping + 1
         return self._command(state, wanted, resetting).word
 
-    def _command(self, state: State, wanted: bool, resetting: bool) -> Command:
+    def _command(self, state: DriveState, wanted: bool, resetting: bool) -> DriveCommand:
         if not wanted:
             brakes = state in _MOVING and self.stopping <= self._stop_cycles
-            return Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
-        if state is State.FAULT:
+            return DriveCommand.QUICK_STOP if brakes else DriveCommand.DISABLE_VOLTAGE
+        if state is DriveState.FAULT:
             self._wait = (self._wait + 1) % self._reset_cycles
-            return Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
-        return ENABLING.get(state, Command.DISABLE_VOLTAGE)
+            return (
+                DriveCommand.FAULT_RESET
+                if resetting and self._wait == 1
+                else DriveCommand.DISABLE_VOLTAGE
+            )
+        return ENABLING.get(state, DriveCommand.DISABLE_VOLTAGE)
 
 
-def usual_transfers(cycle: float, mode: Mode, patience: float) -> list[Transfer]:
+def usual_transfers(cycle: float, mode: OperationMode, patience: float) -> list[Transfer]:
     """Identity, heartbeats both ways (`patience` s), the bus cycle (s) and the mode of
     operation."""
     beat = MASTER_NODE << 16 | round(patience * 1e3)
     return [
-        Transfer(Object.DEVICE_TYPE, 0, _U32),
-        Transfer(Object.SUPPORTED_MODES, 0, _U32),
-        Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
-        Transfer(Object.CONSUMER_HEARTBEAT, 1, _U32, beat),
-        Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
-        Transfer(Object.MODE, 0, _I8, mode),
+        Transfer(ObjectIndex.DEVICE_TYPE, 0, _U32),
+        Transfer(ObjectIndex.SUPPORTED_MODES, 0, _U32),
+        Transfer(ObjectIndex.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+        Transfer(ObjectIndex.CONSUMER_HEARTBEAT, 1, _U32, beat),
+        Transfer(ObjectIndex.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
+        Transfer(ObjectIndex.MODE, 0, _I8, mode),
     ]
 
 
@@ -176,26 +185,28 @@ def pdo_transfers(node: int, received: Sequence[Mapped]) -> list[Transfer]:
     """One RPDO of these objects and the TPDO that every drive sends, both by SYNC."""
     return [
         *canopen.map_pdo(
-            Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received
+            ObjectIndex.RPDO1, ObjectIndex.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received
         ),
-        *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 1, SENT),
+        *canopen.map_pdo(
+            ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 1, SENT
+        ),
     ]
 
 
 def companion_transfers(node: int, timer_ms: int, objects: Sequence[Mapped]) -> list[Transfer]:
     """Heartbeat, and a TPDO of these objects when they change and every `timer_ms`."""
     return [
-        Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
-        Transfer(Object.TPDO1, 5, _U16, timer_ms),
+        Transfer(ObjectIndex.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+        Transfer(ObjectIndex.TPDO1, 5, _U16, timer_ms),
         *canopen.map_pdo(
-            Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects
+            ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects
         ),
     ]
 
 
-def unfit(node: int, read: Mapping[tuple[int, int], int], mode: Mode) -> str:
+def unfit(node: int, read: Mapping[tuple[int, int], int], mode: OperationMode) -> str:
     """What makes a device with these objects no drive for a mode, in words; empty if nothing."""
-    device, modes = read[Object.DEVICE_TYPE, 0], read[Object.SUPPORTED_MODES, 0]
+    device, modes = read[ObjectIndex.DEVICE_TYPE, 0], read[ObjectIndex.SUPPORTED_MODES, 0]
     if device != DEVICE_TYPE:
         return f"node {node} is no servo drive (object 1000h is {device:#010x}): check the node ids"
     if not modes & mode.bit:
@@ -211,7 +222,7 @@ class CanopenMaster(Generic[Link]):
         drives: Mapping[str, Link],
         companions: Sequence[Companion],
         cycle: float,
-        manner: Manner,
+        manner: Supervision,
         *,
         enable: bool = False,
     ) -> None:
@@ -222,7 +233,7 @@ class CanopenMaster(Generic[Link]):
         self.names = tuple(drives)
         self.wanted = False
         """Whether the drives are to be enabled."""
-        self.phase = Phase.CONFIGURING
+        self.phase = MasterPhase.CONFIGURING
         self.troubles: list[Trouble] = []
         self.limited = False
         """Whether a drive cuts its set points because they are faster than it goes."""
@@ -244,7 +255,7 @@ class CanopenMaster(Generic[Link]):
     @property
     def enabled(self) -> bool:
         """Whether all drives follow set points."""
-        return self._all_enabled and self.phase is Phase.RUNNING
+        return self._all_enabled and self.phase is MasterPhase.RUNNING
 
     def alive(self, node: int) -> bool:
         """Whether a node's heartbeat has been heard of late."""
@@ -253,7 +264,7 @@ class CanopenMaster(Generic[Link]):
     def reset(self, now: float) -> None:
         """Forget troubles, reset faults and enable again; configure again if the bus was the
         trouble."""
-        again = self.phase is not Phase.RUNNING or any(
+        again = self.phase is not MasterPhase.RUNNING or any(
             trouble.cause == "bus" for trouble in self.troubles
         )
         self.troubles.clear()
@@ -261,7 +272,7 @@ class CanopenMaster(Generic[Link]):
         for drive in self.drives:
             drive.error_code = 0
         if again:
-            self.phase, self._begin_at = Phase.CONFIGURING, now
+            self.phase, self._begin_at = MasterPhase.CONFIGURING, now
 
     def give_up(self, why: str, cause: str, code: int) -> None:
         """The machine itself has its drives stopped quickly, with the next cycle."""
@@ -271,7 +282,7 @@ class CanopenMaster(Generic[Link]):
     def bus_lost(self, now: float, why: str) -> None:
         """The bus itself is gone: nothing is enabled any more; configure again when it is back."""
         self._report(Trouble("bus", None, 0, why))
-        self.phase, self._begin_at = Phase.CONFIGURING, now + RETRY
+        self.phase, self._begin_at = MasterPhase.CONFIGURING, now + RETRY
 
     # Frames in
 
@@ -296,7 +307,9 @@ class CanopenMaster(Generic[Link]):
 
     def _look_at_drives(self) -> None:
         """A drive's status has changed."""
-        self._all_enabled = all(drive.state is State.OPERATION_ENABLED for drive in self.drives)
+        self._all_enabled = all(
+            drive.state is DriveState.OPERATION_ENABLED for drive in self.drives
+        )
         self.limited = any(drive.limited for drive in self.drives)
 
     def _beat(self, now: float, frame: Frame) -> None:
@@ -304,7 +317,7 @@ class CanopenMaster(Generic[Link]):
         if node not in self._heard or len(frame.data) != 1:
             return
         self._heard[node] = now
-        restarted = frame.data[0] == NmtState.BOOT_UP and self.phase is not Phase.CONFIGURING
+        restarted = frame.data[0] == NmtState.BOOT_UP and self.phase is not MasterPhase.CONFIGURING
         if restarted and self._needed(node):
             self._report(Trouble("bus", self._axis.get(node), 0, f"node {node} has restarted"))
 
@@ -317,7 +330,7 @@ class CanopenMaster(Generic[Link]):
         if axis is None:
             return
         self.drives[axis].error_code = message.code
-        passed_over = self.phase is Phase.CONFIGURING or (
+        passed_over = self.phase is MasterPhase.CONFIGURING or (
             self._manner.old_emergencies and self._resetting
         )
         if message.code and not passed_over:  # before, it may be old; a fault that stays will show
@@ -333,7 +346,7 @@ class CanopenMaster(Generic[Link]):
         if now >= self._beat_due:
             self._beat_due = now + HEARTBEAT_MS / 1e3
             frames.append(canopen.heartbeat(MASTER_NODE, NmtState.OPERATIONAL))
-        if self.phase is Phase.CONFIGURING:
+        if self.phase is MasterPhase.CONFIGURING:
             return frames + self._configure(now)
         self._supervise(now)
         wanted, resetting = self.wanted, self._resetting
@@ -382,7 +395,7 @@ class CanopenMaster(Generic[Link]):
                 True  # the drives may have gone into a fault when their last master went away
             )
             self.troubles.clear()
-        self.phase = Phase.STARTING
+        self.phase = MasterPhase.STARTING
         for drive in self.drives:
             drive.silent, drive.spoken = 0, False
         self._heard = dict.fromkeys(self._heard, now)
@@ -402,7 +415,7 @@ class CanopenMaster(Generic[Link]):
             if drive.silent == lost:
                 self._report(Trouble("bus", axis, 0, f"{self.names[axis]}: the drive is silent"))
             if (
-                drive.state is State.FAULT
+                drive.state is DriveState.FAULT
                 and not self._resetting
                 and drive.spoken
                 and drive.silent <= 1
@@ -414,13 +427,13 @@ class CanopenMaster(Generic[Link]):
                 self._report(
                     Trouble("bus", self._axis.get(node), 0, f"node {node} sends no heartbeat")
                 )
-        if self.phase is Phase.STARTING and all(drive.spoken for drive in self.drives):
-            self.phase = Phase.RUNNING
+        if self.phase is MasterPhase.STARTING and all(drive.spoken for drive in self.drives):
+            self.phase = MasterPhase.RUNNING
         if self._resetting and self.enabled:
             self._resetting = False
 
     def _fault(self, axis: int, code: int) -> None:
-        cause = "power" if code == Fault.UNDERVOLTAGE else "drive_fault"
+        cause = "power" if code == DriveFault.UNDERVOLTAGE else "drive_fault"
         what = fault_text(code) if code else "drive in fault"
         self._report(Trouble(cause, axis, code, f"{self.names[axis]}: {what}"))
 

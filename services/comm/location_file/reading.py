@@ -15,7 +15,7 @@ SCHEMA = 1
 Tables = dict[str, dict[str, Any]]
 
 
-class Key(NamedTuple):
+class KeySpec(NamedTuple):
     """What one key of a table may hold: a sentence for people, and the check."""
 
     wants: str
@@ -45,8 +45,8 @@ def _text(value: Any) -> bool:
     return isinstance(value, str) and bool(value)
 
 
-def _one_of(*choices: str) -> Key:
-    return Key("one of " + ", ".join(f'"{c}"' for c in choices), lambda v: v in choices)
+def _one_of(*choices: str) -> KeySpec:
+    return KeySpec("one of " + ", ".join(f'"{c}"' for c in choices), lambda v: v in choices)
 
 
 def _host(value: Any) -> bool:
@@ -76,36 +76,36 @@ LONGEST_NAME = 200
 in any message."""
 
 
-def _path_key(what: str, *, required: bool = False) -> Key:
-    return Key(
+def _path_key(what: str, *, required: bool = False) -> KeySpec:
+    return KeySpec(
         f'an import path "module:{what}"',
         lambda v: isinstance(v, str) and bool(_IMPORT_PATH.fullmatch(v)),
         required,
     )
 
 
-def _name_key(what: str, *, required: bool = False) -> Key:
-    return Key(f"the name of {what}", _text, required)
+def _name_key(what: str, *, required: bool = False) -> KeySpec:
+    return KeySpec(f"the name of {what}", _text, required)
 
 
-_POSITIVE = Key("a number of seconds above 0", lambda v: _number(v) and v > 0)
-_NOT_NEGATIVE = Key("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
+_POSITIVE = KeySpec("a number of seconds above 0", lambda v: _number(v) and v > 0)
+_NOT_NEGATIVE = KeySpec("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
 _PERIOD = _POSITIVE._replace(required=True)
 
-SHAPES: Mapping[str, Mapping[str, Key]] = {
+SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
     "nodes": {
-        "host": Key('a host name or address such as "127.0.0.1", without a port', _host, True),
-        "port": Key(
+        "host": KeySpec('a host name or address such as "127.0.0.1", without a port', _host, True),
+        "port": KeySpec(
             "a port from 1 to 65535",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536,
             True,
         ),
         "sim": _path_key("function"),
-        "worker_memory_mb": Key(
+        "worker_memory_mb": KeySpec(
             "a whole number of MiB above 0",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
         ),
-        "workers": Key(
+        "workers": KeySpec(
             "a whole number of processes above 0",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
         ),
@@ -115,8 +115,8 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
         "run": _path_key("function", required=True),
         "task": _name_key("the primitive task that the action translates", required=True),
         "device": _name_key("a device"),
-        "node": Key("the name of one node", _text),
-        "args": Key("a table of arguments", lambda v: isinstance(v, dict)),
+        "node": KeySpec("the name of one node", _text),
+        "args": KeySpec("a table of arguments", lambda v: isinstance(v, dict)),
         "deadline": _POSITIVE,
         "orphan_time": _NOT_NEGATIVE,
         "on_resume": _one_of("rejoin", "error", "ask"),
@@ -133,12 +133,12 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
 }
 OPEN = ("devices",)
 """Tables whose entries have keys of their own beside the known ones."""
-FLAT: Mapping[str, Key] = {
-    "links": Key(
+FLAT: Mapping[str, KeySpec] = {
+    "links": KeySpec(
         "a delay in seconds, 0.004 (one tick) or more", lambda v: _number(v) and v >= 0.004
     ),
-    "keys": Key("the path of a file or folder, relative to this one", _text),
-    "parameters": Key("the path of a file, relative to this one", _text),
+    "keys": KeySpec("the path of a file or folder, relative to this one", _text),
+    "parameters": KeySpec("the path of a file, relative to this one", _text),
 }
 CHANNELS = ("call", "can", "image", "stream", "control")
 KEYS = ("file", "certificates", "also")
@@ -273,7 +273,7 @@ def _coordinator(data: Mapping[str, Any], faults: Faults) -> dict[str, Any]:
 
 
 def _entries(
-    table: str, shape: Mapping[str, Key], entries: Mapping[str, Any], faults: Faults
+    table: str, shape: Mapping[str, KeySpec], entries: Mapping[str, Any], faults: Faults
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, entry in entries.items():
         here = f"{table}.{name}"
@@ -293,7 +293,7 @@ def _entries(
 
 
 def _check_key(
-    here: str, key: str, value: Any, shape: Mapping[str, Key], open_: bool, faults: Faults
+    here: str, key: str, value: Any, shape: Mapping[str, KeySpec], open_: bool, faults: Faults
 ) -> None:
     if key in shape:
         if not shape[key].fits(value):

@@ -101,7 +101,7 @@ def _frozen(array: NDArray[Any]) -> bool:
     return locked and array.dtype in _DTYPES and array.ndim <= _MOST_DIMENSIONS
 
 
-class Half:
+class LocalParties:
     """The parties that live in this process, their inboxes, and the numbers of what they send."""
 
     def __init__(
@@ -185,11 +185,11 @@ class Half:
         return Posted(tick + self._delays.ticks(envelope), sequence, envelope)
 
 
-class Cell:
+class LockStepCell:
     """A whole cell in one process."""
 
     def __init__(self, parties: Sequence[Party], delays: Delays | None = None) -> None:
-        self._half = Half(parties, delays or Delays())
+        self._half = LocalParties(parties, delays or Delays())
         self.tick = 0
         """The next tick to run."""
 

@@ -26,9 +26,9 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
-from petrobot.services.comm.calls.listening import cannot_listen
 from petrobot.services.comm.location_file import COORDINATOR
-from petrobot.services.comm.lockstep.cell import Cell, CellError, Delays, Half
+from petrobot.services.comm.location_file.host_checks import cannot_listen
+from petrobot.services.comm.lockstep.cell import CellError, Delays, LocalParties, LockStepCell
 from petrobot.services.comm.lockstep.party import Party, Posted
 from petrobot.services.comm.protocol.messages import Bye, Hello, Message, Refuse, Tick, Welcome
 from petrobot.services.comm.protocol.security import NONCE_BYTES, UNPROVEN, Keys, require_key
@@ -40,7 +40,7 @@ from petrobot.services.comm.protocol.wire import (
     Side,
 )
 
-__all__ = ["Cell", "CellError", "Delays", "Member", "PartyLostError", "TickLink"]
+__all__ = ["CellError", "Delays", "LockStepCell", "Member", "PartyLostError", "TickLink"]
 
 
 # The connection of two members of a lock-step cell: Ticks out, Ticks in, in order.
@@ -232,7 +232,7 @@ class Member:
         """The next tick to run."""
         self._addresses = addresses
         self._hosts = dict(hosts) if hosts is not None else {member: member for member in addresses}
-        self._half = Half(parties, delays or Delays(), self._hosts)
+        self._half = LocalParties(parties, delays or Delays(), self._hosts)
         self._directory = directory
         self._key = key
         self._patience = patience

@@ -17,6 +17,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from enum import Enum
 from typing import Final
 
 from petrobot.services.comm.protocol.codec import (
@@ -34,12 +35,30 @@ from petrobot.services.comm.protocol.codec import (
     unpack,
 )
 from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Bye,
+    Call,
+    Cancel,
     Challenge,
+    Command,
+    Event,
+    EventAck,
+    Feedback,
     Hello,
     Message,
+    Outcome,
+    Ping,
+    Pong,
     Proof,
     Refuse,
+    ResultAck,
+    SetPoint,
+    StreamOpen,
+    Subscribe,
+    Tick,
     Welcome,
+    Withdraw,
 )
 from petrobot.services.comm.protocol.security import (
     CHECK_BYTES,
@@ -54,25 +73,97 @@ from petrobot.services.comm.protocol.security import (
     proof,
     same,
 )
-from petrobot.services.comm.protocol.states import (
-    LAST,
-    MAY_COME,
-    MAY_GO,
-    NOTHING,
-    OVER,
-    STATES,
-    Phase,
-    Side,
-    State,
-)
+
+# Who may say what when: the states of a connection of the node protocol, as tables.
+
+
+class Side(Enum):
+    """Which end of the connection this is."""
+
+    CLIENT = "client"
+    SERVER = "server"
+
+
+class ConnectionState(Enum):
+    """Where a connection stands."""
+
+    OPENING = "opening"
+    OPEN = "open"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+class ConnectionPhase(Enum):
+    """State in full: what the next message may be."""
+
+    HELLO = "hello"
+    """Nothing was said yet."""
+    HELLO_SENT = "hello sent"
+    CHALLENGED = "challenged"
+    """Server: proof awaited."""
+    PROVED = "proved"
+    """Client: proof sent."""
+    DECIDING = "deciding"
+    """Server: its owner answers WELCOME or REFUSE."""
+    OPEN = "open"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+STATES: Mapping[ConnectionPhase, ConnectionState] = {
+    ConnectionPhase.OPEN: ConnectionState.OPEN,
+    ConnectionPhase.CLOSING: ConnectionState.CLOSING,
+    ConnectionPhase.CLOSED: ConnectionState.CLOSED,
+}
+
+_BOTH = frozenset(cls.KIND for cls in (Ping, Pong, Tick, Bye, Refuse))
+_FROM_CLIENT = _BOTH | {
+    cls.KIND
+    for cls in (
+        Call,
+        ResultAck,
+        Cancel,
+        EventAck,
+        Subscribe,
+        Command,
+        StreamOpen,
+        SetPoint,
+        Withdraw,
+    )
+}
+_FROM_SERVER = _BOTH | {cls.KIND for cls in (Accept, Feedback, Outcome, Event, Answer)}
+NOTHING: frozenset[int] = frozenset()
+_REFUSE = frozenset((Refuse.KIND,))
+
+MAY_COME: Mapping[tuple[Side, ConnectionPhase], frozenset[int]] = {
+    (Side.SERVER, ConnectionPhase.HELLO): frozenset((Hello.KIND,)),
+    (Side.SERVER, ConnectionPhase.CHALLENGED): _REFUSE | {Proof.KIND},
+    (Side.SERVER, ConnectionPhase.OPEN): _FROM_CLIENT,
+    (Side.CLIENT, ConnectionPhase.HELLO_SENT): _REFUSE | {Challenge.KIND, Welcome.KIND},
+    (Side.CLIENT, ConnectionPhase.PROVED): _REFUSE | {Welcome.KIND},
+    (Side.CLIENT, ConnectionPhase.OPEN): _FROM_SERVER,
+}
+MAY_GO: Mapping[tuple[Side, ConnectionPhase], frozenset[int]] = {
+    (Side.CLIENT, ConnectionPhase.HELLO): frozenset((Hello.KIND,)),
+    (Side.CLIENT, ConnectionPhase.HELLO_SENT): _REFUSE,
+    (Side.CLIENT, ConnectionPhase.PROVED): _REFUSE,
+    (Side.CLIENT, ConnectionPhase.OPEN): _FROM_CLIENT,
+    (Side.SERVER, ConnectionPhase.HELLO): _REFUSE,
+    (Side.SERVER, ConnectionPhase.CHALLENGED): _REFUSE,
+    (Side.SERVER, ConnectionPhase.DECIDING): _REFUSE | {Welcome.KIND},
+    (Side.SERVER, ConnectionPhase.OPEN): _FROM_SERVER,
+}
+LAST = frozenset((Bye.KIND, Refuse.KIND))
+OVER = (ConnectionPhase.CLOSING, ConnectionPhase.CLOSED)
+
 
 __all__ = [
     "NEWEST_VERSION",
     "OLDEST_VERSION",
     "Connection",
+    "ConnectionState",
     "ProtocolError",
     "Side",
-    "State",
     "negotiate",
 ]
 
@@ -118,7 +209,7 @@ class Connection:
         self._server = server
         self._keys = all_keys(key)
         self._nonce = nonce
-        self._phase = Phase.HELLO
+        self._phase = ConnectionPhase.HELLO
         self._parts: list[bytes] = []
         self._have = 0
         self._need = 0
@@ -137,15 +228,15 @@ class Connection:
         """and those that may go so."""
 
     @property
-    def state(self) -> State:
+    def state(self) -> ConnectionState:
         """opening, open, closing or closed."""
-        return STATES.get(self._phase, State.OPENING)
+        return STATES.get(self._phase, ConnectionState.OPENING)
 
-    def _enter(self, phase: Phase) -> None:
+    def _enter(self, phase: ConnectionPhase) -> None:
         self._phase = phase
         self._may_come = MAY_COME.get((self.side, phase), NOTHING)
         self._may_go = MAY_GO.get((self.side, phase), NOTHING)
-        if phase is Phase.OPEN:
+        if phase is ConnectionPhase.OPEN:
             self._quick_in = {
                 kind: LIMITS[kind] + self._seal_bytes for kind in self._may_come - LAST
             }
@@ -183,10 +274,10 @@ class Connection:
             raise ProtocolError(
                 "out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}"
             )
-        if self._phase is not Phase.OPEN:
+        if self._phase is not ConnectionPhase.OPEN:
             return self._send_opening(message)
         last_word = self._frame(encode(message))
-        self._enter(Phase.CLOSING)
+        self._enter(ConnectionPhase.CLOSING)
         return last_word
 
     def refusal(self, refuse: Refuse) -> bytes:
@@ -208,14 +299,14 @@ class Connection:
     def _send_opening(self, message: Message) -> bytes:
         if isinstance(message, Hello):
             self._transcript = self._hello_body(message)
-            self._enter(Phase.HELLO_SENT)
+            self._enter(ConnectionPhase.HELLO_SENT)
             return _opening_frame(self._transcript)
         if isinstance(message, Welcome):
             data = _opening_frame(self._welcome_body(message))
             self._open(message.version)
             return data
         data = self._opening_refusal(encode(message))
-        self._enter(Phase.CLOSING)
+        self._enter(ConnectionPhase.CLOSING)
         return data
 
     def _hello_body(self, hello: Hello) -> bytes:
@@ -246,7 +337,7 @@ class Connection:
         self._seal_bytes = SEAL_BYTES if self._keys else CHECK_BYTES
         if not self._keys:
             self._seal_out = self._seal_in = Check()
-        self._enter(Phase.OPEN)
+        self._enter(ConnectionPhase.OPEN)
 
     def receive_data(self, data: bytes) -> list[Message]:
         """Messages completed by these bytes, in order.
@@ -269,7 +360,7 @@ class Connection:
             if start < len(data):
                 self._frames(data, start, messages)
         except ProtocolError as fault:
-            self._enter(Phase.CLOSED)
+            self._enter(ConnectionPhase.CLOSED)
             raise ProtocolError(fault.code, fault.text, messages) from None
         return messages
 
@@ -302,7 +393,7 @@ class Connection:
     def _frames(self, data: bytes, start: int, messages: list[Message]) -> None:
         """Take whole frames, whatever they are; what is left waits for more, in parts, so that
         nothing is moved twice."""
-        while self.state is not State.CLOSED and (end := self._frame_end(data, start)):
+        while self.state is not ConnectionState.CLOSED and (end := self._frame_end(data, start)):
             message = self._take(data, start + _HEADER, end)
             start = end
             if message is not None:
@@ -345,7 +436,7 @@ class Connection:
         if kind not in self._may_come:
             raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
         # A refusal of the opening may have a seal as well.
-        longest = LIMITS[kind] + (SEAL_BYTES if self._phase is Phase.PROVED else sealed)
+        longest = LIMITS[kind] + (SEAL_BYTES if self._phase is ConnectionPhase.PROVED else sealed)
         if length > longest:
             raise ProtocolError(
                 "too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}"
@@ -354,15 +445,15 @@ class Connection:
         return body + length if len(data) >= body + length else 0
 
     def _take(self, data: bytes, start: int, end: int) -> Message | None:
-        if self._phase is not Phase.OPEN:
+        if self._phase is not ConnectionPhase.OPEN:
             return self._take_opening(data[start:end])
         message = decode(self._unsealed(data, start, end))
         if message.KIND in LAST:
-            self._enter(Phase.CLOSED)
+            self._enter(ConnectionPhase.CLOSED)
         return message
 
     def _take_opening(self, body: bytes) -> Message | None:
-        if self._phase is Phase.PROVED and kind_of(body) == Refuse.KIND:
+        if self._phase is ConnectionPhase.PROVED and kind_of(body) == Refuse.KIND:
             body = self._refusal_body(body)
         message = decode(body)
         if isinstance(message, Hello):
@@ -375,8 +466,8 @@ class Connection:
         if isinstance(message, Welcome):
             self._take_welcome(message, body)
             return message
-        self.proven = not self._keys or (self.proven and self._phase is Phase.PROVED)
-        self._enter(Phase.CLOSED)
+        self.proven = not self._keys or (self.proven and self._phase is ConnectionPhase.PROVED)
+        self._enter(ConnectionPhase.CLOSED)
         return message
 
     def _refusal_body(self, body: bytes) -> bytes:
@@ -405,7 +496,7 @@ class Connection:
                     "no_key_here",
                     "this side has no key: give it the same key file, or take yours away",
                 )
-            self._enter(Phase.DECIDING)
+            self._enter(ConnectionPhase.DECIDING)
             self._refuse_another(wanted)
             return hello
         if not keyed:
@@ -416,7 +507,7 @@ class Connection:
         challenge = encode(Challenge(self._nonce))
         self._transcript += challenge
         self._out += _opening_frame(challenge)
-        self._enter(Phase.CHALLENGED)
+        self._enter(ConnectionPhase.CHALLENGED)
         return None
 
     def _refuse_another(self, wanted: str) -> None:
@@ -433,7 +524,7 @@ class Connection:
         self._transcript += body
         proofs = b"".join([proof(key, "client", self._transcript) for key in self._keys])
         self._out += _opening_frame(encode(Proof(proofs)))
-        self._enter(Phase.PROVED)
+        self._enter(ConnectionPhase.PROVED)
 
     def _take_proof(self, given: Proof) -> Hello | None:
         auth = given.auth
@@ -447,14 +538,14 @@ class Connection:
                 "wrong_key", "the client's key is not this side's key: use the same key file"
             )
         self._share(key)
-        self._enter(Phase.DECIDING)
+        self._enter(ConnectionPhase.DECIDING)
         assert self._hello is not None
         self._refuse_another(_wanted(self._hello, b"")[0])
         return self._hello
 
     def _take_welcome(self, welcome: Welcome, body: bytes) -> None:
         if self._keys:
-            if self._phase is not Phase.PROVED:
+            if self._phase is not ConnectionPhase.PROVED:
                 raise ProtocolError(
                     "no_key_there", "the server did not ask for the key: give it the same key file"
                 )

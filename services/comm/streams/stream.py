@@ -17,7 +17,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -30,15 +30,154 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
     Withdraw,
 )
-from petrobot.services.comm.protocol.security import UNPROVEN, Keys, require_key, same
+from petrobot.services.comm.protocol.security import NONCE_BYTES, UNPROVEN, Keys, require_key, same
 from petrobot.services.comm.protocol.wire import (
     NEWEST_VERSION,
     OLDEST_VERSION,
+    Connection,
+    ConnectionState,
     ProtocolError,
     Side,
-    State,
 )
-from petrobot.services.comm.streams.line import STALE_AFTER, Incoming, Inlet, Line, Sink
+
+# One end of a set-point stream: its connection without waiting, and what of the arrived counts.
+
+STALE_AFTER: Final = 3
+"""Periods after which a set point is too old."""
+
+_DRIFT: Final = 1e-4
+"""How much two clocks may drift apart (s/s); quartz is ten times better."""
+_CHUNK: Final = 1 << 14
+_READS: Final = 16
+"""Reads of one connection in a poll: a flood must not hold up the servo loop that polls."""
+
+
+class Sink(Protocol):
+    """Where the newest set point of a stream goes."""
+
+    def take(self, values: Sequence[float], held: float = 0.0) -> None:
+        """A set point has arrived, `held` seconds after its sender first sent these values."""
+
+    def withdraw(self) -> None:
+        """It counts no more: its sender does not stand by it, is gone, or it has become too old."""
+
+
+class Lateness:
+    """How much longer a message took than the quickest one of its stream: from arrivals and the
+    sender's own durations."""
+
+    __slots__ = ("_at", "_best")
+
+    def __init__(self) -> None:
+        self._best = math.inf
+        self._at = 0.0
+
+    def of(self, now: float, elapsed: float) -> float:
+        """Seconds that a message sent `elapsed` seconds into the stream has lost on its way when it
+        arrives at `now`."""
+        offset = now - elapsed
+        # The quickest passage is forgotten at the rate at which clocks may drift, so an old one
+        # cannot make all look late.
+        self._best = min(self._best + _DRIFT * (now - self._at), offset)
+        self._at = now
+        return offset - self._best
+
+
+class Inlet:
+    """Receiving end of one open stream, without socket or clock: what is older than three periods
+    does not count.
+
+    What a set point lost on its way counts as age, so one that was held up is not taken for a fresh
+    one.
+    """
+
+    __slots__ = ("_lateness", "_limit", "_sink", "_until")
+
+    def __init__(self, period: float, sink: Sink) -> None:
+        self._limit = STALE_AFTER * period
+        self._sink = sink
+        self._lateness = Lateness()
+        self._until = math.inf
+
+    def receive(self, now: float, messages: Sequence[Message]) -> None:
+        """Take what has arrived by `now`: the newest counts, the others only show how late things
+        are."""
+        newest: Message | None = None
+        late = 0.0
+        for message in messages:
+            if isinstance(message, SetPoint):
+                newest, late = message, self._lateness.of(now, message.elapsed)
+            elif isinstance(message, Withdraw):
+                newest = message
+        if isinstance(newest, SetPoint) and late <= self._limit:
+            self._until = now - late + self._limit
+            self._sink.take(newest.values, newest.held + late)
+        elif isinstance(newest, Withdraw) or now > self._until:
+            self._until = math.inf
+            self._sink.withdraw()
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A stream that a receiver takes: its period (s), where its values go, and what its sender must
+    show."""
+
+    period: float
+    sink: Sink
+    ticket: str = ""
+
+
+class StreamConnection:
+    """One non-blocking connection, either end; `receiver` is the name of the end that listens."""
+
+    def __init__(self, sock: socket.socket, side: Side, receiver: str, key: Keys | None) -> None:
+        sock.setblocking(False)
+        self.sock = sock
+        nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
+        self.connection = Connection(side, receiver, key=key, nonce=nonce)
+        self.unsent = b""
+
+    def tune(self) -> None:
+        """Small buffers and short timeouts: nothing old is to queue up here."""
+        sock = self.sock
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1500)
+
+    def write(self, data: bytes) -> None:
+        """Send, or keep what finds no room now. Raises OSError when the connection is gone."""
+        data = self.unsent + data
+        self.unsent = b""
+        if not data:
+            return
+        try:
+            sent = self.sock.send(data)
+        except BlockingIOError:
+            sent = 0
+        self.unsent = data[sent:]
+
+    def read(self, reads: int = _READS, chunk: int = _CHUNK) -> list[Message]:
+        """Messages that have arrived, of at most so many reads. Raises OSError when the connection
+        is gone, ProtocolError when it is no good."""
+        messages: list[Message] = []
+        for _ in range(reads):
+            try:
+                data = self.sock.recv(chunk)
+            except BlockingIOError:
+                break
+            if not data:
+                raise ConnectionResetError("the other side hung up")
+            messages += self.connection.receive_data(data)
+            if out := self.connection.data_to_send():
+                self.write(out)
+            if len(data) < chunk:
+                break
+        return messages
+
 
 __all__ = ["STALE_AFTER", "Incoming", "Inlet", "Sink", "StreamReceiver", "StreamSender"]
 
@@ -84,7 +223,7 @@ class StreamSender:
         self._receiver = receiver
         self._key = key
         self._clock = clock
-        self._line: Line | None = None
+        self._line: StreamConnection | None = None
         self._greeted = False
         self._again = -math.inf
         self._opened = 0.0
@@ -93,7 +232,7 @@ class StreamSender:
     @property
     def up(self) -> bool:
         """Whether the receiver has welcomed the stream."""
-        return self._line is not None and self._line.connection.state is State.OPEN
+        return self._line is not None and self._line.connection.state is ConnectionState.OPEN
 
     def send(self, values: Sequence[float], held: float = 0.0) -> bool:
         """Send the newest values, which the sender has stood by for `held` seconds. False if they
@@ -124,7 +263,7 @@ class StreamSender:
                 line.write(line.connection.send(Bye("the stream ends")))
         self._drop(0.0)
 
-    def advance(self) -> Line | None:
+    def advance(self) -> StreamConnection | None:
         """Look after the connection: connect, shake hands, notice its end. Gives it when the stream
         is open."""
         now = self._clock()
@@ -145,7 +284,7 @@ class StreamSender:
             self._drop(now + _RETRY)
         return self._line if self.up else None
 
-    def _write(self, line: Line, message: Message) -> bool:
+    def _write(self, line: StreamConnection, message: Message) -> bool:
         try:
             line.write(line.connection.send(message))
         except OSError:
@@ -156,7 +295,7 @@ class StreamSender:
     def _connect(self, now: float) -> None:
         host = self._address[0]
         sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-        self._line = Line(sock, Side.CLIENT, self._receiver, self._key)
+        self._line = StreamConnection(sock, Side.CLIENT, self._receiver, self._key)
         self._greeted = False
         try:
             self._line.tune()
@@ -166,7 +305,7 @@ class StreamSender:
         except OSError:
             self._drop(now + _RETRY)
 
-    def _greet(self, line: Line) -> None:
+    def _greet(self, line: StreamConnection) -> None:
         if self._greeted:
             return
         fault = line.sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
@@ -179,7 +318,7 @@ class StreamSender:
         self._greeted = True
         line.write(line.connection.send(self._hello))
 
-    def _take(self, line: Line, message: Message) -> None:
+    def _take(self, line: StreamConnection, message: Message) -> None:
         if isinstance(message, Welcome):
             self.refusal = ""
             self._opened, self._number = self._clock(), 0
@@ -201,7 +340,7 @@ class StreamSender:
 
 @dataclass(slots=True, eq=False)
 class _Guest:
-    line: Line
+    line: StreamConnection
     since: float
     stream: str = ""
     inlet: Inlet | None = None
@@ -276,7 +415,7 @@ class StreamReceiver:
         with contextlib.suppress(OSError):
             for _ in range(_ADMITTED):
                 sock, _ = self._listener.accept()
-                line = Line(sock, Side.SERVER, self._name, self._key)
+                line = StreamConnection(sock, Side.SERVER, self._name, self._key)
                 line.tune()
                 self._ready.register(sock, select.EPOLLIN)
                 newest = self._guests[sock.fileno()] = _Guest(line, now)
