@@ -398,11 +398,11 @@ def test_a_restarted_caller_counts_its_commands_anew() -> None:
 
 def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
     callee = _callee()
-    with pytest.raises(ValueError, match="no such run"):
+    with pytest.raises(ValueError, match="no active run"):
         callee.finish(0.0, "1", "success")
-    with pytest.raises(ValueError, match="no such run"):
+    with pytest.raises(ValueError, match="no active run"):
         callee.feedback(0.0, "1", 0.5)
-    with pytest.raises(ValueError, match="no such run"):
+    with pytest.raises(ValueError, match="no active run"):
         callee.raise_event(0.0, "lost", run="1")
     with pytest.raises(ValueError, match="nobody waits"):
         callee.answer(0.0, "k1", True)

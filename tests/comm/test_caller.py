@@ -460,6 +460,6 @@ def test_bad_calls_are_refused_where_they_are_made() -> None:
     with pytest.raises(NotPlainError, match=r"arguments\.to"):
         caller.call(0.0, m.Call("1", "move", {"to": object()}))
     caller.call(0.0, CALL)
-    with pytest.raises(ValueError, match="under way already"):
+    with pytest.raises(ValueError, match="already pending"):
         caller.call(0.0, CALL)
     assert caller.under_way() == ("1",)

@@ -266,7 +266,7 @@ def test_bodies_arrive_as_from_another_process_and_are_nobody_elses() -> None:
         ([Post("b"), Post("b")], "two parties are named b"),
         (
             [Post("c", [(0, _envelope("z", object()))]), Post("b")],
-            "z sends there on control what no envelope carries",
+            "z sends data to there on control that cannot be sent",
         ),
         ([Post("c", [(0, _envelope("z", {1: 2}))]), Post("b")], "a key of a map is not a str"),
         (
@@ -337,9 +337,9 @@ def test_a_failing_party_is_named_to_the_others() -> None:
 
 def test_a_member_that_never_comes_is_named() -> None:
     listeners, addresses = _listeners(["a", "b"])
-    with pytest.raises(PartyLostError, match=r"b: it did not join the cell in 0\.1 s"):
+    with pytest.raises(PartyLostError, match=r"b: it did not join the cell within 0\.1 s"):
         Member("a", [Post("a")], addresses, listener=listeners["a"], joining=0.1).open()
-    with pytest.raises(PartyLostError, match="a: nobody answers on 127"):
+    with pytest.raises(PartyLostError, match="a: no process answers at 127"):
         Member("b", [Post("b")], addresses, listener=listeners["b"], joining=0.1).open()
 
 
@@ -353,24 +353,24 @@ def _join(address: tuple[str, int], name: str = "b", directory: str = "") -> soc
 @pytest.mark.parametrize(
     ("rest", "says"),
     [
-        pytest.param(None, r"no end of tick 0 for 0\.3 s: lost", id="silent"),
-        pytest.param(b"", "its process ended without a word", id="gone"),
-        pytest.param(frame(m.Tick(1)), "tick 1 came after tick -1", id="tick left out"),
+        pytest.param(None, r"it did not finish tick 0 within 0\.3 s", id="silent"),
+        pytest.param(b"", "its process ended without a BYE", id="gone"),
+        pytest.param(frame(m.Tick(1)), "expected tick 0, got tick 1", id="tick left out"),
         pytest.param(
             b"\x00\x00\x00\x02\xff\xff", "it broke the protocol: malformed", id="random bytes"
         ),
-        pytest.param(frame(m.Ping(1)), "a Ping has no place in lock step", id="another kind"),
+        pytest.param(frame(m.Ping(1)), "a Ping is not allowed in lock step", id="another kind"),
         pytest.param(
             frame(m.Refuse("failed", "it failed: no luck")), "b: it failed: no luck", id="failed"
         ),
         pytest.param(
             frame(m.Tick(0, (Posted(0, 0, _envelope("z", 1, party="a")),))),
-            "does not belong here",
+            "is late or misdirected",
             id="due at once",
         ),
         pytest.param(
             frame(m.Tick(0, (Posted(1, 0, _envelope("z", 1, party="q")),))),
-            "does not belong here",
+            "is late or misdirected",
             id="not for a",
         ),
     ],

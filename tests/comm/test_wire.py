@@ -475,7 +475,7 @@ def test_a_server_of_another_name_refuses_and_seals_its_refusal(key: bytes | Non
     client = Connection(Side.CLIENT, "motion", key=key, nonce=NONCES[Side.CLIENT] if key else b"")
     server = Connection(Side.SERVER, "vision", key=key, nonce=NONCES[Side.SERVER] if key else b"")
     with pytest.raises(
-        ProtocolError, match="wrong_node: this is vision, motion was asked for"
+        ProtocolError, match="wrong_node: this is vision, but the client asked for motion"
     ) as fault:
         server.receive_data(client.send(HELLO))
         client.receive_data(server.data_to_send())
@@ -492,7 +492,9 @@ def test_a_welcome_of_another_name_is_refused_though_its_proof_is_good(
     if server.receive_data(client.send(HELLO)) == []:
         client.receive_data(server.data_to_send())
         server.receive_data(client.data_to_send())
-    with pytest.raises(ProtocolError, match="wrong_node: this is motion, vision was asked for"):
+    with pytest.raises(
+        ProtocolError, match="wrong_node: this is motion, but the client asked for vision"
+    ):
         client.receive_data(server.send(m.Welcome(2, "motion", "b1")))
     assert client.version == 0
 

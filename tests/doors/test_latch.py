@@ -71,7 +71,9 @@ def test_a_stop_that_cannot_be_kept_is_said_and_holds_all_the_same(tmp_path: Pat
     stuck.paths[0].mkdir(parents=True)
     stops = EmergencyStops(DEVICES, stuck)
     stops.at_start()
-    assert "remove it by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
+    assert (
+        "remove this file by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
+    )
 
 
 def test_a_node_that_can_keep_no_latch_comes_up_stopped(

@@ -179,9 +179,9 @@ def test_can_fd_is_refused(pair: tuple[can.BusABC, can.BusABC], channel: str) ->
     [
         ("tcp://192.0.2.1:7303", "allow_remote=True"),
         ("tcp://0.0.0.0:7303", "allow_remote=True"),
-        ("tcp://127.0.0.1", "write tcp://127.0.0.1:7303"),
-        ("can0", "write tcp://127.0.0.1:7303"),
-        ("unix://", "write tcp://127.0.0.1:7303"),
+        ("tcp://127.0.0.1", "expected tcp://127.0.0.1:7303"),
+        ("can0", "expected tcp://127.0.0.1:7303"),
+        ("unix://", "expected tcp://127.0.0.1:7303"),
     ],
 )
 def test_bad_channels_are_refused_with_a_remedy(bad: str, says: str) -> None:

@@ -150,7 +150,7 @@ def test_client_gives_up_after_its_timeout_and_says_so() -> None:
     [
         (canopen.sdo_abort(0x584, 0x1000, 0, AbortCode.NO_OBJECT), "no object"),
         (canopen.sdo_write_reply(4, 0x1000, 0), "command"),
-        (canopen.sdo_read_reply(4, 0x1000, 0, b"\x01"), "1 bytes are no UNSIGNED32"),
+        (canopen.sdo_read_reply(4, 0x1000, 0, b"\x01"), "expected 4 bytes for UNSIGNED32, got 1"),
         (Frame(0x584, bytes.fromhex("41 00 10 00 10 00 00 00")), "command"),
     ],
 )
@@ -187,7 +187,7 @@ def test_statuswords(word: int, state: DriveState) -> None:
 
 
 def test_a_statusword_that_shows_no_state_is_refused() -> None:
-    with pytest.raises(ValueError, match="shows no state"):
+    with pytest.raises(ValueError, match="is not a state"):
         cia402.state_of(0x0002)
 
 

@@ -327,7 +327,7 @@ def test_a_local_service_is_refused_to_another_host() -> None:
     end = Bench(far).call("delegate", service="secret")
     assert (
         end.values["cause"] == "local_only"
-        and "serves callers on the host of right alone" in end.values["text"]
+        and "only serves callers on the host of right" in end.values["text"]
     )
 
 

@@ -1,4 +1,5 @@
-"""Calls under way at their caller, and how long each may wait."""
+"""What a caller keeps about its calls to one peer (sans-I/O): pending calls, the lost connection,
+finished calls."""
 
 from __future__ import annotations
 
@@ -19,93 +20,97 @@ class Patience:
     """How long the caller waits (s)."""
 
     reconnect: float = 2.0
-    """After a broken link, before its calls end."""
+    """For a lost connection to come back, before its calls end."""
     again: float = 0.1
-    """Between two calls that are told at once that the peer is not there; those in between wait."""
+    """Between two calls that fail at once because the peer is not there; calls in between wait."""
     accept: float = 1.0
     """For ACCEPT."""
     stop: float = 5.0
-    """For RESULT after the deadline or a cancel: the node's stop routine and kill take time."""
+    """For RESULT after the deadline or a CANCEL: the node's stop routine and kill take time."""
     answer: float = 2.0
     """For the answer to a command."""
     acknowledge: float = 0.05
-    """How long an acknowledgement waits for others to go with it."""
+    """How long an acknowledgement waits for others, to be sent in one message with them."""
 
 
 class Waiter(Protocol):
-    """Whoever waits for one call's end; a future of asyncio is one."""
+    """Receives the result of one call, for example an asyncio future."""
 
     def done(self) -> bool:
-        """Whether it wants to know no more."""
+        """Return whether it no longer wants the result."""
 
     def set_result(self, outcome: Outcome, /) -> None:
-        """The call has ended so."""
+        """Receive the result."""
 
 
 @dataclass(slots=True)
 class PendingCall:
-    """A call that has not ended. `made` and the dues are on the caller's clock (s)."""
+    """A call without a result. `made` and the due times are on the caller's clock (s)."""
 
     call: Call
     any_boot: bool
-    """Until it is sent, it may go to whatever boot the peer is; False when its owner names one."""
+    """While unsent, the call may go to any boot of the peer; False if its owner names one."""
     made: float
     waiter: Waiter | None = None
-    """Told its end in place of a notice; the result is acknowledged then."""
+    """Receives the result instead of a notice; the result is then acknowledged."""
     sent: bool = False
     accepted: bool = False
     cancel: str | None = None
     accept_due: float = NEVER
     result_due: float = NEVER
     held: float | None = None
-    """Since when an operator holds its run."""
+    """Since when an operator holds its run (s)."""
 
     @property
     def if_unsent(self) -> Executed:
-        """What is known when it ends unsent: its owner may have sent it before the owner was
-        restarted."""
+        """Return `executed` if the call ends unsent: unknown if its owner may have sent it before a
+        restart."""
         return Executed.NO if self.any_boot and not self.call.again else Executed.UNKNOWN
 
 
 class PendingCalls(dict[str, PendingCall]):
-    """Calls under way by id, with their watches: for ACCEPT a queue (all wait equally long), for
-    RESULT a heap."""
+    """Pending calls by id, with their timeouts.
+
+    All calls wait equally long for ACCEPT, so these timeouts are a queue; those for RESULT are a
+    heap. Entries are not removed early: one that is due is compared with the call as it is now.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self._accepts: deque[tuple[float, str]] = deque()
         self._most = _SPARE
-        """Watches for ACCEPT above which those of ended calls are looked for."""
+        """Length of the ACCEPT queue above which entries of finished calls are removed from it."""
         self._results: list[tuple[float, str]] = []
 
     def watch_new(self, due: float, id_: str) -> None:
-        """A call that was sent as it was made, with this `accept_due`, waits for ACCEPT."""
+        """Expect ACCEPT until `due` for a call that was sent when it was made (its `accept_due` is
+        set)."""
         accepts = self._accepts
         accepts.append((due, id_))
         if len(accepts) > self._most:
-            # Most of them have ended long before their time: a second of quick calls is a hundred
-            # thousand of them.
+            # Most of these calls are finished long before they are due. Without this a second of
+            # quick calls would leave a hundred thousand entries.
             self._drop_past()
 
     def watch_accept(self, pending: PendingCall, due: float) -> None:
-        """Wait for ACCEPT until `due`."""
+        """Expect ACCEPT until `due` (s)."""
         pending.accept_due = due
         self.watch_new(due, pending.call.id)
 
     def watch_result(self, pending: PendingCall, due: float) -> None:
-        """Wait for RESULT until `due`, or until an earlier time set before."""
+        """Expect RESULT until `due` (s), or until an earlier time that is already set."""
         if due < pending.result_due:
             pending.result_due = due
             heapq.heappush(self._results, (due, pending.call.id))
 
     def hold(self, now: float, id_: str) -> None:
-        """The wait for this call's RESULT stands still."""
+        """Stop the clock of this call's wait for RESULT."""
         pending = self.get(id_)
         if pending is not None and pending.held is None:
             pending.held = now
 
     def release(self, now: float, id_: str) -> None:
-        """The wait goes on, later by the pause."""
+        """Restart the clock, later by the duration of the pause."""
         pending = self.get(id_)
         if pending is None or pending.held is None:
             return
@@ -115,7 +120,7 @@ class PendingCalls(dict[str, PendingCall]):
             heapq.heappush(self._results, (pending.result_due, id_))
 
     def not_accepted(self, now: float) -> Iterator[str]:
-        """Ids that have waited too long for ACCEPT."""
+        """Yield ids that have waited too long for ACCEPT."""
         while self._accepts and self._accepts[0][0] <= now:
             due, id_ = self._accepts.popleft()
             pending = self.get(id_)
@@ -123,7 +128,7 @@ class PendingCalls(dict[str, PendingCall]):
                 yield id_
 
     def not_answered(self, now: float) -> Iterator[str]:
-        """Ids that have waited too long for RESULT."""
+        """Yield ids that have waited too long for RESULT."""
         while self._results and self._results[0][0] <= now:
             due, id_ = heapq.heappop(self._results)
             pending = self.get(id_)
@@ -131,7 +136,7 @@ class PendingCalls(dict[str, PendingCall]):
                 yield id_
 
     def due(self) -> float:
-        """When the next watch is over (s)."""
+        """Return when the next timeout is due (s)."""
         self._drop_past()
         while self._results and self._results[0][1] not in self:
             heapq.heappop(self._results)
@@ -148,7 +153,7 @@ class PendingCalls(dict[str, PendingCall]):
         self._most = 2 * len(self) + _SPARE
 
 
-# A peer that is not there: which calls wait for it, and what those that do not are told.
+# A lost connection: which calls wait for it, and how the others end.
 
 LOST: Final = "lost"
 UNREACHABLE: Final = "unreachable"
@@ -156,60 +161,60 @@ REFUSED: Final = "refused"
 
 
 class CallEnd(NamedTuple):
-    """Why a call ends."""
+    """Why a call ends: cause and text of its ERROR outcome."""
 
     cause: str
     text: str
 
 
 class PeerAbsence:
-    """Of one peer, while there is no link to it."""
+    """The time during which there is no connection to one peer."""
 
     def __init__(self, peer: str, patience: Patience) -> None:
         self._peer = peer
         self._patience = patience
         self._refusal = ""
         self._trouble = ""
-        """Why there is no link, as far as is known."""
+        """Why there is no connection, as far as is known."""
         self._why = ""
         self._again_from = 0.0
         self.until = NEVER
         """Calls wait until then (s); NEVER: they do not wait."""
 
     def over(self) -> None:
-        """The peer is there."""
+        """The peer is connected."""
         self._refusal, self._trouble, self.until = "", "", NEVER
 
     def wait(self, now: float) -> None:
-        """A link is being tried for the first time or again: calls wait for it."""
+        """A connection is being tried, for the first time or again: calls wait for it."""
         self._wait_until(
             now + self._patience.reconnect,
-            f"{self._peer} did not come back in {self._patience.reconnect:g} s",
+            f"{self._peer} did not come back within {self._patience.reconnect:g} s",
         )
 
     def fail(self, trouble: str) -> None:
-        """An attempt to connect has failed; those that wait go on waiting."""
+        """An attempt to connect has failed; waiting calls still wait."""
         self._trouble = trouble
 
     def give_up(self) -> CallEnd:
-        """The peer's process is gone. What all calls are told."""
+        """The peer's process is gone. Return how all calls end."""
         self.until = NEVER
         return CallEnd(LOST, f"{self._peer} is gone: nothing listens at its address any more")
 
     def refuse(self, code: str, text: str) -> CallEnd:
-        """The peer refuses us, until it is there. What all calls are told."""
+        """The peer refuses us until further notice. Return how all calls end."""
         self._refusal, self.until = f"{self._peer} refuses the connection: {code}: {text}", NEVER
         return CallEnd(REFUSED, self._refusal)
 
     def new_call(self, now: float) -> CallEnd | None:
-        """What a new call is told at once; None: it waits.
+        """Return how a new call ends at once; None if it waits.
 
-        One that follows another too soon waits a little: a task that tries again at once must not
-        go round as fast as the machine can.
+        A call that follows a failed one too soon waits a little: a task that repeats a failed call
+        at once must not loop as fast as the machine can.
         """
         if now < self.until < NEVER:
             return None
-        text = self._refusal or self._with_trouble(f"{self._peer} is not there")
+        text = self._refusal or self._with_trouble(f"{self._peer} is not connected")
         away = CallEnd(REFUSED if self._refusal else UNREACHABLE, text)
         if now < self._again_from:
             self._wait_until(self._again_from, away.text)
@@ -218,7 +223,7 @@ class PeerAbsence:
         return away
 
     def advance(self, now: float) -> CallEnd | None:
-        """What those that have waited are told now, if anything."""
+        """Return how the waiting calls end now; None if they still wait."""
         if now < self.until:
             return None
         self.until = NEVER
@@ -233,20 +238,19 @@ class PeerAbsence:
         self.until, self._why = until, why
 
 
-# What a caller remembers of calls that have ended: which results are safe, what was given up, what
-# is to be acknowledged.
+# What a caller remembers of finished calls: stored results, calls given up, acknowledgements to send.
 
 REMEMBERED: Final = 10_000
-"""Ids of ended calls that are remembered at least."""
+"""How many ids of finished calls are remembered at least."""
 ACKS_AT_ONCE: Final = 64
-"""Acknowledgements that wait no longer for others."""
+"""So many acknowledgements are sent without waiting for more."""
 IN_ONE: Final = 200
-"""Most of them in one message: so many of the longest ids keep to its limit."""
+"""Most acknowledgements in one message: as many of the longest ids fit its size limit."""
 
 
 class FinishedCalls:
-    """Ended calls of one caller. An acknowledgement waits up to `delay` seconds for others to go
-    with it."""
+    """Finished calls of one caller. An acknowledgement waits up to `delay` seconds to be sent with
+    others."""
 
     def __init__(self, delay: float) -> None:
         self._delay = delay
@@ -254,21 +258,21 @@ class FinishedCalls:
         self._given_up: OrderedDict[str, None] = OrderedDict()
         self._acks: list[str] = []
         self.due = NEVER
-        """When the waiting acknowledgements are to go (s)."""
+        """When the waiting acknowledgements must be sent (s)."""
 
     def end(self, id_: str, safe: bool) -> None:
-        """The peer's result of this call has come, and is safe already or not yet."""
+        """The peer's result of this call has arrived; `safe`: it is stored already."""
         self._safe[id_] = safe
 
     def _prune(self) -> None:
-        """Forget the oldest in bulk, so that a single call pays nothing for it; what is not safe
-        yet stays."""
+        """Forget the oldest in bulk, so that no single call pays for it. Results that are not
+        stored yet stay."""
         for old in list(self._safe)[:REMEMBERED]:
             if self._safe[old]:
                 del self._safe[old]
 
     def is_safe(self, id_: str) -> bool | None:
-        """Whether the peer's result of this call is safe; None if none has come."""
+        """Return whether the peer's result of this call is stored; None if none has arrived."""
         return self._safe.get(id_)
 
     def give_up(self, id_: str) -> None:
@@ -278,17 +282,17 @@ class FinishedCalls:
             del self._given_up[next(iter(self._given_up))]
 
     def was_given_up(self, id_: str) -> bool:
-        """Whether this call ended here and the peer's own result has not come since."""
+        """Return whether this call ended here and the peer's own result has not arrived since."""
         return id_ in self._given_up
 
     def turn_up(self, id_: str) -> None:
-        """The peer's own result of a call that had ended here has come late; it is only
+        """The peer's own result of a call that had ended here has arrived late; it is only
         recorded."""
         self._given_up.pop(id_, None)
         self.end(id_, True)
 
     def acknowledge(self, now: float, *ids: str) -> None:
-        """Tell the peer soon that these results are safe."""
+        """Tell the peer soon that these results are stored."""
         safe, acks = self._safe, self._acks
         if not acks:
             self.due = now + self._delay
@@ -301,17 +305,18 @@ class FinishedCalls:
             self.due = now
 
     def take_acks(self) -> list[ResultAck]:
-        """The acknowledgements of all that wait. To be asked for once they are `due`."""
+        """Take out all waiting acknowledgements. Call it once they are `due`."""
         acks, self._acks, self.due = self._acks, [], NEVER
         return [
             ResultAck(acks[n], tuple(acks[n + 1 : n + IN_ONE])) for n in range(0, len(acks), IN_ONE)
         ]
 
     def link_lost(self) -> None:
-        """What waits is not told any more: the peer lists what it keeps when it is back."""
+        """Drop waiting acknowledgements: the peer lists the results that it keeps when it is
+        back."""
         self._acks.clear()
         self.due = NEVER
 
     def peer_is_new(self) -> None:
-        """The peer is another process: nothing given up can turn up any more."""
+        """The peer is a new process: results of calls given up cannot arrive any more."""
         self._given_up.clear()

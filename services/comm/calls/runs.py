@@ -1,5 +1,5 @@
-"""Runs that go on at the called end: when each must have ended, with clocks that stand still while
-the run is held."""
+"""The runs of a node: active ones with their deadlines, finished ones with their results
+(sans-I/O)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ ORPHAN: Final = "orphan"
 
 @dataclass(slots=True)
 class ActiveRun:
-    """A run that goes on; times in seconds on the node's clock. `stopping` once it was ordered to
-    stop, `reason` says why."""
+    """An active run; times in seconds on the node's clock.
+
+    `stopping` is set when it was ordered to stop; `reason` says why.
+    """
 
     call: Call
     peer: str
@@ -28,37 +30,43 @@ class ActiveRun:
     device: str
     orphan_time: float | None
     limit: float = NEVER
-    """When its deadline is over."""
+    """When its deadline is over (s)."""
     held: float | None = None
-    """Since when an operator holds it."""
+    """Since when an operator holds it (s)."""
     stopping: bool = False
     reason: str = ""
 
 
 class ActiveRuns(dict[str, ActiveRun]):
-    """Runs that go on, by call id, with the times at which they are worth a look."""
+    """Active runs by call id, with a heap of the times at which one of them must be looked at.
+
+    Entries of the heap are never removed early. One that is taken out is compared with the run as
+    it is now: it may have finished, or its deadline may have moved.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self._timers: list[tuple[float, str, str]] = []
 
     def limit(self, id_: str, due: float) -> None:
-        """The run must have ended by then."""
+        """The run must have finished at `due` (s)."""
         self[id_].limit = due
         heapq.heappush(self._timers, (due, DEADLINE, id_))
 
     def watch_orphan(self, id_: str, due: float) -> None:
-        """Then the run's caller may have been away for too long."""
+        """At `due` (s) the run's caller may have been away for too long."""
         heapq.heappush(self._timers, (due, ORPHAN, id_))
 
     def hold_all(self, now: float, devices: Collection[str]) -> None:
-        """Deadlines of the runs of these devices ("" for runs without one) stand still."""
+        """Stop the clocks of the deadlines of these devices' runs ("" for runs without a
+        device)."""
         for run in self.values():
             if run.device in devices and run.held is None:
                 run.held = now
 
     def release_all(self, now: float, devices: Collection[str] | None) -> None:
-        """Deadlines of the held runs of these devices (None: of all) go on, later by the pause."""
+        """Restart the stopped deadlines of these devices' runs (None: of all), later by the
+        duration of the pause."""
         for id_, run in self.items():
             if run.held is None or (devices is not None and run.device not in devices):
                 continue
@@ -67,8 +75,8 @@ class ActiveRuns(dict[str, ActiveRun]):
                 self.limit(id_, run.limit + pause)
 
     def over(self, now: float) -> Iterator[tuple[float, str, str, ActiveRun]]:
-        """What is due: time, DEADLINE or ORPHAN, id and run. A deadline that stands still or has
-        moved is not."""
+        """Yield what is due: time, DEADLINE or ORPHAN, id and run. A stopped or moved deadline is
+        not due."""
         while self._timers and self._timers[0][0] <= now:
             due, kind, id_ = heapq.heappop(self._timers)
             run = self.get(id_)
@@ -76,42 +84,41 @@ class ActiveRuns(dict[str, ActiveRun]):
                 yield due, kind, id_, run
 
     def due(self) -> float:
-        """When `over` has something to give next (s)."""
+        """Return when `over` has something to yield next (s)."""
         while self._timers and self._timers[0][2] not in self:
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else NEVER
 
 
-# What a node remembers of calls that have ended: results until they are acknowledged, ids for
-# longer.
+# What a node remembers of finished calls: results until they are acknowledged, ids for longer.
 
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """How long the node remembers."""
+    """How long the node remembers finished calls."""
 
     results: float = 600.0
-    """Seconds that an unacknowledged result is kept,"""
+    """How long an unacknowledged result is kept (s)."""
     result_count: int = 1_000
-    """and how many of them,"""
+    """How many unacknowledged results are kept."""
     result_bytes: int = 64 << 20
-    """and how much they may weigh together (bytes, about as on the wire); the newest is kept
-    whatever it weighs."""
+    """How large the kept results may be together (bytes, about as on the wire). The newest is
+    always kept."""
     id_groups: int = 100_000
-    """Groups of ids that are remembered once their results are gone (`FinishedIds`); there is no
-    limit of time."""
+    """How many groups of ids are remembered after their results are dropped (`FinishedIds`);
+    without limit of time."""
     lease: float = 2.0
-    """Seconds after which the lease of a device is free when its holder is away and none of its
-    runs goes on."""
+    """After this time (s) the lease of a device is free when its holder is away and none of its
+    runs is active."""
 
 
 _SCALAR = 9
-"""Bytes of a number on the wire."""
+"""Bytes of a number on the wire: one marker and eight bytes."""
 _NUMBERS = frozenset((float, int, bool, NoneType))
 
 
 def weight_of(value: Any) -> int:
-    """About how many bytes plain data takes on the wire."""
+    """Estimate how many bytes plain data takes on the wire."""
     kind = type(value)
     if kind is str or kind is bytes:
         return len(value) + _SCALAR
@@ -129,23 +136,27 @@ def weight_of(value: Any) -> int:
 
 _DIGITS = "0123456789"
 _GROUP = 4_096
-"""Numbers in one group: 512 bytes when all of them are used."""
+"""Numbers in one group: a bit set of 512 bytes when all of them are used."""
 
 
 class FinishedIds:
-    """Ids of calls whose results are gone, grouped so that they need never be forgotten in ordinary
-    use.
+    """Ids of calls whose results are dropped, stored so compactly that ordinary use never forgets
+    one.
 
-    Callers count their calls (docs/protocol.md, `id`), so an id is split into its text and its
-    trailing number, and the numbers of one text are kept as bits. At most `limit` groups of 4,096
-    numbers are kept, the oldest is forgotten first.
+    Callers count their calls (docs/protocol.md, `id`). So an id is split into its text and its
+    trailing number, and the numbers of one text are bits of a Python integer, 4,096 per group. A
+    million calls of one caller need 245 groups, about 128 KB. At most `limit` groups are kept; then
+    the oldest is dropped.
+
+    Dropping a group means that an unknown id may have run before. `complete` says whether that can
+    be; the callee then refuses repeated calls that it does not know (`Call.again`).
     """
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._groups: OrderedDict[tuple[str, int], int] = OrderedDict()
         self.complete = True
-        """Whether no id was ever forgotten: then an unknown id has never been here."""
+        """Whether no id was ever forgotten: then an unknown id certainly never ran here."""
 
     def __contains__(self, id_: str) -> bool:
         text, number = _split(id_)
@@ -162,8 +173,8 @@ class FinishedIds:
 
 
 def _split(id_: str) -> tuple[str, int]:
-    """An id as its text and its trailing number; no two ids give the same, since leading zeros stay
-    with the text."""
+    """Split an id into its text and its trailing number. Leading zeros stay with the text, so no
+    two ids give the same pair."""
     text = id_.rstrip(_DIGITS)
     digits = id_[len(text) :]
     if digits[:1] == "0":
@@ -173,25 +184,26 @@ def _split(id_: str) -> tuple[str, int]:
 
 
 class ResultStore:
-    """Results by call id. `forgotten` is told each id whose result goes."""
+    """Results by call id. `forgotten` is called with each id whose result is dropped."""
 
     def __init__(self, keeping: Retention, forgotten: Callable[[str], None]) -> None:
         self._keeping = keeping
         self._forgotten = forgotten
-        # A plain dict is slow to find its first entry once many were deleted before it.
+        # An OrderedDict finds its first entry at once. A plain dict scans over all entries that were
+        # deleted before it, and results are deleted at the front.
         self._results: OrderedDict[str, tuple[Outcome, str, float, int]] = OrderedDict()
         self._weight = 0
         self.kept: Collection[str] = self._results.keys()
-        """Ids whose result is kept,"""
+        """Ids whose result is kept (for a quick look; see `in`)."""
         self.gone = FinishedIds(keeping.id_groups)
-        """and those whose result is gone; both for quick looks, see `in`."""
+        """Ids whose result is dropped."""
 
     def __contains__(self, id_: str) -> bool:
         return id_ in self._results or id_ in self.gone
 
     def add(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
-        """Keep a result for its caller. `weight` is its length on the wire (bytes) where that is
-        known, else it is estimated."""
+        """Keep a result for its caller. `weight` is its length on the wire (bytes); it is estimated
+        when left out."""
         if weight is None:
             weight = weight_of(outcome.values) if outcome.values else 0
         results, id_ = self._results, outcome.id
@@ -204,17 +216,17 @@ class ResultStore:
             self._forget(next(iter(results)))
 
     def get(self, id_: str) -> Outcome | None:
-        """The result of this call, None if it is not kept (any more)."""
+        """Return the result of this call, None if it is not kept."""
         stored = self._results.get(id_)
         return None if stored is None else stored[0]
 
     def owner(self, id_: str) -> str:
-        """Whose result it is; empty if it is not kept."""
+        """Return the caller of this result; empty if it is not kept."""
         stored = self._results.get(id_)
         return "" if stored is None else stored[1]
 
     def acknowledge(self, peer: str, ids: Iterable[str]) -> None:
-        """The caller has these results safe; of others' ids nothing is forgotten."""
+        """Drop the results that the caller has stored; ids of other callers are ignored."""
         get = self._results.get
         for id_ in ids:
             stored = get(id_)
@@ -222,17 +234,17 @@ class ResultStore:
                 self._forget(id_)
 
     def of(self, peer: str) -> list[str]:
-        """Ids of the results kept for this caller."""
+        """Return the ids of the results kept for this caller."""
         return [id_ for id_, (_, owner, _, _) in self._results.items() if owner == peer]
 
     def due(self) -> float | None:
-        """When the oldest result has been kept long enough (s)."""
+        """Return when the oldest result has been kept long enough (s)."""
         for _, _, at, _ in self._results.values():
             return at + self._keeping.results
         return None
 
     def advance(self, now: float) -> None:
-        """Forget what has been kept long enough."""
+        """Drop the results that have been kept long enough."""
         while (due := self.due()) is not None and due <= now:
             self._forget(next(iter(self._results)))
 

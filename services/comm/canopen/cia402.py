@@ -1,5 +1,5 @@
-"""CiA 402 servo drives: state machine, words, objects, units and error codes, as master and drives
-must agree on them.
+"""CiA 402 servo drives: state machine, words, objects, units and error codes, shared by master and
+simulated drives.
 
 Pure tables and functions (CiA 402-2 and 402-3). Positions are in micro-radians at the joint (the
 drives' position factor), speeds in micro-radians per second, so an INTEGER32 holds 2,147 rad.
@@ -13,21 +13,21 @@ from typing import Final
 from petrobot.services.comm.canopen.cia301 import DataType, Mapped
 
 UNITS: Final = 1e6
-"""Position units in a radian and speed units in a radian per second."""
+"""Position units per radian, and speed units per radian per second."""
 
 
 def to_units(radians: float) -> int:
-    """Radians (or rad/s) as the drives count them."""
+    """Convert radians (or rad/s) to the drives' units."""
     return round(radians * UNITS)
 
 
 def from_units(units: int) -> float:
-    """What the drives count as radians (or rad/s)."""
+    """Convert the drives' units to radians (or rad/s)."""
     return units / UNITS
 
 
 class DriveState(Enum):
-    """The power drive system's states; the value is (mask, pattern) of the statusword's low byte
+    """States of the power drive system; the value is (mask, pattern) of the statusword's low byte
     (CiA 402-2, table 31)."""
 
     def __init__(self, mask: int, word: int) -> None:
@@ -45,7 +45,7 @@ class DriveState(Enum):
 
 
 class StatusBit(IntEnum):
-    """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode,
+    """Statusword bits outside the state pattern. 12 and 13 as in cyclic synchronous position mode;
     12 also as in velocity mode."""
 
     VOLTAGE_ENABLED = 1 << 4
@@ -82,12 +82,12 @@ class OperationMode(IntEnum):
 
     @property
     def bit(self) -> int:
-        """Its bit in object 6502h, supported drive modes (modes 1 and up)."""
+        """Return its bit in object 6502h, supported drive modes (modes 1 and up)."""
         return 1 << (self.value - 1)
 
 
 SUPPORTED_MODES: Final = OperationMode.CYCLIC_SYNCHRONOUS_POSITION.bit
-"""Object 6502h of a drive that knows cyclic synchronous position alone."""
+"""Object 6502h of a drive that supports only cyclic synchronous position mode."""
 
 DEVICE_TYPE: Final = 0x0002_0192
 """Object 1000h of a servo drive (profile 402)."""
@@ -123,7 +123,7 @@ FAULT_TEXT: Final = {
 
 
 def fault_text(code: int) -> str:
-    """An error code in words."""
+    """Return an error code in words."""
     return (
         FAULT_TEXT[DriveFault(code)]
         if code in DriveFault._value2member_map_
@@ -184,7 +184,7 @@ SENT: Final = (
     Mapped(ObjectIndex.POSITION, 0, DataType.INTEGER32),
     Mapped(ObjectIndex.TORQUE, 0, DataType.INTEGER16),
 )
-"""Objects of the TPDO that each drive sends on SYNC, in either mode."""
+"""Objects of the TPDO that each drive sends after SYNC, in either mode."""
 
 
 def _state(statusword: int) -> DriveState | None:
@@ -195,29 +195,32 @@ def _state(statusword: int) -> DriveState | None:
     return None
 
 
+# No two patterns overlap, so the order of the commands does not matter.
 def _command(controlword: int) -> DriveCommand | None:
-    for command in reversed(DriveCommand):
+    for command in DriveCommand:
         mask, pattern = command.value
         if controlword & mask == pattern:
             return command
     return None
 
 
+# Both words are decoded every cycle, so the answer is looked up by the low byte.
 _STATES: Final = tuple(_state(low) for low in range(256))
 _COMMANDS: Final = tuple(_command(low) for low in range(256))
 
 
 def state_of(statusword: int) -> DriveState:
-    """The state that a statusword shows; raises ValueError for a pattern that is none."""
+    """Return the state that a statusword shows; raises ValueError for a pattern that is not a
+    state."""
     state = _STATES[statusword & 0xFF]
     if state is None:
-        raise ValueError(f"statusword {statusword:#06x} shows no state of CiA 402")
+        raise ValueError(f"statusword {statusword:#06x} is not a state of CiA 402")
     return state
 
 
 def command_of(controlword: int) -> DriveCommand | None:
-    """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive
-    to see)."""
+    """Return the command that a controlword gives. For FAULT_RESET only the bit is checked; the
+    drive itself detects the edge."""
     return _COMMANDS[controlword & 0xFF]
 
 
@@ -257,8 +260,11 @@ TRANSITIONS: Final = {
         DriveCommand.ENABLE_OPERATION,
     ): DriveState.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
 }
-"""The transitions that commands cause, with their numbers in CiA 402-2 figure 9. Any other command
-changes nothing. 0, 1 (power on), 13 (fault) and 14 (fault reaction over) happen of themselves."""
+"""Transitions caused by commands, with their numbers in CiA 402-2, figure 9; any other command
+changes nothing.
+
+0, 1 (power on), 13 (fault) and 14 (end of the fault reaction) happen without a command.
+"""
 
 ENABLING: Final = {
     DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
@@ -268,10 +274,10 @@ ENABLING: Final = {
     DriveState.QUICK_STOP_ACTIVE: DriveCommand.DISABLE_VOLTAGE,
     DriveState.FAULT: DriveCommand.FAULT_RESET,
 }
-"""Which command leads from a state towards OPERATION_ENABLED. FAULT_RESET needs a word without its
-bit before."""
+"""The command that leads from a state towards OPERATION_ENABLED. FAULT_RESET must follow a word
+without its bit."""
 
 
 def after(state: DriveState, command: DriveCommand) -> DriveState:
-    """The state after a command."""
+    """Return the state after a command."""
     return TRANSITIONS.get((state, command), state)

@@ -1,10 +1,10 @@
-"""Set points from node to node, each stream on a connection of its own: newest value wins.
+"""Set points from node to node, each stream on a connection of its own: the newest value wins.
 
-The sender opens with the handshake of the node protocol (role "stream"), then STREAM_OPEN, then one
-SET_POINT a period for as long as it stands by its values, and WITHDRAW when it does no more.
-Nothing here waits: a value that finds no room is dropped, since a newer one follows; the receiver
-drains its sockets to the newest value, and withdraws it once it is older than three periods, what
-it lost on its way included. Pacing is the sender's loop's.
+The sender opens with the handshake of the node protocol (role "stream") and STREAM_OPEN. Then it
+sends one SET_POINT per period as long as its values must be followed, and WITHDRAW when they must
+not. Nothing here blocks: a value that finds no room in the socket is dropped, because a newer one
+follows. The receiver reads its sockets up to the newest value, and withdraws it once it is older
+than three periods, including its delay on the way. The sender's own loop keeps the period.
 """
 
 from __future__ import annotations
@@ -40,31 +40,33 @@ from petrobot.services.comm.protocol.wire import (
     Side,
 )
 
-# One end of a set-point stream: its connection without waiting, and what of the arrived counts.
-
 STALE_AFTER: Final = 3
-"""Periods after which a set point is too old."""
+"""A set point is too old after so many periods."""
 
 _DRIFT: Final = 1e-4
-"""How much two clocks may drift apart (s/s); quartz is ten times better."""
+"""Assumed drift between two clocks (s/s); quartz is ten times better."""
 _CHUNK: Final = 1 << 14
 _READS: Final = 16
-"""Reads of one connection in a poll: a flood must not hold up the servo loop that polls."""
+"""Most reads of one connection per poll: a flood must not delay the servo loop that polls."""
 
 
 class Sink(Protocol):
-    """Where the newest set point of a stream goes."""
+    """Receives the newest set point of a stream."""
 
     def take(self, values: Sequence[float], held: float = 0.0) -> None:
         """A set point has arrived, `held` seconds after its sender first sent these values."""
 
     def withdraw(self) -> None:
-        """It counts no more: its sender does not stand by it, is gone, or it has become too old."""
+        """The last set point must not be followed: its sender withdrew it or is gone, or it is too
+        old."""
 
 
 class Lateness:
-    """How much longer a message took than the quickest one of its stream: from arrivals and the
-    sender's own durations."""
+    """Estimates how much longer a message took than the quickest one of its stream.
+
+    The clocks of sender and receiver have an unknown offset. The smallest difference between
+    arrival time and the sender's elapsed time is taken as the passage without delay.
+    """
 
     __slots__ = ("_at", "_best")
 
@@ -73,22 +75,21 @@ class Lateness:
         self._at = 0.0
 
     def of(self, now: float, elapsed: float) -> float:
-        """Seconds that a message sent `elapsed` seconds into the stream has lost on its way when it
+        """Return the delay (s) of a message that was sent `elapsed` seconds into the stream and
         arrives at `now`."""
         offset = now - elapsed
-        # The quickest passage is forgotten at the rate at which clocks may drift, so an old one
-        # cannot make all look late.
+        # The quickest passage grows at the rate at which clocks may drift. Otherwise a very old one
+        # would make all later messages look late.
         self._best = min(self._best + _DRIFT * (now - self._at), offset)
         self._at = now
         return offset - self._best
 
 
 class Inlet:
-    """Receiving end of one open stream, without socket or clock: what is older than three periods
-    does not count.
+    """Receiving end of one open stream (sans-I/O): drops what is older than three periods.
 
-    What a set point lost on its way counts as age, so one that was held up is not taken for a fresh
-    one.
+    The delay of a set point on its way counts as age, so one that was held up is not mistaken for a
+    fresh one.
     """
 
     __slots__ = ("_lateness", "_limit", "_sink", "_until")
@@ -100,8 +101,8 @@ class Inlet:
         self._until = math.inf
 
     def receive(self, now: float, messages: Sequence[Message]) -> None:
-        """Take what has arrived by `now`: the newest counts, the others only show how late things
-        are."""
+        """Handle what has arrived by `now`: the newest message counts, the others only improve the
+        estimate of the delay."""
         newest: Message | None = None
         late = 0.0
         for message in messages:
@@ -119,8 +120,8 @@ class Inlet:
 
 @dataclass(frozen=True, slots=True)
 class Incoming:
-    """A stream that a receiver takes: its period (s), where its values go, and what its sender must
-    show."""
+    """A stream that a receiver accepts: its period (s), the sink of its values, and the ticket that
+    its sender must show."""
 
     period: float
     sink: Sink
@@ -128,7 +129,7 @@ class Incoming:
 
 
 class StreamConnection:
-    """One non-blocking connection, either end; `receiver` is the name of the end that listens."""
+    """One non-blocking connection, either end; `receiver` is the name of the listening end."""
 
     def __init__(self, sock: socket.socket, side: Side, receiver: str, key: Keys | None) -> None:
         sock.setblocking(False)
@@ -138,7 +139,8 @@ class StreamConnection:
         self.unsent = b""
 
     def tune(self) -> None:
-        """Small buffers and short timeouts: nothing old is to queue up here."""
+        """Set small buffers and short timeouts, so that old values do not queue up in the
+        kernel."""
         sock = self.sock
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
@@ -161,8 +163,11 @@ class StreamConnection:
         self.unsent = data[sent:]
 
     def read(self, reads: int = _READS, chunk: int = _CHUNK) -> list[Message]:
-        """Messages that have arrived, of at most so many reads. Raises OSError when the connection
-        is gone, ProtocolError when it is no good."""
+        """Return the messages that have arrived, with at most `reads` reads.
+
+        Raises OSError when the connection is gone, ProtocolError when the other side broke the
+        protocol.
+        """
         messages: list[Message] = []
         for _ in range(reads):
             try:
@@ -183,21 +188,20 @@ __all__ = ["STALE_AFTER", "Incoming", "Inlet", "Sink", "StreamReceiver", "Stream
 
 _CONNECTIONS: Final = 16
 _ADMITTED: Final = 4
-"""Connections taken in a poll, and"""
+"""Connections accepted per poll, so that strangers do not delay the servo loop that polls."""
 _STRANGERS_CHUNK: Final = 2048
-"""bytes read in a poll from one that has not opened a stream: strangers must not hold up the servo
-loop that polls."""
+"""Bytes read per poll from a connection that has not opened a stream yet, for the same reason."""
 _HANDSHAKE: Final = 2.0
 _RETRY: Final = 0.1
 
 
 class StreamSender:
-    """Sending end of one stream, for the loop of a worker: `send` never blocks, the connection
-    looks after itself.
+    """Sending end of one stream, for the loop of a worker. `send` never blocks; the connection is
+    maintained in passing.
 
-    It connects when there is first something to send, and again at most every 0.1 s when that fails
-    or the receiver is gone. `name` says who sends, `receiver` the name of the device that is to
-    receive: another one is sent nothing.
+    It connects when there is first something to send. When that fails or the receiver is gone, it
+    tries again at most every 0.1 s. `name` is the sender, `receiver` the device that must receive;
+    another device is sent nothing.
     """
 
     def __init__(
@@ -231,12 +235,12 @@ class StreamSender:
 
     @property
     def up(self) -> bool:
-        """Whether the receiver has welcomed the stream."""
+        """Return whether the receiver has welcomed the stream."""
         return self._line is not None and self._line.connection.state is ConnectionState.OPEN
 
     def send(self, values: Sequence[float], held: float = 0.0) -> bool:
-        """Send the newest values, which the sender has stood by for `held` seconds. False if they
-        were dropped."""
+        """Send the newest values, which the sender has held for `held` seconds. Return False if
+        they were dropped."""
         line = self._line if self.up else self.advance()
         if line is not None and line.unsent:
             line = self.advance()
@@ -246,11 +250,11 @@ class StreamSender:
         self._number += 1
         elapsed = self._clock() - self._opened
         sent = self._write(line, SetPoint(self._number, tuple(map(float, values)), held, elapsed))
-        self.advance()  # what the receiver said can wait until the value is on its way
+        self.advance()  # read what the receiver sent only after the value is on its way
         return sent
 
     def withdraw(self) -> None:
-        """Stand by the last values no more."""
+        """Withdraw the last values."""
         line = self.advance()
         if line is not None:
             self._write(line, Withdraw())
@@ -264,7 +268,7 @@ class StreamSender:
         self._drop(0.0)
 
     def advance(self) -> StreamConnection | None:
-        """Look after the connection: connect, shake hands, notice its end. Gives it when the stream
+        """Maintain the connection: connect, shake hands, notice its end. Return it when the stream
         is open."""
         now = self._clock()
         if self._line is None and now >= self._again:
@@ -372,7 +376,7 @@ class StreamReceiver:
         self._key = key
         self._clock = clock
         self._guests: dict[int, _Guest] = {}
-        """By the number of their sockets."""
+        """Connections by the file number of their socket."""
         self._ready = select.epoll()
         self._listener = socket.create_server(
             (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -382,17 +386,17 @@ class StreamReceiver:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where it listens."""
+        """Return the address at which it listens."""
         host, port = self._listener.getsockname()[:2]
         return str(host), int(port)
 
     def sockets(self) -> list[socket.socket]:
-        """What to wait on, for a loop that would rather wait than poll each cycle."""
+        """Return the sockets to wait on, for a loop that waits instead of polling each cycle."""
         return [self._listener, *(guest.line.sock for guest in self._guests.values())]
 
     def poll(self) -> None:
-        """Take in all that has arrived; never blocks."""
-        # Asked for first: a read of each socket in vain is an exception each, and this is called in
+        """Read all that has arrived; never blocks."""
+        # epoll first: a read of a socket without data raises an exception, and this function runs in
         # every servo cycle.
         ready = {number for number, _ in self._ready.poll(0.0)}
         now = self._clock()
@@ -405,7 +409,7 @@ class StreamReceiver:
             self._admit(now)
 
     def close(self) -> None:
-        """Listen no more and end all streams."""
+        """Stop listening and end all streams."""
         for guest in list(self._guests.values()):
             self._end(guest)
         self._ready.close()
@@ -425,7 +429,7 @@ class StreamReceiver:
                     )
 
     def _wait(self, now: float, guest: _Guest) -> None:
-        """Nothing came: what is there grows older."""
+        """Nothing arrived on this connection: its last set point grows older."""
         if guest.inlet is not None:
             guest.inlet.receive(now, ())
         elif now > guest.since + _HANDSHAKE:
@@ -456,7 +460,7 @@ class StreamReceiver:
             self._end(guest)
 
     def _open(self, guest: _Guest, messages: list[Message]) -> list[Message]:
-        """Lead a connection through HELLO and STREAM_OPEN; gives what came after."""
+        """Handle HELLO and STREAM_OPEN of a connection; return the messages after them."""
         for position, message in enumerate(messages):
             if isinstance(message, Hello):
                 welcome = Welcome(NEWEST_VERSION, self._name, self._boot, tuple(self._streams))
@@ -478,7 +482,7 @@ class StreamReceiver:
         if incoming is None:
             return Refuse(
                 "unknown_stream",
-                f"{self._name} takes no stream {opening.stream}: see [streams] in services.toml",
+                f"{self._name} receives no stream {opening.stream}: see [streams] in services.toml",
             )
         if not math.isclose(opening.period, incoming.period):
             text = (
@@ -489,12 +493,12 @@ class StreamReceiver:
         if incoming.ticket and not same(opening.ticket.encode(), incoming.ticket.encode()):
             return Refuse(
                 "ticket",
-                f"the ticket for {opening.stream} is not the one that {self._name} gave out",
+                f"the ticket for {opening.stream} is not the one that {self._name} issued",
             )
         return None
 
     def _replace(self, guest: _Guest, stream: str) -> None:
-        """A stream has one sender: the newest."""
+        """Make this connection the sender of a stream; an older one is closed."""
         for older in [one for one in self._guests.values() if one.stream == stream]:
             self._end(older)
         incoming = self._streams[stream]
@@ -514,6 +518,6 @@ class StreamReceiver:
         number = guest.line.sock.fileno()
         if self._guests.get(number) is guest:
             del self._guests[number]
-            guest.line.sock.close()  # and with it epoll lets it go
+            guest.line.sock.close()  # this also removes it from the epoll
             if guest.inlet is not None:
                 self._streams[guest.stream].sink.withdraw()
