@@ -295,7 +295,7 @@ class Callee:
         elif outcome is not None:
             self._messages.append((peer, outcome))
         else:
-            text = "it ran, but its result is no longer kept"
+            text = "this call was handled before, but its result is no longer kept"
             self._messages.append(
                 (peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN))
             )
