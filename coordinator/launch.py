@@ -37,7 +37,7 @@ from petrobot.coordinator.run.supervisor import Program, is_local
 from petrobot.coordinator.task import Task
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import Directory, NodeEntry, module_name
-from petrobot.services.comm.lockstep.cell import Cell, Delays
+from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
 from petrobot.services.comm.lockstep.mesh import Member
 from petrobot.services.comm.lockstep.party import Party
 from petrobot.services.comm.lockstep.process import cell_key
@@ -152,13 +152,13 @@ def lockstep_cell(
     substitutes: Substitutes | None = None,
     watch: Callable[[Mission, float], None] | None = None,
     store: Store | None = None,
-) -> tuple[Cell, CoordinatorParty]:
+) -> tuple[LockStepCell, CoordinatorParty]:
     """The whole cell in this process."""
     mission = lockstep_mission(directory, setting, store)
     watching = None if watch is None else lambda now: watch(mission, now)
     coordinator = CoordinatorParty(directory, mission, watching)
     parties = [lockstep_party(directory, node, substitutes) for node in directory.nodes.values()]
-    return Cell([coordinator, *parties], Delays(directory.delays())), coordinator
+    return LockStepCell([coordinator, *parties], Delays(directory.delays())), coordinator
 
 
 def lockstep_member(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
 
-from petrobot.services.comm.calls.callee import Callee, Commanded, Offer, Order
+from petrobot.services.comm.calls.callee import Callee, CommandOrder, Offer, Order
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.lockstep.channels import (
     can_body,
@@ -30,7 +30,7 @@ PREPARE, SCORE, FAULT = SERVICES = ("laboratory_prepare", "laboratory_score", "l
 def answer_command(now: float, callee: Callee, order: Order) -> None:
     """Answer an operator's command: a laboratory is running, and has no device that could be held
     or stopped."""
-    if isinstance(order, Commanded):
+    if isinstance(order, CommandOrder):
         callee.answer(now, order.command.id, True, {"answers": {}, "devices": {}, "emergency": []})
 
 

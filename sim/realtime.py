@@ -25,11 +25,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Final
 
-from petrobot.services.comm.calls.callee import Callee, Offer, Order, StartRun
-from petrobot.services.comm.calls.listening import listening, refuse_unusable
+from petrobot.services.comm.calls.callee import Callee, Offer, Order, StartOrder
 from petrobot.services.comm.calls.server import Server
-from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.location_file import Directory, resolve
+from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.comm.streams.camera import ImageServer
@@ -50,7 +50,7 @@ class Pacemaker:
     a thread of its own."""
 
     def __init__(
-        self, laboratory: LaboratoryParty, hub: Hub | None, images: ImageServer | None
+        self, laboratory: LaboratoryParty, hub: CanHub | None, images: ImageServer | None
     ) -> None:
         """`hub`: the bus, `images`: the camera's end of the wire; None where the cell has none."""
         self.lock = threading.Lock()
@@ -153,7 +153,7 @@ class LaboratoryShell:
         self.laboratory = _made(directory, name)
         channel, address = bus_channel(directory), camera_address(directory)
         with _had(f"{directory.source}: the simulated bus's channel {channel}"):
-            self._hub = Hub(channel) if channel else None
+            self._hub = CanHub(channel) if channel else None
         with _had(
             f"{directory.source}: the simulated camera's address "
             f"{':'.join(map(str, address or ()))}"
@@ -224,7 +224,7 @@ class LaboratoryShell:
         awaited."""
         for order in orders:
             answer_command(now, self.server.callee, order)
-            if isinstance(order, StartRun):
+            if isinstance(order, StartOrder):
                 task = asyncio.get_running_loop().create_task(self._prepare(order.call))
                 self._preparing.add(task)
                 task.add_done_callback(self._preparing.discard)

@@ -126,7 +126,7 @@ def refuse_misplaced(
     `everywhere`: all nodes are launched here, wherever they belong; `scripted`: actions are
     replaced (`--mock`).
     """
-    from petrobot.services.comm.location_file.promises import misplaced
+    from petrobot.services.comm.location_file.host_checks import misplaced
 
     faults = misplaced(directory, everywhere=everywhere, actions=not scripted)
     if faults:

@@ -70,7 +70,7 @@ def _stopped(directory: Directory, answers: Mapping[str, Any]) -> dict[str, list
     """By node the devices that an emergency stop holds: as it says itself, or as this host says of
     one that does not run."""
     from petrobot.coordinator.operator.emergency_stop import still_stopped
-    from petrobot.services.comm.calls.latch import ALL, latch_of
+    from petrobot.services.host.emergency_latch import ALL, latch_of
 
     told = {
         node: list(answer["status"].get("emergency", ()))

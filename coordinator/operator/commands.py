@@ -37,7 +37,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.coordinator.run.realtime import credentials_of
-from petrobot.services.comm.calls.notices import Progress
+from petrobot.services.comm.calls.caller import CallProgress
 
 ANSWERS = 1.5
 """Seconds that nodes have to answer a pause."""
@@ -121,7 +121,7 @@ class Operation:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to keep."""
 
-    def progress(self, now: float, run: str, notice: Progress) -> None:
+    def progress(self, now: float, run: str, notice: CallProgress) -> None:
         """Nothing to keep."""
 
     def settled(self, now: float, state: State) -> None:

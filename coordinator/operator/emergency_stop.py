@@ -18,14 +18,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from petrobot.coordinator.run.supervisor import is_local
-from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.caller import Caller, CommandAnswered, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.latch import ALL, LatchError, latch_of
-from petrobot.services.comm.calls.notices import Answered, Notice, PeerLost
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Command, Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.comm.tls.credentials import Credentials
+from petrobot.services.host.emergency_latch import ALL, LatchError, latch_of
 
 STOP = "emergency_stop"
 CLEAR = "clear_emergency"
@@ -159,7 +158,7 @@ class EmergencyLine:
 
     def _hear(self, _: float, notices: list[Notice]) -> None:
         for notice in notices:
-            if isinstance(notice, Answered):
+            if isinstance(notice, CommandAnswered):
                 told = self._answers.get(notice.answer.id)
                 if told is not None and not told.done():
                     told.set_result(notice.answer.data)

@@ -18,7 +18,7 @@ from petrobot.coordinator.operator.feed import Feed
 from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.task import Task
-from petrobot.services.comm.calls.notices import Progress
+from petrobot.services.comm.calls.caller import CallProgress
 from petrobot.services.comm.protocol.messages import Command
 
 POLL = 0.2
@@ -224,7 +224,7 @@ class Watching:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to show that the narrator does not tell."""
 
-    def progress(self, now: float, run: str, notice: Progress) -> None:
+    def progress(self, now: float, run: str, notice: CallProgress) -> None:
         """Nothing to show that the narrator does not tell."""
 
     def settled(self, now: float, state: State) -> None:

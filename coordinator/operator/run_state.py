@@ -40,7 +40,7 @@ from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.task import End, Executed, Scope, Task
 from petrobot.coordinator.task.net import Marking
 from petrobot.coordinator.task.wording import Severity
-from petrobot.services.comm.calls.notices import Progress
+from petrobot.services.comm.calls.caller import CallProgress
 
 _AFTER_HOLD = {Hold.HELD: "held", Hold.CANNOT: "running", Hold.STOPPED: "stopping"}
 _GOING = ACTIVE | {Phase.STOPPING, Phase.STUCK}
@@ -151,7 +151,7 @@ class Narrator:
         if tell is not None:
             tell(now - self.origin, instruction)
 
-    def progress(self, now: float, run: str, notice: Progress) -> None:
+    def progress(self, now: float, run: str, notice: CallProgress) -> None:
         """A run says how far it is."""
         self.feed.emit(
             "run_progress", time=now - self.origin, id=run, progress=round(notice.fraction, 4)

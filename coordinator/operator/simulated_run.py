@@ -22,7 +22,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.services.comm.location_file import Directory
-from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.comm.lockstep.cell import LockStepCell
 
 SLICE = 0.008
 """Seconds of wall time that ticks may take before others have their turn."""
@@ -36,7 +36,7 @@ class SimulatedShell:
     """Ticks of a cell at a pace; what `coordinator.operator.operation.Operation` drives in place of
     a mission in real time."""
 
-    def __init__(self, cell: Cell, party: CoordinatorParty, pace: float) -> None:
+    def __init__(self, cell: LockStepCell, party: CoordinatorParty, pace: float) -> None:
         self.mission = party.mission
         self._cell = cell
         self._party = party

@@ -45,18 +45,18 @@ from petrobot.coordinator.run.interfaces import (
 )
 from petrobot.coordinator.run.recording import Step
 from petrobot.coordinator.task import Scope, Status, Task
-from petrobot.services.comm.calls.caller import Caller
-from petrobot.services.comm.calls.notices import (
-    Accepted,
-    Answered,
-    Ended,
+from petrobot.services.comm.calls.caller import (
+    CallAccepted,
+    CallEnded,
+    Caller,
+    CallProgress,
+    CommandAnswered,
     EventArrived,
-    Late,
+    LateResult,
     Notice,
     PeerBack,
-    Progress,
 )
-from petrobot.services.comm.calls.verdicts import VERDICT_EVENTS, VerdictSaid, verdict_event
+from petrobot.services.comm.calls.events import VERDICT_EVENTS, RunVerdict, verdict_event
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Answer, Event, Outcome
 
@@ -135,17 +135,17 @@ class Executor:
     def take(self, now: float, node: str, notices: Iterable[Notice]) -> None:
         """Take what a node's caller noticed."""
         for notice in notices:
-            if isinstance(notice, Ended):
+            if isinstance(notice, CallEnded):
                 self._ended(now, node, notice.outcome)
-            elif isinstance(notice, Accepted):
+            elif isinstance(notice, CallAccepted):
                 self._queue.extend(self.dispatch.accepted(now, notice.id))
             elif isinstance(notice, EventArrived):
                 self._event(now, node, notice.event)
-            elif isinstance(notice, Progress):
+            elif isinstance(notice, CallProgress):
                 self._progress(now, notice)
-            elif isinstance(notice, Answered):
+            elif isinstance(notice, CommandAnswered):
                 self._answered(now, notice.answer)
-            elif isinstance(notice, Late):
+            elif isinstance(notice, LateResult):
                 self._queue.extend(self.dispatch.late(now, notice.outcome))
             elif isinstance(notice, PeerBack):
                 self.dispatch.back(now, node, notice.boot, notice.runs)
@@ -264,7 +264,7 @@ class Executor:
             self._queue.append(VariableChanged(name, event.data.get("value"), event.source))
         elif event.name.startswith(VERDICT_EVENTS):
             with suppress(ValueError):  # a foreign node's mistake; nobody here could mend it
-                self._queue.append(self.verdict(VerdictSaid.of_data(event.data)))
+                self._queue.append(self.verdict(RunVerdict.of_data(event.data)))
         elif event.run:
             run = self.dispatch.run_of(event.run)
             if run is not None:
@@ -274,14 +274,14 @@ class Executor:
         ):
             self._queue.append(EventOccurred(event.name, event.source, event.number))
 
-    def verdict(self, said: VerdictSaid) -> Verdict:
+    def verdict(self, said: RunVerdict) -> Verdict:
         """What somebody says of a run, as the engine takes it. One on another mission run's run
         names none of this one."""
         return Verdict(
             said.run.removeprefix(f"{self.mission}/"), Status(said.status), said.cause, said.text
         )
 
-    def _progress(self, now: float, notice: Progress) -> None:
+    def _progress(self, now: float, notice: CallProgress) -> None:
         run = self.dispatch.run_of(notice.id)
         if run is not None:
             for observer in self.observers:

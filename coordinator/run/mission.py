@@ -23,9 +23,15 @@ from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.recording import PREPARED, SCORED, Step
 from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.net import Marking
-from petrobot.services.comm.calls.caller import Caller
-from petrobot.services.comm.calls.notices import Ended, Notice, PeerBack, PeerLost, Progress
-from petrobot.services.comm.calls.verdicts import VerdictSaid
+from petrobot.services.comm.calls.caller import (
+    CallEnded,
+    Caller,
+    CallProgress,
+    Notice,
+    PeerBack,
+    PeerLost,
+)
+from petrobot.services.comm.calls.events import RunVerdict
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.protocol.messages import Call, Outcome
 
@@ -129,7 +135,7 @@ class Tally:
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
         """Nothing to count."""
 
-    def progress(self, now: float, run: str, notice: Progress) -> None:
+    def progress(self, now: float, run: str, notice: CallProgress) -> None:
         """Nothing to count."""
 
     def settled(self, now: float, state: State) -> None:
@@ -257,7 +263,7 @@ class Mission:
                 (node, notice) for notice in notices if not isinstance(notice, PeerBack | PeerLost)
             )
             notices = [notice for notice in notices if isinstance(notice, PeerBack | PeerLost)]
-        own = [n for n in notices if isinstance(n, Ended) and self._is_own(n.outcome)]
+        own = [n for n in notices if isinstance(n, CallEnded) and self._is_own(n.outcome)]
         for notice in own:
             self._answered(now, notice.outcome)
             self.callers[node].acknowledge(now, notice.outcome.id)
@@ -384,11 +390,11 @@ class Mission:
                 self.executor.store.node(node, notice.boot)
 
 
-def _verdicts(said: Any) -> list[VerdictSaid]:
+def _verdicts(said: Any) -> list[RunVerdict]:
     """What a score says of runs. Raises MissionError when it is not {run: {status, cause,
     text}}."""
     try:
-        return [VerdictSaid.of_data({**verdict, "run": run}) for run, verdict in said.items()]
+        return [RunVerdict.of_data({**verdict, "run": run}) for run, verdict in said.items()]
     except (AttributeError, TypeError, ValueError) as fault:
         text = (
             f"score: {VERDICTS}: {fault}; give {{run: {{status, cause, text}}}} with the runs' ids"

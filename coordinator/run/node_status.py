@@ -9,9 +9,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from petrobot.coordinator.run.realtime import credentials_of
-from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.caller import Caller, CommandAnswered, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.notices import Answered, Notice, PeerLost
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Command, Hello
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
@@ -42,7 +41,7 @@ async def _ask(directory: Directory, node: str, timeout: float) -> dict[str, Any
 
     def hear(_: float, notices: list[Notice]) -> None:
         for notice in notices:
-            if isinstance(notice, Answered) and not told.done():
+            if isinstance(notice, CommandAnswered) and not told.done():
                 told.set_result(dict(notice.answer.data))
             elif isinstance(notice, PeerLost):
                 refused.append(notice.reason)

@@ -11,8 +11,8 @@ from typing import Final
 
 from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, MissionError, Stage
+from petrobot.services.comm.calls.caller import Notice, PeerBack, PeerLost
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.notices import Notice, PeerBack, PeerLost
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.tls.credentials import COORDINATOR, Credentials, credentials
 
@@ -61,7 +61,7 @@ LINGER = 1.0
 LEAVE: Final = 2.5
 """Seconds after the loss of a node in which it may come back to be told good-bye: a little
 longer than it keeps the leases of one who has gone without a word
-(`services.comm.results.Keeping.lease`)."""
+(`services.comm.calls.runs.Retention.lease`)."""
 
 KEY_CODES: Final = ("key_needed", "no_key_here", "no_key_there", "wrong_key")
 """Refusals (docs/protocol.md) of one whose key is not that of the node."""

@@ -1,1 +1,2 @@
-"""What any process needs of its own computer: files, parents, command line, compiled loops."""
+"""What a process needs of its own computer: files, parent processes, command line, compiled
+loops."""

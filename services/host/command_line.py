@@ -1,7 +1,7 @@
-"""Numbers on the command line: argparse types that say in words which numbers there may be.
+"""argparse types for numbers that state their range in the error message.
 
-argparse words a ValueError by the name of the function that raised it; what these raise is printed
-as it is: `argument --runs: abc is not a whole number of at least 1`.
+argparse words a ValueError with the name of the function that raised it. The ArgumentTypeError
+raised here is printed as it is: `argument --runs: abc is not a whole number of at least 1`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from math import isfinite
 
 
 def whole(least: int = 1) -> Callable[[str], int]:
-    """The type of an option that takes a whole number of at least `least`."""
+    """Return the type of an option that takes a whole number of at least `least`."""
 
     def read(text: str) -> int:
         try:
@@ -29,8 +29,8 @@ def whole(least: int = 1) -> Callable[[str], int]:
 def number(
     *, above: float | None = None, least: float | None = None, most: float | None = None
 ) -> Callable[[str], float]:
-    """The type of an option that takes a finite number: more than `above`, at least `least`, at
-    most `most`."""
+    """Return the type of an option that takes a finite number: more than `above`, at least `least`,
+    at most `most`."""
     bounds = (("more than", above), ("at least", least), ("at most", most))
     asked = " and ".join(f"{words} {bound:g}" for words, bound in bounds if bound is not None)
 
@@ -42,7 +42,7 @@ def number(
         low = (above is None or value > above) and (least is None or value >= least)
         if not (isfinite(value) and low and (most is None or value <= most)):
             raise ArgumentTypeError(
-                f"{text} is not a number of {asked}" if asked else f"{text} is no finite number"
+                f"{text} is not a number of {asked}" if asked else f"{text} is not a finite number"
             )
         return value
 
@@ -50,6 +50,5 @@ def number(
 
 
 def probability(text: str) -> float:
-    """The type of an option that takes a probability which something is to reach: more than 0, at
-    most 1."""
+    """Read a probability that is to be reached: more than 0, at most 1."""
     return number(above=0.0, most=1.0)(text)

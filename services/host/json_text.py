@@ -1,8 +1,8 @@
-"""JSON for whoever reads it: browsers, scripts, other programs. Every text that leaves petrobot as
-JSON is written here.
+"""Write JSON for browsers, scripts and other programs. All JSON that leaves petrobot is written
+here.
 
-RFC 8259 has no infinity and no NaN. Python writes them anyway, and then no browser can read
-anything of that text. So a number that is not finite leaves as null: "no value".
+RFC 8259 has neither infinity nor NaN. Python writes them anyway, and then a browser can read
+nothing of the whole text. So a number that is not finite is written as null: "no value".
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from numbers import Real
 from typing import Any
 
 DEEPEST = 64
-"""Levels of nesting that are written; what lies deeper becomes an ellipsis, so that a value that
-holds itself has an end."""
+"""Deepest nesting that is written; deeper values become an ellipsis, so that a value that contains
+itself has an end."""
 WIDEST_BITS = 1023
-"""Whole numbers of more bits are infinite for a reader that keeps numbers as doubles, as browsers
+"""A whole number of more bits is infinite for a reader that stores numbers as doubles, as browsers
 do."""
 
 
 def json_text(value: Any, **layout: Any) -> str:
-    """A value as JSON text, with the options of `json.dumps` for its layout. Never raises because
-    of a value.
+    """Return a value as JSON text, with the options of `json.dumps` for its layout. Never raises
+    because of a value.
 
-    Numbers that are not finite become null; what JSON does not know (a set, an object) becomes
+    Numbers that are not finite become null; types that JSON does not know (a set, an object) become
     text.
     """
     try:
         return json.dumps(value, allow_nan=False, default=_foreign, **layout)
-    except (ValueError, TypeError, RecursionError):  # rare, so only then is the whole value copied
+    except (ValueError, TypeError, RecursionError):  # rare: only then the whole value is copied
         return json.dumps(finite(value), allow_nan=False, **layout)
 
 
 def finite(value: Any, depth: int = DEEPEST) -> Any:
-    """A copy of the value that holds nothing but what JSON knows, with null for every number that
-    is not finite."""
+    """Return a copy of the value with only what JSON knows, and null for every number that is not
+    finite."""
     if value is None or isinstance(value, str | bool):
         return value
     if isinstance(value, int):
@@ -59,11 +59,12 @@ def _key(key: Any) -> str:
 
 
 def _foreign(value: Any) -> Any:
-    """What the encoder does not know: numbers of other libraries as numbers, all else as text."""
+    """Convert what the encoder does not know: numbers of other libraries to numbers, all else to
+    text."""
     if isinstance(value, Real):
         number = float(value)
         return number if isfinite(number) else None
     try:
         return str(value)
-    except Exception:  # an object whose own text fails must not end the feed
+    except Exception:  # an object whose `__str__` fails must not end the data feed
         return f"<{type(value).__name__}>"

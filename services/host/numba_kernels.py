@@ -1,11 +1,11 @@
-"""The numba extra for small kernels of numbers: compiled where numba is installed, run as they
-stand where it is not.
+"""Optional compilation of small numeric functions (kernels) with numba; without numba they run as
+plain Python.
 
-A kernel takes and gives floats and tuples of floats, and gives the same bits either way: no fast
-mathematics, so sums keep their order, and functions whose last place differs from library to
-library (hypot, powers) do not occur in kernels. Compiled code is kept on disk beside the source or
-in the user's cache; where neither can be written kernels are not compiled, since that would have to
-be done anew in every process. `PETROBOT_COMPILED=0` in the environment leaves numba out.
+A kernel takes and returns floats and tuples of floats, and gives the same bits either way:
+fast-math is off, so sums keep their order, and functions whose last digit differs between libraries
+(hypot, powers) are not used in kernels. Compiled code is cached on disk beside the source or in the
+user's cache. If neither can be written, kernels are not compiled, because every process would have
+to compile them again. `PETROBOT_COMPILED=0` in the environment turns numba off.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 SWITCH = "PETROBOT_COMPILED"
-"""Environment variable: 0 leaves numba out."""
+"""Environment variable: 0 turns numba off."""
 
 try:
     if os.environ.get(SWITCH) == "0":
@@ -33,20 +33,24 @@ except ImportError:
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """The function compiled, when it is first called with arguments of these types; or itself."""
+    """Return the function compiled (at its first call, for its argument types), or the function
+    itself without numba."""
     if not COMPILED:
         return function
     try:
         compiled: Callable[P, R] = numba.njit(cache=True)(function)
-    except RuntimeError:  # there is nowhere to keep what is compiled
+    except RuntimeError:  # no cache folder can be written
         return function
     return compiled
 
 
 def packed(function: Callable[..., Any], numbers: Iterable[float]) -> Sequence[float]:
-    """Numbers that a kernel reads by place and that seldom change, as its callers best hand them
-    over: an array to a compiled one, which takes it as it is (many floats of a tuple are each taken
-    apart), else a tuple of floats."""
+    """Return numbers in the form that a kernel reads fastest: a numpy array if compiled, else a
+    tuple of floats.
+
+    For numbers that seldom change and are read by index. A compiled function unpacks every element
+    of a tuple at each call, but takes an array as it is.
+    """
     if hasattr(function, "py_func"):
         array: Any = np.array(list(numbers), dtype=np.float64)
         return array  # type: ignore[no-any-return]
@@ -54,6 +58,6 @@ def packed(function: Callable[..., Any], numbers: Iterable[float]) -> Sequence[f
 
 
 def plain(function: Callable[P, R]) -> Callable[P, R]:
-    """What a kernel is compiled from, to compare the two."""
+    """Return the Python function of a kernel, to compare the two."""
     source: Callable[P, R] = getattr(function, "py_func", function)
     return source

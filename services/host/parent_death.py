@@ -1,13 +1,13 @@
-"""A child ends with its parent: the kernel sees to it (prctl(2), PR_SET_PDEATHSIG), so that nothing
-here has to run for it.
+"""End a child process when its parent ends: the kernel does it (prctl(2), PR_SET_PDEATHSIG), so no
+code of the child has to run.
 
-What has no device is killed at once. What owns a device gets the time of its stop routine, which
-begins when the pipe to the parent ends; but a driver or an action that hangs never looks at a pipe,
-and one that hangs in C holds the interpreter, so that no handler and no thread of Python runs
-either. For such a process the kernel's signal is handled by the C library's own `alarm(2)`: a
-handler is called with the number of its signal, `alarm` with seconds. SIGQUIT is 3, so 3 s after
-the parent's end SIGALRM ends the process, whatever it is doing. SIGUSR1 is 10, the time of a node
-that ends its own children first.
+A child without a device is killed at once. A child that owns a device gets the time for its stop
+routine, which begins when the pipe to the parent closes. But a driver or action that hangs never
+looks at a pipe, and one that hangs in C code holds the interpreter lock, so neither a signal
+handler nor a thread of Python runs. For such a child the C library's own `alarm(2)` is installed as
+the signal handler: a handler is called with the signal's number, and `alarm` takes seconds. SIGQUIT
+is 3, so 3 s after the parent's end SIGALRM kills the child, whatever it is doing. SIGUSR1 is 10:
+the time of a node, which first ends its own children.
 """
 
 from __future__ import annotations
@@ -20,27 +20,28 @@ from pathlib import Path
 
 PR_SET_PDEATHSIG, PR_GET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 2, 36
 STOP_ROUTINE = signal.SIGQUIT
-"""Its number is how many seconds a process with a device may go on without its node: the stop limit
-of 2 s, and a margin."""
+"""The signal's number is how many seconds a process with a device may live on without its node: the
+limit of 2 s for a stop routine, and a margin."""
 GOOD_ORDER = signal.SIGUSR1
-"""Its number is how many seconds a node may take to end in good order once its launcher is gone."""
+"""The signal's number is how many seconds a node may take to close in an orderly way after its
+launcher is gone."""
 
 LOOK_AGAIN = 0.02
-"""Seconds between looks at a process, where the kernel does not tell of its end."""
+"""Seconds between checks of a process, where the kernel does not report its end."""
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def die_with(parent: int) -> None:
-    """Be killed at the very moment the parent ends, also while stopped, or in the middle of an
-    action that hangs."""
+    """Have this process killed when the parent ends, even while it is stopped or hangs in an
+    action."""
     _ask(signal.SIGKILL)
     _still_there(parent)
 
 
 def outlive(parent: int, by: signal.Signals) -> None:
-    """Be ended so many seconds after the parent as `by` (STOP_ROUTINE or GOOD_ORDER) has for its
-    number, and not later."""
+    """Have this process killed so many seconds after the parent as the number of `by` (STOP_ROUTINE
+    or GOOD_ORDER)."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     _LIBC.signal.restype = ctypes.c_void_p
     _LIBC.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
@@ -62,13 +63,12 @@ def adopt_orphans() -> None:
 
 
 async def until_ended(process: int) -> None:
-    """Wait until a child of this process has ended. It need not have been waited for (it is left
-    for that).
+    """Wait until a child process has ended. It need not be reaped yet; it is left for `wait`.
 
-    The end of a pipe to a process is no sign of its end: a process that it has left running may
-    hold the other end.
+    The closed end of a pipe would not show it: a process that the child left running may hold the
+    pipe open.
     """
-    # here, not above: a worker's keeper needs nothing of it, and there is one beside each worker
+    # Imported here: the keeper process beside each worker does not need asyncio.
     import asyncio
 
     loop = asyncio.get_running_loop()
@@ -90,7 +90,7 @@ async def until_ended(process: int) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Whether a process exists and is not a zombie."""
+    """Return whether a process exists and is not a zombie."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
@@ -98,8 +98,8 @@ def _runs(process: int) -> bool:
 
 
 def wanted_with_parent() -> bool:
-    """Whether whoever launched this process wants it to end with itself (PR_SET_PDEATHSIG outlives
-    exec)."""
+    """Return whether the launcher of this process wants it to end together with itself
+    (PR_SET_PDEATHSIG survives exec)."""
     number = ctypes.c_int()
     _LIBC.prctl(PR_GET_PDEATHSIG, ctypes.byref(number))
     return number.value != 0
@@ -111,6 +111,6 @@ def _ask(number: signal.Signals) -> None:
 
 
 def _still_there(parent: int) -> None:
-    """The parent may have ended before the kernel was asked: then no signal comes any more."""
+    """Exit if the parent ended before the kernel was asked: then no signal would come."""
     if os.getppid() != parent:
         sys.exit(0)

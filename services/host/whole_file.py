@@ -1,9 +1,8 @@
-"""Writes a file in one piece: a kill or a power cut leaves the old one or the new one, never a
-part.
+"""Write a file in one piece: after a kill or a power cut there is the old file or the new one,
+never a part.
 
-What is written is on the disk when the function returns: the content, then the file's name in its
-folder, and the names of folders that were made for it. Nothing may be acknowledged on the strength
-of a file before that.
+Everything is on the disk when a function returns: the content, then the file's name in its folder,
+then the names of new folders. Only then may other parts rely on the file.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from pathlib import Path
 def write_whole(
     path: Path, content: str | bytes, *, mode: int | None = None, fresh: bool = False
 ) -> None:
-    """Replace the file's content, synced before this returns.
+    """Replace the file's content, synced to disk before this returns.
 
-    `mode` is the file's mode (None: that of the file there is, else the usual one). With `fresh` a
-    file that exists is left as it is. What is no regular file (a terminal, a pipe) is simply
-    written to. Raises FileExistsError with `fresh`, else OSError; both name the path, and leave no
-    draft behind.
+    `mode` is the file's mode (None: that of the existing file, else the default). With `fresh` an
+    existing file is left as it is. What is not a regular file (a terminal, a pipe) is written to
+    directly. Raises FileExistsError with `fresh`, else OSError; both name the path. No draft is
+    left behind.
     """
-    path = path.resolve()  # a link is followed, not replaced
+    path = path.resolve()  # follow a symbolic link, do not replace it
     data = content.encode("utf-8") if isinstance(content, str) else content
     draft = path.with_name(f".{path.name[-200:]}.{os.getpid()}")
     try:
@@ -43,12 +42,12 @@ def write_whole(
     except OSError as fault:
         with contextlib.suppress(OSError):
             draft.unlink(missing_ok=True)
-        # Written to, a file is not named by the fault; and nobody knows the draft.
+        # An error while writing names no file, and the name of the draft means nothing to the user.
         raise OSError(fault.errno, fault.strerror or str(fault), str(path)) from fault
 
 
 def _write_draft(draft: Path, data: bytes, mode: int | None) -> None:
-    draft.unlink(missing_ok=True)  # of a process of this number that was killed
+    draft.unlink(missing_ok=True)  # left by a killed process with the same process id
     handle = os.open(
         draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666 if mode is None else 0o600
     )
@@ -61,8 +60,8 @@ def _write_draft(draft: Path, data: bytes, mode: int | None) -> None:
 
 
 def _linked(draft: Path, path: Path) -> bool:
-    """Give the draft its name by a link, which unlike a rename fails if the name is taken; False
-    where no links can be made."""
+    """Link the draft to its name; unlike a rename this fails if the name exists. Return False where
+    links are not possible."""
     try:
         os.link(draft, path)
     except FileExistsError:
@@ -75,8 +74,7 @@ def _linked(draft: Path, path: Path) -> bool:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those that it stands in, their names synced before this returns. Raises
-    OSError."""
+    """Make a folder and its parents, their names synced before this returns. Raises OSError."""
     if folder.is_dir():
         return
     make_folder(folder.absolute().parent)
@@ -88,7 +86,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk. Raises OSError."""
+    """Sync the names in a folder to disk. Raises OSError."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(handle)

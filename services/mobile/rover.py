@@ -24,7 +24,7 @@ from petrobot.services.mobile.odometry import Odometry, Pose, turned
 from petrobot.services.mobile.reflectors import ReflectorMap, parse_echoes
 from petrobot.services.mobile.sight import TrackAhead, TrackEnd
 from petrobot.services.mobile.track_map import Fit, TrackMap
-from petrobot.services.mobile.wheel_drives import Phase, WheelMaster
+from petrobot.services.mobile.wheel_drives import MasterPhase, WheelMaster
 
 LEASE: Final = 0.4
 """Seconds after which a motion ends unless its command is repeated."""
@@ -394,4 +394,4 @@ def _positive(body: Mapping[str, Any], key: str, default: float | None = None) -
     return float(value)
 
 
-__all__ = ["LEASE", "Phase", "Pose", "Rover", "TrackEnd"]
+__all__ = ["LEASE", "MasterPhase", "Pose", "Rover", "TrackEnd"]

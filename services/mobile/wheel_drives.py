@@ -12,13 +12,13 @@ from typing import Final
 
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import Mapped, SdoClient, Transfer, Type
+from petrobot.services.comm.canopen.cia301 import DataType, Mapped, SdoClient, Transfer
 from petrobot.services.comm.canopen.cia402 import (
     SENT,
     VELOCITY_RECEIVED,
-    Mode,
-    Object,
-    State,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     from_units,
     state_of,
@@ -27,9 +27,9 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.services.comm.canopen.master import (
     CanopenMaster,
     Companion,
-    Manner,
-    Phase,
+    MasterPhase,
     Power,
+    Supervision,
     Trouble,
     companion_transfers,
     pdo_transfers,
@@ -49,11 +49,12 @@ STOP_CYCLES: Final = 40
 holds."""
 SENSOR_TIMER_MS: Final = 40
 SENSOR_OBJECTS: Final = tuple(
-    Mapped(0x2010, sub, Type.INTEGER16 if sub % 2 else Type.UNSIGNED16) for sub in range(1, 5)
+    Mapped(0x2010, sub, DataType.INTEGER16 if sub % 2 else DataType.UNSIGNED16)
+    for sub in range(1, 5)
 )
 """Bearing and range of two echoes."""
 
-_MODE: Final = Mode.CYCLIC_SYNCHRONOUS_VELOCITY
+_MODE: Final = OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY
 _TPDO: Final = canopen.pdo_struct(SENT)
 _RPDO: Final = canopen.pdo_struct(VELOCITY_RECEIVED)
 _HALF, _WHOLE = 1 << 31, 1 << 32
@@ -66,7 +67,7 @@ class WheelLink:
         """`quick_stop` in rad/s^2."""
         self.node = node
         self.sdo = SdoClient(node)
-        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.limited = False
         """Whether the drive cuts its set points because the battery cannot supply more."""
         self.spoken = False
@@ -83,7 +84,10 @@ class WheelLink:
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
             Transfer(
-                Object.QUICK_STOP_DECELERATION, 0, Type.UNSIGNED32, to_units(self._quick_stop)
+                ObjectIndex.QUICK_STOP_DECELERATION,
+                0,
+                DataType.UNSIGNED32,
+                to_units(self._quick_stop),
             ),
             *pdo_transfers(self.node, VELOCITY_RECEIVED),
         ]
@@ -140,7 +144,7 @@ class WheelMaster(CanopenMaster[WheelLink]):
             wheels,
             (companion,),
             cycle,
-            Manner(SILENT_CYCLES, HEARTBEAT_PATIENCE, old_emergencies=True),
+            Supervision(SILENT_CYCLES, HEARTBEAT_PATIENCE, old_emergencies=True),
         )
 
     @property
@@ -157,4 +161,4 @@ class WheelMaster(CanopenMaster[WheelLink]):
             self.echoes.append(data)
 
 
-__all__ = ["Phase", "Trouble", "WheelLink", "WheelMaster"]
+__all__ = ["MasterPhase", "Trouble", "WheelLink", "WheelMaster"]

@@ -27,7 +27,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from petrobot.services.comm.canopen.master import Phase
+from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.device import Ports, Setpoint, refuse_unknown_keys
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.services.motion.following import Follower
@@ -308,7 +308,7 @@ class Arm:
         """Return whether the arm stands still, held by its drives or its brakes."""
         if self._mode == "off":
             return (
-                self._master.phase is not Phase.RUNNING
+                self._master.phase is not MasterPhase.RUNNING
                 or max(map(abs, self._measured_speed)) < _STANDING
             )
         return self._trajectory.still and self._standing()

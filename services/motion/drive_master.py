@@ -13,15 +13,15 @@ from typing import Final
 
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import Mapped, SdoClient, Transfer, Type
+from petrobot.services.comm.canopen.cia301 import DataType, Mapped, SdoClient, Transfer
 from petrobot.services.comm.canopen.cia402 import (
     ENABLING,
     RECEIVED,
     SENT,
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     from_units,
     state_of,
@@ -30,9 +30,9 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.services.comm.canopen.master import (
     CanopenMaster,
     Companion,
-    Manner,
-    Phase,
+    MasterPhase,
     Power,
+    Supervision,
     companion_transfers,
     pdo_transfers,
     unfit,
@@ -53,13 +53,13 @@ SPEED_POLL: Final = 1.0
 LIMITED_POLL: Final = 0.02
 """The same while a drive reports that it is too slow for its set points."""
 
-_MODE: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION
+_MODE: Final = OperationMode.CYCLIC_SYNCHRONOUS_POSITION
 _U8, _U16, _U32, _I8, _I32 = (
-    Type.UNSIGNED8,
-    Type.UNSIGNED16,
-    Type.UNSIGNED32,
-    Type.INTEGER8,
-    Type.INTEGER32,
+    DataType.UNSIGNED8,
+    DataType.UNSIGNED16,
+    DataType.UNSIGNED32,
+    DataType.INTEGER8,
+    DataType.INTEGER32,
 )
 _TPDO: Final = canopen.pdo_struct(SENT)
 _RPDO: Final = canopen.pdo_struct(RECEIVED)
@@ -84,7 +84,7 @@ class JointDriveLink:
         self.node = node
         self.settings = settings
         self.sdo = SdoClient(node)
-        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
         self.limited = False
         """Whether the drive cuts its set points because they are faster than it can move."""
@@ -108,14 +108,18 @@ class JointDriveLink:
         settings = self.settings
         return [
             *usual_transfers(cycle, _MODE, HEARTBEAT_PATIENCE),
-            Transfer(Object.MAX_SPEED, 0, _U32),
-            Transfer(Object.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
-            Transfer(Object.INTERPOLATION_PERIOD, 2, _I8, -3),
-            Transfer(Object.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
-            Transfer(Object.SOFTWARE_LIMITS, 2, _I32, to_units(settings.upper)),
-            Transfer(Object.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)),
-            Transfer(Object.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)),
-            Transfer(Object.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
+            Transfer(ObjectIndex.MAX_SPEED, 0, _U32),
+            Transfer(ObjectIndex.INTERPOLATION_PERIOD, 1, _U8, round(cycle * 1e3)),
+            Transfer(ObjectIndex.INTERPOLATION_PERIOD, 2, _I8, -3),
+            Transfer(ObjectIndex.SOFTWARE_LIMITS, 1, _I32, to_units(settings.lower)),
+            Transfer(ObjectIndex.SOFTWARE_LIMITS, 2, _I32, to_units(settings.upper)),
+            Transfer(
+                ObjectIndex.FOLLOWING_ERROR_WINDOW, 0, _U32, to_units(settings.following_error)
+            ),
+            Transfer(
+                ObjectIndex.FOLLOWING_ERROR_TIMEOUT, 0, _U16, round(settings.following_time * 1e3)
+            ),
+            Transfer(ObjectIndex.QUICK_STOP_DECELERATION, 0, _U32, to_units(settings.quick_stop)),
             *pdo_transfers(self.node, RECEIVED),
         ]
 
@@ -124,7 +128,7 @@ class JointDriveLink:
         greatest speed."""
         wrong = unfit(self.node, self.sdo.results, _MODE)
         if not wrong:
-            self.max_speed = from_units(self.sdo.results[Object.MAX_SPEED, 0])
+            self.max_speed = from_units(self.sdo.results[ObjectIndex.MAX_SPEED, 0])
         return wrong
 
     def ask_speed(self, now: float, hurry: bool) -> list[Frame]:
@@ -135,12 +139,12 @@ class JointDriveLink:
                 return self.sdo.advance(now)
             self._reading = False
             self.max_speed = from_units(
-                self.sdo.results.get((Object.MAX_SPEED, 0), to_units(self.max_speed))
+                self.sdo.results.get((ObjectIndex.MAX_SPEED, 0), to_units(self.max_speed))
             )
         if now - self._asked < (LIMITED_POLL if hurry else SPEED_POLL):
             return []
         self._asked, self._reading = now, True
-        self.sdo.begin([Transfer(Object.MAX_SPEED, 0, _U32)])
+        self.sdo.begin([Transfer(ObjectIndex.MAX_SPEED, 0, _U32)])
         return self.sdo.advance(now)
 
     def take(self, data: bytes) -> bool:
@@ -165,7 +169,7 @@ class JointDriveLink:
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
         """Return the RPDO: the controlword that leads to the state that the master wants, and the
         target position (rad)."""
-        if wanted and self.state is State.OPERATION_ENABLED:
+        if wanted and self.state is DriveState.OPERATION_ENABLED:
             self._power.stopping = 0
             self.controlword = _GO_ON
         else:
@@ -181,7 +185,7 @@ class JointDriveLink:
         return sent[2]
 
 
-_GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
+_GO_ON: Final = ENABLING[DriveState.OPERATION_ENABLED].word
 """Controlword for a drive that follows its set points."""
 
 
@@ -190,7 +194,7 @@ _GO_ON: Final = ENABLING[State.OPERATION_ENABLED].word
 SILENT_CYCLES: Final = 10
 """Cycles without a drive's TPDO after which the drive counts as lost."""
 INPUT_TIMER_MS: Final = 100
-INPUT_OBJECTS: Final = (Mapped(0x6000, 1, Type.UNSIGNED8),)
+INPUT_OBJECTS: Final = (Mapped(0x6000, 1, DataType.UNSIGNED8),)
 
 
 class DriveMaster(CanopenMaster[JointDriveLink]):
@@ -208,7 +212,11 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
         transfers = companion_transfers(inputs, INPUT_TIMER_MS, INPUT_OBJECTS)
         companion = Companion(inputs, transfers, self._take_inputs)
         super().__init__(
-            drives, (companion,), cycle, Manner(SILENT_CYCLES, HEARTBEAT_PATIENCE), enable=enable
+            drives,
+            (companion,),
+            cycle,
+            Supervision(SILENT_CYCLES, HEARTBEAT_PATIENCE),
+            enable=enable,
         )
 
     @property
@@ -222,7 +230,7 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
         return tuple([drive.max_speed for drive in self.drives])
 
     def give_up(
-        self, why: str, cause: str = "drive_fault", code: int = Fault.FOLLOWING_ERROR
+        self, why: str, cause: str = "drive_fault", code: int = DriveFault.FOLLOWING_ERROR
     ) -> None:
         """Stop the drives quickly in the next cycle: the joints do not follow, or in an
         emergency."""
@@ -231,7 +239,7 @@ class DriveMaster(CanopenMaster[JointDriveLink]):
     def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
         """Return the frames of one cycle: configuration, or set points (rad) and SYNC, and now and
         then a read of a drive's greatest speed."""
-        configuring = self.phase is Phase.CONFIGURING
+        configuring = self.phase is MasterPhase.CONFIGURING
         frames = super().advance(now, targets)
         if not configuring:
             hurry = self.limited

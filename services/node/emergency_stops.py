@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 
-from petrobot.services.comm.calls.latch import ALL, Latch, LatchError
+from petrobot.services.host.emergency_latch import ALL, Latch, LatchError
 from petrobot.services.worker.remote import EMERGENCY_STOP, NODE_SILENT
 
 LOOK = 0.25

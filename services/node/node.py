@@ -13,19 +13,17 @@ from typing import Any
 from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import (
     Callee,
-    CancelRun,
-    Commanded,
+    CancelOrder,
+    CommandOrder,
     Inline,
     Offer,
     Order,
-    StartRun,
+    StartOrder,
 )
-from petrobot.services.comm.calls.caller import Caller
-from petrobot.services.comm.calls.latch import Latch
-from petrobot.services.comm.calls.notices import Ended as CallEnded
-from petrobot.services.comm.calls.notices import Notice
+from petrobot.services.comm.calls.caller import CallEnded as CallEnded
+from petrobot.services.comm.calls.caller import Caller, Notice
+from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
 from petrobot.services.comm.calls.peers import COORDINATOR, NODE
-from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
 from petrobot.services.comm.location_file import (
     MEMORY,
     MEMORY_CALLS,
@@ -38,6 +36,7 @@ from petrobot.services.comm.location_file import (
 from petrobot.services.comm.protocol.messages import Call, Executed, Hello, Outcome
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 from petrobot.services.device import PICTURE
+from petrobot.services.host.emergency_latch import Latch
 from petrobot.services.node.emergency_stops import NEVER, EmergencyStops
 from petrobot.services.node.inline_host import InlinePlace, Place
 from petrobot.services.node.memory import Memory, event_name
@@ -355,12 +354,12 @@ class Node:
     def obey(self, now: float, orders: Iterable[Order]) -> None:
         """Carry out what the callee orders."""
         for order in orders:
-            if isinstance(order, StartRun):
+            if isinstance(order, StartOrder):
                 self._start(now, order.call)
-            elif isinstance(order, CancelRun):
+            elif isinstance(order, CancelOrder):
                 cause = order.reason if order.reason in _OWN_CAUSES else "cancelled"
                 self.places[self._at[order.id]].take(now, Stop(order.id, cause, order.reason))
-            elif isinstance(order, Commanded):
+            elif isinstance(order, CommandOrder):
                 self._command(now, order)
 
     def _start(self, now: float, call: Call) -> None:
@@ -380,7 +379,7 @@ class Node:
             now, Begin(call.id, call.service, call.arguments, deadline, call.seed)
         )
 
-    def _command(self, now: float, order: Commanded) -> None:
+    def _command(self, now: float, order: CommandOrder) -> None:
         command = order.command
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
         if command.verb not in VERBS:
@@ -491,7 +490,7 @@ class Node:
     def _judge(self, source: str, judged: Judged) -> None:
         """The verdict goes to the coordinator of the judged run: latched, so that a lost link only
         delays it."""
-        said = VerdictSaid(judged.run, judged.status, judged.cause, judged.text)
+        said = RunVerdict(judged.run, judged.status, judged.cause, judged.text)
         name = verdict_event(mission_of(judged.run))
         self.callee.raise_event(self._now, name, said.to_data(), source=source, latched=True)
 

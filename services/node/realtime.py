@@ -14,14 +14,14 @@ from typing import Any
 
 from petrobot.services.action import Status
 from petrobot.services.comm.calls.callee import Order
+from petrobot.services.comm.calls.caller import Notice
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.latch import STATE, latch_of
-from petrobot.services.comm.calls.listening import listening, refuse_unusable
-from petrobot.services.comm.calls.notices import Notice
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import Directory, DirectoryError
+from petrobot.services.comm.location_file.host_checks import listening, refuse_unusable
 from petrobot.services.comm.protocol.security import require_key
 from petrobot.services.comm.tls.credentials import credentials
+from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
 from petrobot.services.node.emergency_stops import BEAT, BEAT_EVERY
 from petrobot.services.node.inline_host import Place

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from petrobot.services.action import Result, Status, Wait
-from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
+from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
 from petrobot.services.comm.protocol.codec import NAME_LENGTH, ProtocolError, encode
 from petrobot.services.comm.protocol.messages import Call, Event, Feedback, Message, Outcome
 from petrobot.services.comm.protocol.plain import plain
@@ -138,7 +138,7 @@ class RunContext:
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
         """Judge an earlier run that had ended provisionally. Raises ValueError for what is no run's
         id or no status."""
-        said = VerdictSaid(run, Status(status).value, str(cause), str(text))
+        said = RunVerdict(run, Status(status).value, str(cause), str(text))
         name = verdict_event(mission_of(run))
         checked(Outcome(run, said.status, cause=said.cause, text=said.text))
         checked(Event(name, self._begin.action, 1, said.to_data()))

@@ -23,9 +23,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from petrobot.services.comm.calls.latch import latch_of
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
 from petrobot.services.device import Driver
+from petrobot.services.host.emergency_latch import latch_of
 from petrobot.services.host.parent_death import STOP_ROUTINE, outlive
 from petrobot.services.node.drivers import make_driver
 from petrobot.services.node.emergency_stops import BEAT, Guard

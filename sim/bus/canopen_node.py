@@ -21,13 +21,13 @@ from petrobot.services.comm.canopen.cia301 import (
     SDO_REQUEST_BASE,
     SYNC_ID,
     TPDO1_BASE,
-    Abort,
+    AbortCode,
+    DataType,
     Mapped,
     NmtCommand,
     NmtState,
     SdoAbortError,
     SdoMessage,
-    Type,
     emergency,
     heartbeat,
     parse_sdo,
@@ -49,7 +49,7 @@ _SYNCHRONOUS: Final = range(241)
 class Entry:
     """One object of the dictionary."""
 
-    type: Type
+    type: DataType
     access: str
     low: int
     high: int
@@ -78,9 +78,9 @@ def _objects(eds: str) -> tuple[Mapping[Key, Entry], Mapping[Key, str]]:
 
 
 def _entry(section: configparser.SectionProxy) -> Entry:
-    kind = Type(int(section["DataType"], 0))
+    kind = DataType(int(section["DataType"], 0))
     bits = kind.size * 8
-    signed = kind in (Type.INTEGER8, Type.INTEGER16, Type.INTEGER32)
+    signed = kind in (DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32)
     low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     return Entry(
         kind,
@@ -114,14 +114,14 @@ class Dictionary:
         found = self.entries.get((index, sub))
         if found is None:
             known = index in self._records or (index, 0) in self.entries
-            raise SdoAbortError(Abort.NO_SUBINDEX if known else Abort.NO_OBJECT, index, sub)
+            raise SdoAbortError(AbortCode.NO_SUBINDEX if known else AbortCode.NO_OBJECT, index, sub)
         return found
 
     def read(self, index: int, sub: int) -> bytes:
         """Return the bytes of an object's value."""
         entry = self.entry(index, sub)
         if entry.access.startswith("wo"):
-            raise SdoAbortError(Abort.WRITE_ONLY, index, sub)
+            raise SdoAbortError(AbortCode.WRITE_ONLY, index, sub)
         return entry.type.pack(self.values[index, sub])
 
     def checked(self, index: int, sub: int, data: bytes) -> int:
@@ -129,14 +129,18 @@ class Dictionary:
         written."""
         entry = self.entry(index, sub)
         if not entry.writable:
-            raise SdoAbortError(Abort.READ_ONLY, index, sub)
+            raise SdoAbortError(AbortCode.READ_ONLY, index, sub)
         if len(data) != entry.type.size:
             raise SdoAbortError(
-                Abort.TOO_LONG if len(data) > entry.type.size else Abort.TOO_SHORT, index, sub
+                AbortCode.TOO_LONG if len(data) > entry.type.size else AbortCode.TOO_SHORT,
+                index,
+                sub,
             )
         value = entry.type.unpack(data)
         if not entry.low <= value <= entry.high:
-            raise SdoAbortError(Abort.TOO_HIGH if value > entry.high else Abort.TOO_LOW, index, sub)
+            raise SdoAbortError(
+                AbortCode.TOO_HIGH if value > entry.high else AbortCode.TOO_LOW, index, sub
+            )
         return value
 
 
@@ -181,20 +185,20 @@ class Pdo:
         index, sub, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
         found = self._dictionary.entry(index, sub)
         if not found.mappable or found.type.size * 8 != bits:
-            raise SdoAbortError(Abort.NOT_MAPPABLE, self.mapping)
+            raise SdoAbortError(AbortCode.NOT_MAPPABLE, self.mapping)
         if self.parameters == RPDO and not found.writable:
-            raise SdoAbortError(Abort.NOT_MAPPABLE, self.mapping)
+            raise SdoAbortError(AbortCode.NOT_MAPPABLE, self.mapping)
         return Mapped(index, sub, found.type)
 
     def check(self, index: int, sub: int, value: int) -> None:
         """Raise SdoAbortError if one of the PDO's records must not get this value now (CiA 301,
         7.5.2.35 and 36)."""
         if index == self.mapping and (self.on or (sub and self._values[index, 0])):
-            raise SdoAbortError(Abort.STATE, index, sub)
+            raise SdoAbortError(AbortCode.STATE, index, sub)
         if index == self.mapping and sub == 0 and value:
             objects = [self.mapped(self._values[index, number]) for number in range(1, value + 1)]
             if sum(mapped.type.size for mapped in objects) > 8:
-                raise SdoAbortError(Abort.PDO_LENGTH, index, sub)
+                raise SdoAbortError(AbortCode.PDO_LENGTH, index, sub)
         if index == self.mapping and sub and value:
             self.mapped(value)
         if (
@@ -204,7 +208,7 @@ class Pdo:
             and not value & PDO_OFF
             and value & 0x7FF != self.cob_id
         ):
-            raise SdoAbortError(Abort.VALUE, index, sub)
+            raise SdoAbortError(AbortCode.VALUE, index, sub)
 
 
 class CanopenNode:
@@ -390,7 +394,7 @@ class CanopenNode:
             self.before_reading()
             return sdo_read_reply(self.node, index, sub, self.dictionary.read(index, sub))
         if request.command != 0x20:
-            raise SdoAbortError(Abort.COMMAND, index, sub)
+            raise SdoAbortError(AbortCode.COMMAND, index, sub)
         self._write(now, index, sub, data)
         return sdo_write_reply(self.node, index, sub)
 
@@ -405,7 +409,7 @@ class CanopenNode:
         if pdo is not None:
             pdo.check(index, sub, value)
         if (index, sub) in ((RPDO, 1), (TPDO, 1)) and not self._may_use(value & 0x7FF):
-            raise SdoAbortError(Abort.VALUE, index, sub)
+            raise SdoAbortError(AbortCode.VALUE, index, sub)
         self.check_write(index, sub, value)
         self.values[index, sub] = value
         self._applied = None

@@ -8,13 +8,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Final
 
-from petrobot.services.comm.canopen.cia301 import Abort, NmtState, SdoAbortError
+from petrobot.services.comm.canopen.cia301 import AbortCode, NmtState, SdoAbortError
 from petrobot.services.comm.canopen.cia402 import (
-    Command,
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveCommand,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     after,
     command_of,
@@ -23,17 +23,21 @@ from petrobot.services.comm.canopen.cia402 import (
 from petrobot.sim.bus.canopen_node import CanopenNode
 
 _REGISTERS: Final = {
-    Fault.OVERCURRENT: 0x03, Fault.UNDERVOLTAGE: 0x05, Fault.OVERHEATED: 0x09,
-    Fault.HEARTBEAT: 0x11, Fault.SYNC_LOST: 0x11, Fault.CAN_PASSIVE: 0x11,
-    Fault.BUS_OFF_RECOVERED: 0x11,
+    DriveFault.OVERCURRENT: 0x03, DriveFault.UNDERVOLTAGE: 0x05, DriveFault.OVERHEATED: 0x09,
+    DriveFault.HEARTBEAT: 0x11, DriveFault.SYNC_LOST: 0x11, DriveFault.CAN_PASSIVE: 0x11,
+    DriveFault.BUS_OFF_RECOVERED: 0x11,
 }  # fmt: skip
-_POWERLESS: Final = (Fault.OVERCURRENT, Fault.UNDERVOLTAGE, Fault.ENCODER)
+_POWERLESS: Final = (DriveFault.OVERCURRENT, DriveFault.UNDERVOLTAGE, DriveFault.ENCODER)
 """Faults after which a drive cannot brake by its motor: the brake engages at once."""
-_CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
-POWERED: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+_CONTROLWORD: Final = (int(ObjectIndex.CONTROLWORD), 0)
+POWERED: Final = (
+    DriveState.OPERATION_ENABLED,
+    DriveState.QUICK_STOP_ACTIVE,
+    DriveState.FAULT_REACTION_ACTIVE,
+)
 """States in which the motor has torque."""
-_DOWN: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
-_ENABLED: Final = State.OPERATION_ENABLED
+_DOWN: Final = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
+_ENABLED: Final = DriveState.OPERATION_ENABLED
 _REMOTE, _VOLTAGE, _FOLLOWS = (
     int(StatusBit.REMOTE),
     int(StatusBit.VOLTAGE_ENABLED),
@@ -41,7 +45,7 @@ _REMOTE, _VOLTAGE, _FOLLOWS = (
 )
 RUNNING: Final = _ENABLED.word | _REMOTE | _VOLTAGE | _FOLLOWS
 """Statusword of a drive that follows its set points, without the bits of its mode."""
-ENABLE_MASK, ENABLE = Command.ENABLE_OPERATION.value
+ENABLE_MASK, ENABLE = DriveCommand.ENABLE_OPERATION.value
 """Bits of a controlword that matter for the command to follow set points, and their value."""
 
 
@@ -53,9 +57,9 @@ class PowerDrive(CanopenNode, ABC):
     """One drive without its motor. A subclass names its `mode` and says how the motor begins, ramps
     down and loses its torque."""
 
-    mode: ClassVar[Mode]
+    mode: ClassVar[OperationMode]
     """The only mode of operation that it supports."""
-    fixed: ClassVar[tuple[Object, ...]] = (Object.MODE,)
+    fixed: ClassVar[tuple[ObjectIndex, ...]] = (ObjectIndex.MODE,)
     """Objects that must not be written while the motor has torque."""
 
     def __init__(
@@ -65,9 +69,9 @@ class PowerDrive(CanopenNode, ABC):
         itself; `stir` is called whenever something happens that may change the motor's torque."""
         super().__init__(node, eds)
         self.stir = stir
-        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.powered = True
-        self.fault = Fault.NONE
+        self.fault = DriveFault.NONE
         self._patient_periods = sync_patience
         self._sync_patience = math.inf
         self._controlword = 0
@@ -101,9 +105,9 @@ class PowerDrive(CanopenNode, ABC):
         OPERATIONAL (6007h = 2)."""
         if before is NmtState.BOOT_UP:
             if self.state not in _DOWN:
-                self._enter(State.SWITCH_ON_DISABLED)
-        elif before is NmtState.OPERATIONAL and self.state is State.OPERATION_ENABLED:
-            self._quick_stop(State.QUICK_STOP_ACTIVE)
+                self._enter(DriveState.SWITCH_ON_DISABLED)
+        elif before is NmtState.OPERATIONAL and self.state is DriveState.OPERATION_ENABLED:
+            self._quick_stop(DriveState.QUICK_STOP_ACTIVE)
         self._synced = now
         self.refresh()
 
@@ -114,30 +118,30 @@ class PowerDrive(CanopenNode, ABC):
         if word & ENABLE_MASK == ENABLE and self.state is _ENABLED:
             return  # nothing new
         command = command_of(word)
-        if command is Command.FAULT_RESET and before & 0x80:
+        if command is DriveCommand.FAULT_RESET and before & 0x80:
             return
         if command is not None:
             self._obey(now, command)
 
     def on_master_lost(self, now: float) -> None:
         """Stop by itself."""
-        self.trip(Fault.HEARTBEAT)
+        self.trip(DriveFault.HEARTBEAT)
 
     def after_configuring(self) -> None:
         """Store how the drive monitors itself."""
         self._sync_patience = (
-            self._patient_periods * self.values[Object.SYNC_PERIOD, 0] * 1e-6 or math.inf
+            self._patient_periods * self.values[ObjectIndex.SYNC_PERIOD, 0] * 1e-6 or math.inf
         )
 
     def check_write(self, index: int, sub: int, value: int) -> None:
         """Refuse any other mode, and any change of configuration while the motor has torque."""
-        if index == Object.MODE and value not in (Mode.NONE, self.mode):
-            raise SdoAbortError(Abort.VALUE, index, sub)
+        if index == ObjectIndex.MODE and value not in (OperationMode.NONE, self.mode):
+            raise SdoAbortError(AbortCode.VALUE, index, sub)
         if index in self.fixed and self.state in POWERED:
-            raise SdoAbortError(Abort.STATE, index, sub)
+            raise SdoAbortError(AbortCode.STATE, index, sub)
 
     # Events of a drive.
-    def trip(self, fault: Fault) -> None:
+    def trip(self, fault: DriveFault) -> None:
         """Raise a fault: EMCY, then a ramp to rest (the brake at once if there is no power for a
         ramp), then FAULT."""
         if self.state in _DOWN:
@@ -145,16 +149,16 @@ class PowerDrive(CanopenNode, ABC):
         self.fault = fault
         self.report(fault, _REGISTERS.get(fault, 0x21))
         if (
-            self.state not in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+            self.state not in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
             or fault in _POWERLESS
         ):
-            self._enter(State.FAULT)
+            self._enter(DriveState.FAULT)
         else:
-            self._quick_stop(State.FAULT_REACTION_ACTIVE)
+            self._quick_stop(DriveState.FAULT_REACTION_ACTIVE)
 
     def ramp_ended(self) -> None:
         """Enter FAULT: the motor has come to rest after a fault."""
-        self._enter(State.FAULT)
+        self._enter(DriveState.FAULT)
 
     def statusword(self) -> int:
         """Return object 6041h."""
@@ -177,33 +181,36 @@ class PowerDrive(CanopenNode, ABC):
         return self._synced + self._sync_patience if self.state is _ENABLED else math.inf
 
     # The state machine.
-    def _obey(self, now: float, command: Command) -> None:
+    def _obey(self, now: float, command: DriveCommand) -> None:
         state = after(self.state, command)
         if state is self.state:
             return
-        if self.state is State.FAULT:
+        if self.state is DriveState.FAULT:
             if not self.powered:
                 return  # the cause is still there
-            self.fault = Fault.NONE
-            self.report(Fault.NONE, 0)
-        if state is State.OPERATION_ENABLED:
-            if self.nmt is not NmtState.OPERATIONAL or self.values[Object.MODE, 0] != self.mode:
+            self.fault = DriveFault.NONE
+            self.report(DriveFault.NONE, 0)
+        if state is DriveState.OPERATION_ENABLED:
+            if (
+                self.nmt is not NmtState.OPERATIONAL
+                or self.values[ObjectIndex.MODE, 0] != self.mode
+            ):
                 return
-            self.begin(self.state is State.QUICK_STOP_ACTIVE)
+            self.begin(self.state is DriveState.QUICK_STOP_ACTIVE)
             self._synced = now
             self.state = state
             self.stir()
-        elif state is State.QUICK_STOP_ACTIVE:
+        elif state is DriveState.QUICK_STOP_ACTIVE:
             self._quick_stop(state)
         else:
             self._enter(state)
 
-    def _quick_stop(self, state: State) -> None:
-        self.ramp_down(from_units(self.values[Object.QUICK_STOP_DECELERATION, 0]))
+    def _quick_stop(self, state: DriveState) -> None:
+        self.ramp_down(from_units(self.values[ObjectIndex.QUICK_STOP_DECELERATION, 0]))
         self.state = state
         self.stir()
 
-    def _enter(self, state: State) -> None:
+    def _enter(self, state: DriveState) -> None:
         """Enter a state without torque: the brake holds."""
         self.cut_power()
         self.state = state

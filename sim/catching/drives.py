@@ -13,10 +13,10 @@ from petrobot.services.comm.canopen.cia402 import (
     RECEIVED,
     SENT,
     UNITS,
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     fault_text,
     to_units,
@@ -81,15 +81,15 @@ SYNC_PATIENCE: Final = 10
 shorter than three periods of the set-point stream, longer than the occasional delay of a master on
 ordinary Linux."""
 
-_STATUSWORD: Final = (int(Object.STATUSWORD), 0)
-_CONTROLWORD: Final = (int(Object.CONTROLWORD), 0)
+_STATUSWORD: Final = (int(ObjectIndex.STATUSWORD), 0)
+_CONTROLWORD: Final = (int(ObjectIndex.CONTROLWORD), 0)
 _POSITION, _VELOCITY, _TORQUE, _TARGET = (
-    (int(Object.POSITION), 0),
-    (int(Object.VELOCITY), 0),
-    (int(Object.TORQUE), 0),
-    (int(Object.TARGET_POSITION), 0),
+    (int(ObjectIndex.POSITION), 0),
+    (int(ObjectIndex.VELOCITY), 0),
+    (int(ObjectIndex.TORQUE), 0),
+    (int(ObjectIndex.TARGET_POSITION), 0),
 )
-_ENABLED: Final = State.OPERATION_ENABLED
+_ENABLED: Final = DriveState.OPERATION_ENABLED
 _OPERATIONAL: Final = NmtState.OPERATIONAL
 _RPDO_KEYS, _TPDO_KEYS = (
     tuple((int(one.index), one.sub) for one in mapped) for mapped in (RECEIVED, SENT)
@@ -134,8 +134,8 @@ def ratings(table: Mapping[str, Any]) -> tuple[DriveRating, ...]:
 class ServoDrive(PowerDrive):
     """Drive of one joint: cyclic synchronous position mode around a `JointServo`."""
 
-    mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
-    fixed = (Object.MODE, Object.INTERPOLATION_PERIOD, Object.SOFTWARE_LIMITS)
+    mode = OperationMode.CYCLIC_SYNCHRONOUS_POSITION
+    fixed = (ObjectIndex.MODE, ObjectIndex.INTERPOLATION_PERIOD, ObjectIndex.SOFTWARE_LIMITS)
 
     def __init__(
         self, joint: int, rating: DriveRating, plant: Plant, stir: Callable[[], None]
@@ -183,9 +183,9 @@ class ServoDrive(PowerDrive):
     def before_reading(self) -> None:
         """Also update what only an SDO reads."""
         self.before_sending()
-        self.values[Object.FOLLOWING_ERROR, 0] = to_units(self.servo.error)
-        self.values[Object.ERROR_CODE, 0] = self.fault
-        self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
+        self.values[ObjectIndex.FOLLOWING_ERROR, 0] = to_units(self.servo.error)
+        self.values[ObjectIndex.ERROR_CODE, 0] = self.fault
+        self.values[ObjectIndex.MODE_DISPLAY, 0] = self.values[ObjectIndex.MODE, 0]
 
     def changed(self) -> None:
         """Note that the content of a TPDO may have changed."""
@@ -265,13 +265,13 @@ class ServoDrive(PowerDrive):
         values, rpdo, tpdo = self.values, self.rpdo, self.tpdo
         self._usual = rpdo.synchronous and tpdo.on and tpdo.synchronous
         self._usual = self._usual and (rpdo.keys, tpdo.keys) == (_RPDO_KEYS, _TPDO_KEYS)
-        self._window = values[Object.FOLLOWING_ERROR_WINDOW, 0] / UNITS
-        self._patience = values[Object.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
-        self._range = values[Object.SOFTWARE_LIMITS, 1], values[Object.SOFTWARE_LIMITS, 2]
-        if values[Object.INTERPOLATION_PERIOD, 1]:
+        self._window = values[ObjectIndex.FOLLOWING_ERROR_WINDOW, 0] / UNITS
+        self._patience = values[ObjectIndex.FOLLOWING_ERROR_TIMEOUT, 0] * 1e-3
+        self._range = values[ObjectIndex.SOFTWARE_LIMITS, 1], values[ObjectIndex.SOFTWARE_LIMITS, 2]
+        if values[ObjectIndex.INTERPOLATION_PERIOD, 1]:
             self.servo.period = (
-                values[Object.INTERPOLATION_PERIOD, 1]
-                * 10.0 ** values[Object.INTERPOLATION_PERIOD, 2]
+                values[ObjectIndex.INTERPOLATION_PERIOD, 1]
+                * 10.0 ** values[ObjectIndex.INTERPOLATION_PERIOD, 2]
             )
         self.stir()
 
@@ -303,7 +303,7 @@ class ServoDrive(PowerDrive):
         """Update all objects, the greatest speed too."""
         self._shown = None
         self.servo.limit = self.servo.rating.speed * self._speed_factor
-        self.values[Object.MAX_SPEED, 0] = to_units(self.servo.limit)
+        self.values[ObjectIndex.MAX_SPEED, 0] = to_units(self.servo.limit)
         self.stir()
 
     # What the laboratory does to a drive.
@@ -328,7 +328,7 @@ class ServoDrive(PowerDrive):
                 or not -self._window <= servo.error <= self._window
             ):
                 self._watch(now, late)
-        elif state is State.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
+        elif state is DriveState.FAULT_REACTION_ACTIVE and servo.ramped_down and abs(qd) < 0.02:
             self.ramp_ended()
         return tau
 
@@ -340,19 +340,19 @@ class ServoDrive(PowerDrive):
         return (
             self.servo.settled
             and self._error_since is None
-            and self.state is not State.FAULT_REACTION_ACTIVE
+            and self.state is not DriveState.FAULT_REACTION_ACTIVE
         )
 
     def _watch(self, now: float, late: bool) -> None:
         """Watch following error (6065h, 6066h) and loss of SYNC (1006h)."""
         if late:
-            self.trip(Fault.SYNC_LOST)
+            self.trip(DriveFault.SYNC_LOST)
         elif -self._window <= self.servo.error <= self._window:
             self._error_since = None
         elif self._error_since is None:
             self._error_since = now
         elif now - self._error_since >= self._patience:
-            self.trip(Fault.FOLLOWING_ERROR)
+            self.trip(DriveFault.FOLLOWING_ERROR)
 
     def _target(self) -> float:
         """Return object 607Ah within the software limits 607Dh, in rad."""
@@ -467,14 +467,14 @@ class DriveBus:
         for drive in self.drives:
             drive.powered = closed
             if not closed:
-                drive.trip(Fault.UNDERVOLTAGE)
+                drive.trip(DriveFault.UNDERVOLTAGE)
 
     def _put(self, mask: int, on: bool) -> None:
         if bool(self.inputs.inputs & mask) is not on:
             self.inputs.put(mask, on)
             self._due = -math.inf
 
-    def trip(self, joint: int, fault: Fault = Fault.OVERCURRENT) -> str:
+    def trip(self, joint: int, fault: DriveFault = DriveFault.OVERCURRENT) -> str:
         """Make a drive (0 to 5) fail; return the fault in words."""
         self.drives[joint].trip(fault)
         return fault_text(fault)

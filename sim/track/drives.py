@@ -10,10 +10,10 @@ from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import SYNC_ID
 from petrobot.services.comm.canopen.cia402 import (
     UNITS,
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     fault_text,
     to_units,
@@ -29,13 +29,13 @@ at 0.5 m/s."""
 _STATUSWORD, _POSITION, _VELOCITY, _TORQUE, _VOLTAGE, _MAX_SPEED, _TARGET = (
     (int(each), 0)
     for each in (
-        Object.STATUSWORD,
-        Object.POSITION,
-        Object.VELOCITY,
-        Object.TORQUE,
-        Object.DC_LINK_VOLTAGE,
-        Object.MAX_SPEED,
-        Object.TARGET_VELOCITY,
+        ObjectIndex.STATUSWORD,
+        ObjectIndex.POSITION,
+        ObjectIndex.VELOCITY,
+        ObjectIndex.TORQUE,
+        ObjectIndex.DC_LINK_VOLTAGE,
+        ObjectIndex.MAX_SPEED,
+        ObjectIndex.TARGET_VELOCITY,
     )
 )
 _LONGEST: Final = 0.1
@@ -49,7 +49,7 @@ _HALF, _WHOLE = 1 << 31, 1 << 32
 class WheelDrive(PowerDrive):
     """Drive of one wheel: speed set points, limited in slope and by the battery."""
 
-    mode = Mode.CYCLIC_SYNCHRONOUS_VELOCITY
+    mode = OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY
 
     def __init__(self, side: int, rover: RoverBody) -> None:
         """`side`: 0 left, 1 right; the node id is one more."""
@@ -82,8 +82,8 @@ class WheelDrive(PowerDrive):
     def before_reading(self) -> None:
         """Also update what only an SDO reads."""
         self.before_sending()
-        self.values[Object.ERROR_CODE, 0] = self.fault
-        self.values[Object.MODE_DISPLAY, 0] = self.values[Object.MODE, 0]
+        self.values[ObjectIndex.ERROR_CODE, 0] = self.fault
+        self.values[ObjectIndex.MODE_DISPLAY, 0] = self.values[ObjectIndex.MODE, 0]
 
     def on_sync(self, now: float) -> None:
         """Read the encoder and take the next set point."""
@@ -93,7 +93,7 @@ class WheelDrive(PowerDrive):
             self._speed = (
                 (self._counted - counted) * _TURN / self._rover.truth.encoder_counts / since
             )
-        if self.state is State.OPERATION_ENABLED:
+        if self.state is DriveState.OPERATION_ENABLED:
             self._aim(self.values[_TARGET] / UNITS, min(since, _LONGEST))
 
     def _count(self) -> int:
@@ -131,15 +131,15 @@ class WheelDrive(PowerDrive):
         """Ramp down and watch SYNC; called once per slot."""
         if self.state not in POWERED:
             return
-        if self.state is State.OPERATION_ENABLED:
+        if self.state is DriveState.OPERATION_ENABLED:
             if self.late(now):
-                self.trip(Fault.SYNC_LOST)
+                self.trip(DriveFault.SYNC_LOST)
             return
         change = (self._ramp or 0.0) * SLOT
         self._reference = math.copysign(max(abs(self._reference) - change, 0.0), self._reference)
         self._wheel.target = self._reference
         if (
-            self.state is State.FAULT_REACTION_ACTIVE
+            self.state is DriveState.FAULT_REACTION_ACTIVE
             and self._reference == 0.0
             and abs(self._wheel.speed) < _AT_REST
         ):
@@ -205,9 +205,9 @@ class RoverBus:
         for drive in self.drives:
             drive.powered = closed
             if not closed:
-                drive.trip(Fault.UNDERVOLTAGE)
+                drive.trip(DriveFault.UNDERVOLTAGE)
 
-    def trip(self, side: int, fault: Fault = Fault.OVERCURRENT) -> str:
+    def trip(self, side: int, fault: DriveFault = DriveFault.OVERCURRENT) -> str:
         """Make a drive (0 left, 1 right) fail; return the fault in words."""
         self.drives[side].trip(fault)
         return fault_text(fault)

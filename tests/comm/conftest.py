@@ -9,7 +9,7 @@ from typing import Any, get_args
 import pytest
 from hypothesis import strategies as st
 
-from petrobot.services.comm.calls.link import Limits
+from petrobot.services.comm.calls.link import LinkLimits
 from petrobot.services.comm.protocol.codec import LIMITS
 from petrobot.services.comm.protocol.messages import Executed, Hello, Message, Tick, Welcome
 from petrobot.services.comm.protocol.wire import Connection, Side
@@ -142,7 +142,9 @@ async def node(key: bytes | None) -> AsyncIterator[Node]:
 @pytest.fixture
 async def open_node() -> AsyncIterator[Node]:
     """A node without a key."""
-    one = Node(limits=Limits(connections=8, opening=4, buffer_high=1 << 16, buffer_hard=1 << 20))
+    one = Node(
+        limits=LinkLimits(connections=8, opening=4, buffer_high=1 << 16, buffer_hard=1 << 20)
+    )
     await one.server.start("127.0.0.1", 0)
     yield one
     await one.server.close()

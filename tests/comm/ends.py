@@ -13,13 +13,13 @@ import pytest
 from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.link import Link, Timing
+from petrobot.services.comm.calls.link import AsyncLink, LinkTiming
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import encode
 from petrobot.services.comm.protocol.wire import Connection, Side
 
-QUICK = Timing(heartbeat=0.05, silence=0.2, handshake=0.3, backoff=(0.01, 0.05))
+QUICK = LinkTiming(heartbeat=0.05, silence=0.2, handshake=0.3, backoff=(0.01, 0.05))
 HELLO = m.Hello(2, 2, "coordinator", "coord", "c1", 1)
 
 
@@ -99,7 +99,12 @@ async def until(condition: Callable[[], bool]) -> None:
     something."""
     stirred = asyncio.Event()
     with pytest.MonkeyPatch.context() as patch:
-        for owner, name in ((Server, "arm"), (Server, "gone"), (Client, "flush"), (Link, "_beat")):
+        for owner, name in (
+            (Server, "arm"),
+            (Server, "gone"),
+            (Client, "flush"),
+            (AsyncLink, "_beat"),
+        ):
             patch.setattr(owner, name, _and_then(getattr(owner, name), stirred.set))
         async with asyncio.timeout(60.0):
             while not condition():

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 
-from petrobot.services.comm.calls.callee import Callee, CancelRun, Offer, Order
+from petrobot.services.comm.calls.callee import Callee, CancelOrder, Offer, Order
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.streams.stream import StreamSender
 
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 STREAM = "points"
 
 
-class Fault(Enum):
+class LinkFault(Enum):
     """What befalls the other side."""
 
     KILLED = "killed"
@@ -101,12 +101,12 @@ class Cable:
                 end.close()
 
 
-def inflict(fault: Fault, process: subprocess.Popen[str], cable: Cable) -> None:
+def inflict(fault: LinkFault, process: subprocess.Popen[str], cable: Cable) -> None:
     """Let it befall the process, or the cable to it."""
-    if fault is Fault.CUT:
+    if fault is LinkFault.CUT:
         cable.cut()
     else:
-        process.send_signal(signal.SIGKILL if fault is Fault.KILLED else signal.SIGSTOP)
+        process.send_signal(signal.SIGKILL if fault is LinkFault.KILLED else signal.SIGSTOP)
 
 
 @contextmanager
@@ -132,7 +132,7 @@ async def be_node(port: int, boot: str) -> None:
 
     def obey(now: float, orders: list[Order]) -> None:
         for order in orders:
-            if isinstance(order, CancelRun):
+            if isinstance(order, CancelOrder):
                 callee.finish(now, order.id, "error", cause="cancelled", text="it was told to stop")
 
     callee = Callee("motion", boot, {"move": Offer()})

@@ -11,7 +11,7 @@ import random
 import pytest
 
 from petrobot.services.comm.calls.caller import PeerLost
-from petrobot.services.comm.calls.link import Timing
+from petrobot.services.comm.calls.link import LinkTiming
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS
 from petrobot.services.comm.protocol.messages import Executed
@@ -115,9 +115,9 @@ async def _attack(address: tuple[str, int], frames: int, seed: int) -> None:
 
 
 async def _served_under_attack(frames: int) -> None:
-    node = Node(timing=Timing(handshake=0.2))
+    node = Node(timing=LinkTiming(handshake=0.2))
     await node.server.start("127.0.0.1", 0)
-    coordinator = node.client(timing=Timing())
+    coordinator = node.client(timing=LinkTiming())
     assert await coordinator.client.connected(60.0)
     attack = asyncio.gather(*(_attack(node.server.address, frames // 4, seed) for seed in range(4)))
     served = 0

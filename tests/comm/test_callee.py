@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.calls.callee import (
     Callee,
-    CancelRun,
-    Commanded,
-    Keeping,
+    CancelOrder,
+    CommandOrder,
     Offer,
-    StartRun,
+    Retention,
+    StartOrder,
 )
-from petrobot.services.comm.calls.results import FinishedIds
+from petrobot.services.comm.calls.runs import FinishedIds
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Executed
 
@@ -36,7 +36,7 @@ OFFERS = {
 }
 
 
-def _callee(*hellos: m.Hello, local: bool = True, keeping: Keeping | None = None) -> Callee:
+def _callee(*hellos: m.Hello, local: bool = True, keeping: Retention | None = None) -> Callee:
     callee = Callee("motion", "n1", OFFERS, directory="d1", keeping=keeping)
     for hello in hellos or (COORD,):
         assert isinstance(callee.link_up(0.0, hello.name, hello, local=local), m.Welcome)
@@ -56,7 +56,7 @@ def test_a_run_from_call_to_acknowledged_result() -> None:
     callee = _callee()
     call = m.Call("1", "move", {"to": 1}, 5.0, 3, "n1")
     callee.receive(0.0, "coord", call)
-    assert callee.orders() == [StartRun(call, "coord")] and callee.orders() == []
+    assert callee.orders() == [StartOrder(call, "coord")] and callee.orders() == []
     callee.feedback(0.1, "1", 1.5, {"n": (1,)})
     outcome = callee.finish(0.5, "1", "success", {"p": (1, 2)}, cpu_seconds=0.1)
     assert outcome == m.Outcome("1", "success", {"p": [1, 2]}, "", "", Executed.YES, 0.5, 0.1)
@@ -176,7 +176,7 @@ def test_the_deadline_is_enforced_whatever_the_action_says(limited_by: str) -> N
     assert callee.orders() == []
     callee.advance(3.0)
     callee.advance(4.0)
-    assert callee.orders() == [CancelRun("1", "deadline")]
+    assert callee.orders() == [CancelOrder("1", "deadline")]
     callee.finish(4.1, "1", "success", {"p": 1})
     assert _outcome(callee) == ("error", "deadline", Executed.YES)
 
@@ -195,7 +195,7 @@ def test_an_orphan_is_stopped_after_its_time_unless_its_caller_comes_back() -> N
     callee.advance(3.9)
     assert callee.orders() == []
     callee.advance(4.0)
-    assert callee.orders() == [CancelRun("1", "orphan")], "track has no orphan time and goes on"
+    assert callee.orders() == [CancelOrder("1", "orphan")], "track has no orphan time and goes on"
     callee.finish(4.1, "1", "error", cause="cancelled")
     _said(callee)
     welcome = callee.link_up(5.0, "coord", COORD)
@@ -210,9 +210,9 @@ def test_cancel_against_completion() -> None:
         callee.receive(0.0, "coord", m.Call(id_, "track", epoch=3))
         callee.receive(0.1, "coord", m.Cancel(id_, "not wanted"))
         callee.receive(0.1, "coord", m.Cancel(id_, "again"))
-    assert [order for order in callee.orders() if isinstance(order, CancelRun)] == [
-        CancelRun("1", "not wanted"),
-        CancelRun("2", "not wanted"),
+    assert [order for order in callee.orders() if isinstance(order, CancelOrder)] == [
+        CancelOrder("1", "not wanted"),
+        CancelOrder("2", "not wanted"),
     ]
     _said(callee)
     callee.finish(0.2, "1", "success", {"p": 1})
@@ -277,7 +277,7 @@ def test_a_caller_that_was_not_welcomed_runs_nothing() -> None:
 
 
 def test_results_are_forgotten_by_number_and_by_time_ids_are_not() -> None:
-    callee = _callee(keeping=Keeping(results=10.0, result_count=2))
+    callee = _callee(keeping=Retention(results=10.0, result_count=2))
     for n in range(3):
         callee.receive(float(n), "coord", m.Call(str(n), "get", epoch=3))
     welcome = callee.link_up(3.0, "coord", COORD)
@@ -300,7 +300,7 @@ def _called_and_acknowledged(callee: Callee, *ids: str) -> None:
 def test_ids_that_count_up_are_never_forgotten() -> None:
     """Neither by number nor by age: a day and twice as many calls as an id was remembered for
     before."""
-    callee = _callee(keeping=Keeping(id_groups=100))
+    callee = _callee(keeping=Retention(id_groups=100))
     _called_and_acknowledged(callee, *(f"m/work#{n}" for n in range(1, 400_000)))
     callee.advance(86_400.0)
     for n in (1, 4_095, 4_096, 200_000, 399_999):
@@ -311,7 +311,7 @@ def test_ids_that_count_up_are_never_forgotten() -> None:
 
 
 def test_a_node_that_has_forgotten_ids_runs_no_call_that_may_be_among_them() -> None:
-    callee = _callee(keeping=Keeping(id_groups=2))
+    callee = _callee(keeping=Retention(id_groups=2))
     _called_and_acknowledged(callee, "work-1", "a", "b")
     for service in ("get", "move"):
         again = m.Call(f"{service}/work-2", service, epoch=3, again=True)
@@ -375,7 +375,7 @@ def test_commands_go_to_the_node_and_their_answers_back() -> None:
     callee = _callee()
     command = m.Command("k1", "hold", "arm")
     callee.receive(0.0, "coord", command)
-    assert callee.orders() == [Commanded(command, "coord")]
+    assert callee.orders() == [CommandOrder(command, "coord")]
     callee.answer(0.1, "k1", True, {"arm": "held"})
     assert callee.messages() == [("coord", m.Answer("k1", True, {"arm": "held"}))]
 
@@ -393,16 +393,16 @@ def test_a_restarted_caller_counts_its_commands_anew() -> None:
     )
     callee.messages()
     callee.receive(2.1, "coord", command)
-    assert callee.orders() == [Commanded(command, "coord")] and callee.messages() == []
+    assert callee.orders() == [CommandOrder(command, "coord")] and callee.messages() == []
 
 
 def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
     callee = _callee()
-    with pytest.raises(ValueError, match="no such run"):
+    with pytest.raises(ValueError, match="no active run"):
         callee.finish(0.0, "1", "success")
-    with pytest.raises(ValueError, match="no such run"):
+    with pytest.raises(ValueError, match="no active run"):
         callee.feedback(0.0, "1", 0.5)
-    with pytest.raises(ValueError, match="no such run"):
+    with pytest.raises(ValueError, match="no active run"):
         callee.raise_event(0.0, "lost", run="1")
     with pytest.raises(ValueError, match="nobody waits"):
         callee.answer(0.0, "k1", True)
@@ -413,7 +413,7 @@ def test_a_service_answered_on_the_spot_is_answered_once_by_either_way() -> None
     outcome = callee.answer_inline(1.0, "coord", m.Call("1", "get", epoch=3))
     assert outcome == m.Outcome("1", "success", {"at": 1.0}) and not callee.has_work
     callee.keep(1.0, "coord", outcome)
-    assert callee.soonest == 1.0 + Keeping().results, "it is not kept for ever"
+    assert callee.soonest == 1.0 + Retention().results, "it is not kept for ever"
     for call in (
         m.Call("1", "get", epoch=3),
         m.Call("2", "track", epoch=3),
@@ -448,12 +448,12 @@ def test_the_deadline_of_a_held_run_stands_still(target: str) -> None:
     callee.orders()
     callee.advance(4.9)
     callee.receive(5.0, "coord", m.Command("r", "release", target))
-    assert [type(order) for order in callee.orders()] == [Commanded]
+    assert [type(order) for order in callee.orders()] == [CommandOrder]
     assert callee.due() == 6.0
     callee.advance(5.99)
     assert callee.orders() == []
     callee.advance(6.0)
-    assert callee.orders() == [CancelRun("1", "deadline")]
+    assert callee.orders() == [CancelOrder("1", "deadline")]
 
 
 @pytest.mark.parametrize(
@@ -467,7 +467,7 @@ def test_the_deadline_of_a_run_that_goes_on_is_kept_during_a_pause(answers: dict
     callee.answer(1.0, "h", False, {"answers": answers})
     callee.orders()
     callee.advance(2.0)
-    assert callee.orders() == [CancelRun("1", "deadline")]
+    assert callee.orders() == [CancelOrder("1", "deadline")]
 
 
 def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
@@ -479,7 +479,7 @@ def test_a_held_run_is_still_an_orphan_without_its_caller() -> None:
     callee.orders()
     callee.link_down(1.0, "coord")
     callee.advance(2.0)
-    assert callee.orders() == [CancelRun("1", "orphan")]
+    assert callee.orders() == [CancelOrder("1", "orphan")]
 
 
 def test_a_repeated_command_is_not_carried_out_again() -> None:
@@ -492,7 +492,7 @@ def test_a_repeated_command_is_not_carried_out_again() -> None:
     stop = m.Command("k1", "stop", "arm")
     for _ in range(3):
         callee.receive(0.0, "coord", stop)
-    assert callee.orders() == [Commanded(stop, "coord")] and callee.messages() == []
+    assert callee.orders() == [CommandOrder(stop, "coord")] and callee.messages() == []
     callee.receive(0.1, "other", stop)
     [(peer, answer)] = callee.messages()
     assert peer == "other" and isinstance(answer, m.Answer) and answer.data["cause"] == "id_taken"
@@ -501,7 +501,7 @@ def test_a_repeated_command_is_not_carried_out_again() -> None:
     callee.receive(0.2, "coord", stop)
     assert callee.orders() == [] and callee.messages() == [said]
     callee.receive(0.3, "other", stop)
-    assert callee.orders() == [Commanded(stop, "other")] and callee.messages() == []
+    assert callee.orders() == [CommandOrder(stop, "other")] and callee.messages() == []
     callee.answer(0.4, "k1", True)
     for number in range(1_000):
         callee.receive(1.0, "coord", m.Command(f"more {number}", "status"))

@@ -7,16 +7,16 @@ from dataclasses import replace
 import pytest
 
 from petrobot.services.comm.calls.caller import (
-    Accepted,
-    Answered,
+    CallAccepted,
+    CallEnded,
     Caller,
-    Ended,
+    CallProgress,
+    CommandAnswered,
     EventArrived,
-    Late,
+    LateResult,
     Notice,
     PeerBack,
     PeerLost,
-    Progress,
 )
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS, encode
@@ -58,7 +58,7 @@ def _ends(notices: list[Notice]) -> list[tuple[str, str, Executed]]:
     return [
         (notice.outcome.id, notice.outcome.cause, notice.outcome.executed)
         for notice in notices
-        if isinstance(notice, Ended)
+        if isinstance(notice, CallEnded)
     ]
 
 
@@ -75,7 +75,11 @@ def test_a_run_from_accept_to_acknowledged_result() -> None:
     result = m.Outcome("1", "success", {"x": 1})
     for message in (m.Accept("1"), m.Accept("1"), m.Feedback("1", 0.5, {"n": 1}), result, result):
         caller.receive(0.1, message)
-    assert caller.notices() == [Accepted("1"), Progress("1", 0.5, {"n": 1}), Ended(result)]
+    assert caller.notices() == [
+        CallAccepted("1"),
+        CallProgress("1", 0.5, {"n": 1}),
+        CallEnded(result),
+    ]
     caller.messages(0.1)
     assert caller.due() is None, "a result that is not safe yet is not acknowledged"
     caller.acknowledge(0.2, "1")
@@ -276,7 +280,7 @@ def test_who_waits_no_more_is_told_nothing_and_the_result_is_acknowledged_all_th
         caller.take_outcomes(0.1, [m.Outcome("1", "success")])
         assert m.ResultAck("1") in caller.messages(1.0)
     assert waiter.told == [] and caller.calls == 0
-    assert not any(isinstance(notice, Ended) for notice in caller.notices())
+    assert not any(isinstance(notice, CallEnded) for notice in caller.notices())
 
 
 def test_very_many_results_at_once_are_acknowledged_in_messages_that_may_be_sent() -> None:
@@ -359,7 +363,7 @@ def test_a_run_given_up_is_stopped_when_its_node_is_back_and_its_end_is_late() -
     caller.notices()
     late = m.Outcome("1", "error", {}, "orphan")
     caller.receive(5.1, late)
-    assert caller.notices() == [Late(late)]
+    assert caller.notices() == [LateResult(late)]
     assert caller.messages() == [m.ResultAck("1")]
 
 
@@ -391,16 +395,16 @@ def test_commands_are_answered_come_what_may() -> None:
         caller.command(0.0, m.Command(id_, "hold"))
     caller.receive(0.1, m.Answer("a", True, {"arm": "held"}))
     caller.receive(0.1, m.Answer("a", True, {"arm": "held"}))
-    assert caller.notices() == [Answered(m.Answer("a", True, {"arm": "held"}))]
+    assert caller.notices() == [CommandAnswered(m.Answer("a", True, {"arm": "held"}))]
     assert caller.due() == 2.0
     caller.advance(2.0)
     assert caller.notices() == [
-        Answered(m.Answer(id_, False, {"cause": "no_answer"})) for id_ in "bc"
+        CommandAnswered(m.Answer(id_, False, {"cause": "no_answer"})) for id_ in "bc"
     ]
     caller.command(3.0, m.Command("d", "hold"))
     caller.link_down(3.1, "cut")
     caller.command(3.2, m.Command("e", "hold"))
-    answers = [notice.answer for notice in caller.notices() if isinstance(notice, Answered)]
+    answers = [notice.answer for notice in caller.notices() if isinstance(notice, CommandAnswered)]
     assert answers == [
         m.Answer("d", False, {"cause": "lost"}),
         m.Answer("e", False, {"cause": "unreachable"}),
@@ -456,6 +460,6 @@ def test_bad_calls_are_refused_where_they_are_made() -> None:
     with pytest.raises(NotPlainError, match=r"arguments\.to"):
         caller.call(0.0, m.Call("1", "move", {"to": object()}))
     caller.call(0.0, CALL)
-    with pytest.raises(ValueError, match="under way already"):
+    with pytest.raises(ValueError, match="already pending"):
         caller.call(0.0, CALL)
     assert caller.under_way() == ("1",)

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.calls.callee import Callee, CancelRun, Keeping, Offer, StartRun
-from petrobot.services.comm.calls.caller import Caller, Ended, Late, PeerBack
+from petrobot.services.comm.calls.callee import Callee, CancelOrder, Offer, Retention, StartOrder
+from petrobot.services.comm.calls.caller import CallEnded, Caller, LateResult, PeerBack
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Executed
 
@@ -21,7 +21,7 @@ DEVICES = 2
 
 
 @dataclass
-class Run:
+class ModelRun:
     ends: float
     call: m.Call
 
@@ -38,7 +38,7 @@ class World:
     towards_node: list[tuple[float, m.Message]] = field(default_factory=list)
     towards_caller: list[tuple[float, m.Message]] = field(default_factory=list)
     stale: list[m.Message] = field(default_factory=list)
-    runs: dict[str, Run] = field(default_factory=dict)
+    runs: dict[str, ModelRun] = field(default_factory=dict)
     started: Counter[str] = field(default_factory=Counter)
     finished: set[str] = field(default_factory=set)
     made: dict[str, m.Call] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class World:
             "motion",
             f"n{self.boot}",
             offers,
-            keeping=Keeping(results=3.0, result_count=4, id_groups=2),
+            keeping=Retention(results=3.0, result_count=4, id_groups=2),
         )
 
     def _new_caller(self) -> Caller:
@@ -159,11 +159,11 @@ class World:
             self._orders()
             self._exchange(delay)
         for notice in self.caller.notices():
-            if isinstance(notice, Ended):
+            if isinstance(notice, CallEnded):
                 assert notice.outcome.id not in self.ended, "a call ended twice"
                 self.ended[notice.outcome.id] = notice.outcome
                 self.caller.acknowledge(self.now, notice.outcome.id)
-            elif isinstance(notice, Late):
+            elif isinstance(notice, LateResult):
                 self.late.append(notice.outcome)
             elif isinstance(notice, PeerBack):
                 self.known_boot = notice.boot
@@ -188,9 +188,9 @@ class World:
 
     def _orders(self) -> None:
         for order in self.callee.orders():
-            if isinstance(order, StartRun):
+            if isinstance(order, StartOrder):
                 self._start(order.call)
-            elif isinstance(order, CancelRun) and order.id in self.runs:
+            elif isinstance(order, CancelOrder) and order.id in self.runs:
                 del self.runs[order.id]
                 self.callee.finish(
                     self.now, order.id, "error", cause="cancelled", text=order.reason
@@ -201,7 +201,7 @@ class World:
             self.callee.finish(self.now, call.id, "error", cause="busy", executed=Executed.NO)
             return
         self.started[call.id] += 1
-        self.runs[call.id] = Run(self.now + call.arguments["seconds"], call)
+        self.runs[call.id] = ModelRun(self.now + call.arguments["seconds"], call)
 
     def _exchange(self, delay: float) -> None:
         due = self.now + delay

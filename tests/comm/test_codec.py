@@ -172,17 +172,19 @@ def _call(**changes: Any) -> list[Any]:
     [
         pytest.param([4, "c1"], "fields", id="too few fields"),
         pytest.param([*CALL, True, 1], "fields", id="too many fields"),
-        pytest.param(_call(id=7), "id is a int", id="number for text"),
-        pytest.param(_call(id=None), "id is a NoneType", id="nil for text"),
-        pytest.param(_call(epoch=True), "epoch is a bool", id="bool for number"),
-        pytest.param(_call(epoch=1.0), "epoch is a float", id="float for int"),
+        pytest.param(_call(id=7), "id: expected a str, found a int", id="number for text"),
+        pytest.param(_call(id=None), "found a NoneType", id="nil for text"),
+        pytest.param(
+            _call(epoch=True), "epoch: expected a int, found a bool", id="bool for number"
+        ),
+        pytest.param(_call(epoch=1.0), "found a float", id="float for int"),
         pytest.param(_call(epoch=-1), "2^63", id="negative count"),
         pytest.param(_call(epoch=2**63), "2^63", id="count too large"),
-        pytest.param(_call(deadline="1"), "deadline is a str", id="text for duration"),
+        pytest.param(_call(deadline="1"), "found a str", id="text for duration"),
         pytest.param(_call(deadline=-0.1), "finite", id="negative duration"),
         pytest.param(_call(deadline=math.nan), "finite", id="nan duration"),
         pytest.param(_call(deadline=math.inf), "finite", id="endless duration"),
-        pytest.param(_call(arguments=[]), "arguments is a list", id="array for map"),
+        pytest.param(_call(arguments=[]), "found a list", id="array for map"),
         pytest.param(_call(arguments={1: 2}), "not msgpack", id="number as key"),
         pytest.param(_call(arguments={b"k": 2}), "key", id="bytes as key"),
         pytest.param(_call(arguments=_nested(DEPTH + 2)), "deeper", id="too deep"),
@@ -190,7 +192,7 @@ def _call(**changes: Any) -> list[Any]:
             _call(arguments={"a": msgpack.ExtType(1, b"\x01\x00")}), "extension", id="extension"
         ),
         pytest.param(_call(arguments={"a": msgpack.Timestamp(1)}), "Timestamp", id="time stamp"),
-        pytest.param(_call(id="x" * (NAME_LENGTH + 1)), "longer", id="long name"),
+        pytest.param(_call(id="x" * (NAME_LENGTH + 1)), "too long", id="long name"),
         pytest.param(
             [7, "c1", "success", {}, "", "", "perhaps", 0.0, 0.0], "yes, no", id="executed perhaps"
         ),
@@ -314,7 +316,7 @@ def test_a_provisional_result_has_one_field_more_and_any_other_none() -> None:
     assert encode(open_) == b"\x9a" + encode(sure)[1:] + b"\xc3" and encode(sure)[0] == 0x99
     assert (decode(encode(sure)), decode(encode(open_))) == (sure, open_)
     assert decode(b"\x9a" + encode(sure)[1:] + b"\xc2") == sure, "written out by whoever does"
-    with pytest.raises(ProtocolError, match="deferred is a int, not a bool"):
+    with pytest.raises(ProtocolError, match="deferred: expected a bool, found a int"):
         decode(b"\x9a" + encode(sure)[1:] + b"\x01")
 
 

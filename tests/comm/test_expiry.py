@@ -20,10 +20,9 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.run.node_status import ask_all
-from petrobot.services.comm.calls.callee import Callee, Offer
+from petrobot.services.comm.calls.callee import Callee, Offer, Order
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.orders import Order
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m
@@ -91,12 +90,12 @@ def test_spoilt_certificates_are_a_value_error_or_a_time(
 ) -> None:
     """Cut off it is always refused; changed it may still be one; nothing else ever leaves."""
     for spoilt in (body, real[:cut], b"\x30\x82" + body):
-        with pytest.raises(ValueError, match="no certificate that can be read"):
+        with pytest.raises(ValueError, match="expected a PEM certificate"):
             ends_of(ssl.DER_cert_to_PEM_cert(spoilt))
     try:
         ends_of(ssl.DER_cert_to_PEM_cert(real[:at] + bytes([byte]) + real[at + 1 :]))
     except ValueError as fault:
-        assert "no certificate that can be read" in str(fault)
+        assert "expected a PEM certificate" in str(fault)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +103,7 @@ def test_spoilt_certificates_are_a_value_error_or_a_time(
     ["", "x" * 30, "-----BEGIN CERTIFICATE-----", "-----BEGIN CERTIFICATE-----\n!\n-----END"],
 )
 def test_what_is_no_certificate_is_a_value_error(text: str) -> None:
-    with pytest.raises(ValueError, match="no certificate that can be read"):
+    with pytest.raises(ValueError, match="expected a PEM certificate"):
         ends_of(text)
 
 
@@ -113,11 +112,11 @@ def test_what_is_no_certificate_is_a_value_error(text: str) -> None:
     [
         (SOON + DAY, ""),
         (SOON + timedelta(seconds=1), ""),
-        (SOON, "ends in 30 days, on "),
-        (timedelta(days=7, hours=1), "ends in 7 days, on "),
-        (timedelta(hours=3), "ends within two days, on "),
-        (timedelta(0), "ended on "),
-        (-timedelta(days=3), "ended on "),
+        (SOON, "expires in 30 days, on "),
+        (timedelta(days=7, hours=1), "expires in 7 days, on "),
+        (timedelta(hours=3), "expires within two days, on "),
+        (timedelta(0), "expired on "),
+        (-timedelta(days=3), "expired on "),
     ],
 )
 def test_what_is_said_a_month_before_and_after(tmp_path: Path, left: timedelta, says: str) -> None:
@@ -140,7 +139,7 @@ def test_each_end_is_said_once_and_with_the_files_remedy(
     proves.client()
     said = capsys.readouterr().err.splitlines()
     assert len(said) == 1 and said[0].startswith(
-        f"{folder / 'vision.pem'}: this certificate ends in "
+        f"{folder / 'vision.pem'}: this certificate expires in "
     )
     assert (
         "`petrobot keys --tls keys`" in said[0] and "copy vision.pem and vision.key here" in said[0]
@@ -149,9 +148,9 @@ def test_each_end_is_said_once_and_with_the_files_remedy(
     assert capsys.readouterr().err == "", "it was said"
     expiry.look_again(NOW + 10 * DAY)
     expiry.look_again(NOW + 11 * DAY)
-    assert capsys.readouterr().err.count("this certificate ended on") == 1
+    assert capsys.readouterr().err.count("this certificate expired on") == 1
     expiry.look_again(NOW - LIFE + CA_LIFE)
-    assert "ca.pem: this certificate ends in" in (said := [capsys.readouterr().err])[0]
+    assert "ca.pem: this certificate expires in" in (said := [capsys.readouterr().err])[0]
     assert "make a new authority" in said[0] and "another folder" in said[0]
 
 
@@ -200,7 +199,7 @@ def test_no_certificate_outlives_the_authority_and_one_that_ends_is_replaced_as_
     make_certificates(tmp_path, ["motion"], NOW + CA_LIFE - LIFE / 2)
     assert ends_of((tmp_path / "motion.pem").read_text()) == NOW + CA_LIFE
     with pytest.raises(
-        CertificateError, match=r"ca\.pem: the authority ends soon.*name of another folder"
+        CertificateError, match=r"ca\.pem: the authority expires soon.*name of another folder"
     ):
         make_certificates(tmp_path, ["arm"], NOW + CA_LIFE - SOON)
     assert not (tmp_path / "arm.pem").exists()
@@ -258,12 +257,14 @@ async def test_ended_certificates_are_named_as_the_reason(
         await client.close()
     if node_left < own_left:
         assert (
-            "the certificate of vision, or its authority's, has ended; make it anew"
+            "the certificate of vision, or that of its authority, has expired; make a new one"
             in client.trouble
         )
     else:
-        assert "has ended" in client.trouble
-        assert f"{folder / 'coordinator.pem'}: this certificate ended on" in capsys.readouterr().err
+        assert "has expired" in client.trouble
+        assert (
+            f"{folder / 'coordinator.pem'}: this certificate expired on" in capsys.readouterr().err
+        )
 
 
 async def test_nodes_shows_when_the_certificate_ends_that_a_node_really_shows(

@@ -16,21 +16,21 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.calls.active import Patience
 from petrobot.services.comm.calls.caller import (
-    Accepted,
+    CallAccepted,
+    CallEnded,
     Caller,
-    Ended,
-    Late,
+    LateResult,
     Notice,
     PeerBack,
     PeerLost,
 )
 from petrobot.services.comm.calls.client import Client
+from petrobot.services.comm.calls.pending import Patience
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Executed
 from petrobot.services.comm.streams.stream import Incoming, StreamReceiver
-from tests.comm.fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
+from tests.comm.fault_parts import HOST, STREAM, Cable, LinkFault, first_line, inflict, part
 
 pytestmark = pytest.mark.processes
 LIMIT = 60.0
@@ -67,16 +67,20 @@ class Told:
         assert await self.client.connected(LIMIT)
         self.caller.call(self.client.now(), m.Call("1", "move"))
         self.client.flush()
-        await self.until(Accepted)
+        await self.until(CallAccepted)
 
 
 @pytest.mark.parametrize(
     ("fault", "says"),
-    [(Fault.KILLED, ("hung up", "broke")), (Fault.FROZEN, ("silent",)), (Fault.CUT, ("silent",))],
-    ids=lambda one: one.value if isinstance(one, Fault) else "",
+    [
+        (LinkFault.KILLED, ("hung up", "broke")),
+        (LinkFault.FROZEN, ("silent",)),
+        (LinkFault.CUT, ("silent",)),
+    ],
+    ids=lambda one: one.value if isinstance(one, LinkFault) else "",
 )
 async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
-    fault: Fault, says: tuple[str, ...]
+    fault: LinkFault, says: tuple[str, ...]
 ) -> None:
     with part("node") as process:
         cable = Cable(int(await asyncio.to_thread(first_line, process)))
@@ -85,7 +89,7 @@ async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
         inflict(fault, process, cable)
         lost = await told.until(PeerLost)
         assert any(one in lost.reason for one in says), lost.reason
-        ended = (await told.until(Ended)).outcome
+        ended = (await told.until(CallEnded)).outcome
         assert (ended.status, ended.cause, ended.executed) == ("error", "lost", Executed.UNKNOWN)
         assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
         await told.client.close()
@@ -102,7 +106,7 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         # Far longer than anything waits here: only the refusing port can end the run.
         told.caller._patience = told.caller._absence._patience = Patience(reconnect=2 * LIMIT)
         process.kill()
-        ended = (await told.until(Ended)).outcome
+        ended = (await told.until(CallEnded)).outcome
     assert (ended.cause, ended.executed) == (
         "lost",
         Executed.UNKNOWN,
@@ -110,7 +114,7 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
     assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
     told.caller.call(told.client.now(), m.Call("2", "move"))
     told.client.flush()
-    late = (await told.until(Ended, 2)).outcome
+    late = (await told.until(CallEnded, 2)).outcome
     assert (late.cause, late.executed) == ("unreachable", Executed.NO)
     with part("node", str(port), "n2") as again:
         await asyncio.to_thread(first_line, again)
@@ -118,7 +122,7 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         assert not back.same_boot and back.runs == (), "nothing was sent to it"
         told.caller.call(told.client.now(), m.Call("3", "move"))
         told.client.flush()
-        await told.until(Accepted, 2)
+        await told.until(CallAccepted, 2)
         await told.client.close()
     assert told.order().count("Ended") >= 2, (
         "the first two once each; the third goes on until its caller leaves"
@@ -145,11 +149,11 @@ async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -
         told = Told(int(await asyncio.to_thread(first_line, process)))
         await told.begin()
         process.send_signal(signal.SIGSTOP)
-        await told.until(Ended)
+        await told.until(CallEnded)
         process.send_signal(signal.SIGCONT)
         back = await told.until(PeerBack, 2)
         assert back.same_boot and back.runs == ("1",), "it never noticed, and the run goes on"
-        late = (await told.until(Late)).outcome
+        late = (await told.until(LateResult)).outcome
         assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), (
             "recorded, and moves nothing"
         )
@@ -194,10 +198,10 @@ def poll_until(
         assert watch.now < end, "it did not come to pass"
 
 
-@pytest.mark.parametrize("fault", Fault, ids=lambda one: one.value)
+@pytest.mark.parametrize("fault", LinkFault, ids=lambda one: one.value)
 @pytest.mark.parametrize("period", [0.004, 0.04])
 def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(
-    fault: Fault, period: float
+    fault: LinkFault, period: float
 ) -> None:
     watch = Watch()
     receiver = StreamReceiver("motion", {STREAM: Incoming(period, watch)}, clock=lambda: watch.now)
@@ -210,7 +214,7 @@ def test_no_set_point_older_than_three_periods_counts_when_its_sender_is_lost(
         ends = watch.now + 10 * period
         poll_until(receiver, watch, lambda: watch.now > ends, period)
         assert not watch.valid, "and it stays so"
-        if fault is Fault.FROZEN:
+        if fault is LinkFault.FROZEN:
             process.send_signal(signal.SIGCONT)
             poll_until(receiver, watch, lambda: len(watch.arrived) > last and watch.valid, period)
     cable.close()

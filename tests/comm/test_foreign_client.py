@@ -438,7 +438,7 @@ def test_another_node_than_the_wanted_one_refuses(hub: Hub) -> None:
     refusal = client.open("client", "lost", node="motion")
     assert (
         refusal[:2] == [f.REFUSE, "wrong_node"]
-        and "this is hub, motion was asked for" in refusal[2]
+        and "this is hub, but the client asked for motion" in refusal[2]
     )
     assert client.proven is (hub.key is not None)
 

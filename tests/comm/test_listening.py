@@ -10,8 +10,12 @@ from pathlib import Path
 import pytest
 
 from petrobot.services.__main__ import main
-from petrobot.services.comm.calls.listening import cannot_listen, listening, refuse_unusable
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.comm.location_file.host_checks import (
+    cannot_listen,
+    listening,
+    refuse_unusable,
+)
 from petrobot.services.comm.lockstep.cell import CellError
 from petrobot.services.comm.lockstep.mesh import Member
 from tests.ports import free_ports
@@ -50,11 +54,11 @@ def directory_in(folder: Path, host: str, port: int) -> Directory:
         (OSError(errno.EACCES, "denied"), "nodes.left.port: 7301 may not be used by this user"),
         (
             OSError(errno.EADDRNOTAVAIL, "no"),
-            "nodes.left.host: 10.0.0.7 is no address of this host",
+            "nodes.left.host: 10.0.0.7 is not an address of this host",
         ),
         (
             socket.gaierror(socket.EAI_NONAME, "unknown"),
-            "nodes.left.host: 10.0.0.7 is no address and no known name (unknown)",
+            "nodes.left.host: 10.0.0.7 is neither an address nor a known name (unknown)",
         ),
         (
             OSError(errno.ENETDOWN, "down"),
@@ -90,7 +94,7 @@ def test_a_foreign_address_is_the_hosts_fault(tmp_path: Path) -> None:
     directory = directory_in(tmp_path, "192.0.2.1", 7301)
     with pytest.raises(
         DirectoryError,
-        match=r"services\.toml: nodes\.left\.host: 192\.0\.2\.1 is no address of this host",
+        match=r"services\.toml: nodes\.left\.host: 192\.0\.2\.1 is not an address of this host",
     ):
         refuse_unusable(directory, "left")
     with (

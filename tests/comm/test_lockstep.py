@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.lockstep.cell import Cell, CellError, Delays
+from petrobot.services.comm.lockstep.cell import CellError, Delays, LockStepCell
 from petrobot.services.comm.lockstep.mesh import Member, PartyLostError
 from petrobot.services.comm.lockstep.party import TICK, Envelope, Party, Posted
 from petrobot.services.comm.protocol import messages as m
@@ -79,7 +79,7 @@ def _in_threads(members: Sequence[Callable[[], Any]]) -> list[Any]:
 
 def _cell(scripts: Any, delays: Any) -> dict[str, list[str]]:
     toys = [Toy(name, scripts[name]) for name in NAMES]
-    Cell(toys, Delays(delays)).run(lambda: False, TICKS)
+    LockStepCell(toys, Delays(delays)).run(lambda: False, TICKS)
     return {toy.name: toy.heard for toy in toys}
 
 
@@ -164,7 +164,7 @@ def test_one_process_and_four_hear_the_same(seed: int) -> None:
         assert answer["ticks"] == ticks
         heard[name] = answer["heard"]
     toys = [Toy(name, scripts[name]) for name in NAMES]
-    Cell(toys, Delays(delays)).run(lambda: False, ticks)
+    LockStepCell(toys, Delays(delays)).run(lambda: False, ticks)
     assert heard == {toy.name: toy.heard for toy in toys}
     assert sum(map(len, heard.values())) > 100
 
@@ -203,7 +203,7 @@ def test_envelopes_arrive_in_the_order_of_tick_source_and_sequence() -> None:
         (2, _envelope("a", "y")),
     ]
     b = Post("b")
-    cell = Cell([Post("c", sends), b], Delays({"image": 2}))
+    cell = LockStepCell([Post("c", sends), b], Delays({"image": 2}))
     assert cell.run(lambda: cell.tick == 4, 100)
     assert b.got == [
         (2, "z", "slow"),
@@ -233,7 +233,7 @@ def test_moving_an_endpoint_to_another_party_changes_nothing(
             )
             for party in "bcd"
         }
-        Cell(list(posts.values())).run(lambda: False, 9)
+        LockStepCell(list(posts.values())).run(lambda: False, 9)
         heard.append(posts["b"].got)
     assert heard[0] == heard[1]
 
@@ -255,7 +255,7 @@ def test_a_delay_below_a_tick_is_refused(ticks: Any) -> None:
 def test_bodies_arrive_as_from_another_process_and_are_nobody_elses() -> None:
     body = {"list": [1, (2, 3)], "text": "x"}
     b = Post("b")
-    Cell([Post("c", [(0, _envelope("z", body))]), b]).run(lambda: False, 2)
+    LockStepCell([Post("c", [(0, _envelope("z", body))]), b]).run(lambda: False, 2)
     assert b.got == [(1, "z", {"list": (1, (2, 3)), "text": "x"})]
     assert b.got[0][2] is not body
 
@@ -266,7 +266,7 @@ def test_bodies_arrive_as_from_another_process_and_are_nobody_elses() -> None:
         ([Post("b"), Post("b")], "two parties are named b"),
         (
             [Post("c", [(0, _envelope("z", object()))]), Post("b")],
-            "z sends there on control what no envelope carries",
+            "z sends data to there on control that cannot be sent",
         ),
         ([Post("c", [(0, _envelope("z", {1: 2}))]), Post("b")], "a key of a map is not a str"),
         (
@@ -281,7 +281,7 @@ def test_bodies_arrive_as_from_another_process_and_are_nobody_elses() -> None:
 )
 def test_mistakes_of_parties_are_named(posts: list[Party], says: str) -> None:
     with pytest.raises(CellError, match=says):
-        Cell(posts).run(lambda: False, 2)
+        LockStepCell(posts).run(lambda: False, 2)
 
 
 # How a cell ends.
@@ -337,9 +337,9 @@ def test_a_failing_party_is_named_to_the_others() -> None:
 
 def test_a_member_that_never_comes_is_named() -> None:
     listeners, addresses = _listeners(["a", "b"])
-    with pytest.raises(PartyLostError, match=r"b: it did not join the cell in 0\.1 s"):
+    with pytest.raises(PartyLostError, match=r"b: it did not join the cell within 0\.1 s"):
         Member("a", [Post("a")], addresses, listener=listeners["a"], joining=0.1).open()
-    with pytest.raises(PartyLostError, match="a: nobody answers on 127"):
+    with pytest.raises(PartyLostError, match="a: no process answers at 127"):
         Member("b", [Post("b")], addresses, listener=listeners["b"], joining=0.1).open()
 
 
@@ -353,24 +353,24 @@ def _join(address: tuple[str, int], name: str = "b", directory: str = "") -> soc
 @pytest.mark.parametrize(
     ("rest", "says"),
     [
-        pytest.param(None, r"no end of tick 0 for 0\.3 s: lost", id="silent"),
-        pytest.param(b"", "its process ended without a word", id="gone"),
-        pytest.param(frame(m.Tick(1)), "tick 1 came after tick -1", id="tick left out"),
+        pytest.param(None, r"it did not finish tick 0 within 0\.3 s", id="silent"),
+        pytest.param(b"", "its process ended without a BYE", id="gone"),
+        pytest.param(frame(m.Tick(1)), "expected tick 0, got tick 1", id="tick left out"),
         pytest.param(
             b"\x00\x00\x00\x02\xff\xff", "it broke the protocol: malformed", id="random bytes"
         ),
-        pytest.param(frame(m.Ping(1)), "a Ping has no place in lock step", id="another kind"),
+        pytest.param(frame(m.Ping(1)), "a Ping is not allowed in lock step", id="another kind"),
         pytest.param(
             frame(m.Refuse("failed", "it failed: no luck")), "b: it failed: no luck", id="failed"
         ),
         pytest.param(
             frame(m.Tick(0, (Posted(0, 0, _envelope("z", 1, party="a")),))),
-            "does not belong here",
+            "is late or misdirected",
             id="due at once",
         ),
         pytest.param(
             frame(m.Tick(0, (Posted(1, 0, _envelope("z", 1, party="q")),))),
-            "does not belong here",
+            "is late or misdirected",
             id="not for a",
         ),
     ],

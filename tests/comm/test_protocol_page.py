@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.calls.active import Patience
-from petrobot.services.comm.calls.link import Timing
-from petrobot.services.comm.calls.results import Keeping
+from petrobot.services.comm.calls.link import LinkTiming
+from petrobot.services.comm.calls.pending import Patience
+from petrobot.services.comm.calls.runs import Retention
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS
 from tests.comm.conftest import KINDS
@@ -19,7 +19,9 @@ from tests.comm.ends import frame
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 ROWS = {
     int(row[1]): row
-    for row in re.finditer(r"^\| (\d+) (\w+) \| (\w+) \| (.*) \| ([\d]+ \w+) \|$", PAGE, re.M)
+    for row in re.finditer(
+        r"^ ?(\d+) ([A-Z_]+) +(C|S|both) +(\d+ \w+) *(.*(?:\n {20,}.*)*)$", PAGE, re.M
+    )
 }
 UNITS = {"B": 1, "KiB": 1024, "MiB": 1024 * 1024}
 SERVICES = Path(m.__file__).parents[2]
@@ -31,7 +33,7 @@ def test_the_table_of_messages(kind: type[m.Message]) -> None:
     row = ROWS[kind.KIND]
     fields = [field.name for field in dataclasses.fields(kind)]
     assert (
-        re.findall(r"(\w+) (?:str|int|dur|bool|bytes|map|\*text\*|\[\w+\])(?=[ ,)]|$)", row[4])
+        re.findall(r"(\w+) (?:str|int|dur|bool|bytes|map|\*text\*|\[\w+\])(?=[ ,)]|$)", row[5])
         == fields
     )
     required = [
@@ -39,8 +41,8 @@ def test_the_table_of_messages(kind: type[m.Message]) -> None:
         for field in dataclasses.fields(kind)
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
     ]
-    assert [name for name in fields if f"({name}" not in row[4]] == required
-    number, unit = row[5].split()
+    assert [name for name in fields if f"({name}" not in row[5]] == required
+    number, unit = row[4].split()
     assert int(number) * UNITS[unit] == LIMITS[kind.KIND]
 
 
@@ -66,21 +68,26 @@ def test_the_codes_and_causes_are_the_codes() -> None:
 
 
 def test_the_times() -> None:
-    assert (Timing().heartbeat, Timing().silence, Timing().handshake, Timing().user_timeout) == (
+    assert (
+        LinkTiming().heartbeat,
+        LinkTiming().silence,
+        LinkTiming().handshake,
+        LinkTiming().user_timeout,
+    ) == (
         0.25,
         1.0,
         2.0,
         1.5,
     )
     assert (Patience().reconnect, Patience().accept, Patience().stop) == (2.0, 1.0, 5.0)
-    assert (Keeping().results, Keeping().result_count, Keeping().lease) == (600.0, 1_000, 2.0)
-    assert Keeping().id_groups == 100_000
+    assert (Retention().results, Retention().result_count, Retention().lease) == (600.0, 1_000, 2.0)
+    assert Retention().id_groups == 100_000
     for said in (
         "after 0.25 s",
         "for 1.0 s",
-        "there are 2 s",
+        "There are 2 s",
         "(1.5 s)",
         "for 10 minutes (at most 1,000",
         "100,000 groups of 4,096",
     ):
-        assert said in PAGE
+        assert said in " ".join(PAGE.split())

@@ -137,5 +137,5 @@ def test_one_that_does_not_come_back_is_lost_after_its_absence() -> None:
     assert (
         not thread.is_alive()
         and failures
-        and failures[0].startswith("coordinator: nobody answers on 127.0.0.1")
+        and failures[0].startswith("coordinator: no process answers at 127.0.0.1")
     )

@@ -15,12 +15,17 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.security import KeyNeededError
-from petrobot.services.comm.streams.line import Lateness
-from petrobot.services.comm.streams.stream import Incoming, Inlet, StreamReceiver, StreamSender
+from petrobot.services.comm.streams.stream import (
+    Incoming,
+    Inlet,
+    Lateness,
+    StreamReceiver,
+    StreamSender,
+)
 from tests.comm.ends import frame, framed
 
 
-class Sink:
+class RecordingSink:
     """Writes down what it is given; None for a withdrawal."""
 
     def __init__(self) -> None:
@@ -38,7 +43,7 @@ def _point(number: int, elapsed: float = 0.0, held: float = 0.0) -> m.SetPoint:
 
 
 def test_the_newest_wins_and_the_others_are_never_seen() -> None:
-    sink = Sink()
+    sink = RecordingSink()
     inlet = Inlet(0.1, sink)
     inlet.receive(1.0, [_point(1), _point(2), _point(3, held=0.04)])
     inlet.receive(1.1, [])
@@ -48,7 +53,7 @@ def test_the_newest_wins_and_the_others_are_never_seen() -> None:
 
 
 def test_what_was_held_up_on_its_way_is_as_old_as_it_is() -> None:
-    sink = Sink()
+    sink = RecordingSink()
     inlet = Inlet(0.04, sink)
     for n in range(5):
         inlet.receive(100.0 + n * 0.04, [_point(n, elapsed=n * 0.04)])
@@ -96,12 +101,12 @@ def test_a_drifting_clock_does_not_make_an_hour_old_stream_late() -> None:
 
 
 @pytest.fixture
-def sink() -> Sink:
-    return Sink()
+def sink() -> RecordingSink:
+    return RecordingSink()
 
 
 @pytest.fixture
-def receiver(sink: Sink, key: bytes | None) -> Iterator[StreamReceiver]:
+def receiver(sink: RecordingSink, key: bytes | None) -> Iterator[StreamReceiver]:
     one = StreamReceiver("motion", {"catch_point": Incoming(0.04, sink, "t1")}, key=key)
     yield one
     one.close()
@@ -125,7 +130,7 @@ def _until(condition: Callable[[], bool], *steps: Callable[[], object]) -> None:
 
 
 def test_a_stream_from_its_first_value_to_its_end(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     assert not sender.send((0.0,)), "not connected yet: dropped, a newer one follows"
     _until(lambda: sender.up, sender.advance, receiver.poll)
@@ -142,7 +147,7 @@ def test_a_stream_from_its_first_value_to_its_end(
 
 
 def test_a_sender_that_is_gone_stands_by_nothing(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     assert sender._line is not None
@@ -151,7 +156,7 @@ def test_a_sender_that_is_gone_stands_by_nothing(
 
 
 def test_a_receiver_that_comes_back_is_found_again(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     host, port = receiver.address
@@ -165,7 +170,7 @@ def test_a_receiver_that_comes_back_is_found_again(
 
 
 def test_the_newest_sender_of_a_stream_takes_it_over(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, key: bytes | None
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     other = StreamSender(
@@ -190,7 +195,7 @@ def test_the_newest_sender_of_a_stream_takes_it_over(
     ],
 )
 def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
-    sink: Sink,
+    sink: RecordingSink,
     receiver: StreamReceiver,
     key: bytes | None,
     stream: str,
@@ -208,7 +213,7 @@ def test_a_stream_that_does_not_fit_is_refused_with_the_reason(
 
 
 @pytest.mark.parametrize("key", [b"k" * 32], indirect=True, ids=["sealed"])
-def test_a_sender_without_the_key_is_refused(sink: Sink, receiver: StreamReceiver) -> None:
+def test_a_sender_without_the_key_is_refused(sink: RecordingSink, receiver: StreamReceiver) -> None:
     for wrong in (None, b"x" * 32):
         sender = StreamSender(
             "vision",
@@ -243,7 +248,7 @@ MALFORMED = [
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
 @pytest.mark.parametrize("said", MALFORMED)
 def test_malformed_set_points_end_their_connection_alone(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender, said: list[bytes]
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender, said: list[bytes]
 ) -> None:
     with socket.create_connection(receiver.address) as sock:
         for data in said:
@@ -263,7 +268,7 @@ def _is_served(receiver: StreamReceiver) -> bool:
 
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
 def test_many_idle_connections_do_not_keep_a_sender_out(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     idle = [socket.create_connection(receiver.address) for _ in range(40)]
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
@@ -274,7 +279,7 @@ def test_many_idle_connections_do_not_keep_a_sender_out(
 
 @pytest.mark.parametrize("key", [None], indirect=True, ids=["plain"])
 def test_a_receiver_that_stands_still_never_blocks_its_sender_and_sees_the_newest_after(
-    sink: Sink, receiver: StreamReceiver, sender: StreamSender
+    sink: RecordingSink, receiver: StreamReceiver, sender: StreamSender
 ) -> None:
     _until(lambda: bool(sink.got), lambda: sender.send((1.0,)), receiver.poll)
     for n in range(20_000):

@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import LIMITS, decode, encode
 from petrobot.services.comm.protocol.security import Keys
-from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side, State, negotiate
+from petrobot.services.comm.protocol.wire import (
+    Connection,
+    ConnectionState,
+    ProtocolError,
+    Side,
+    negotiate,
+)
 from tests.comm.conftest import KEY, KINDS, NONCES, SERVER, greet, messages_of, new_pair
 from tests.comm.ends import framed, head
 from tests.waiting import Limit
@@ -156,8 +162,8 @@ def test_byte_by_byte_handshake_and_call(key: bytes | None, pair: Pair) -> None:
         towards_server += client.data_to_send()
     assert [type(message) for message in seen] == [m.Hello, m.Welcome, m.Call]
     assert (
-        client.state is State.OPEN
-        and server.state is State.OPEN
+        client.state is ConnectionState.OPEN
+        and server.state is ConnectionState.OPEN
         and client.version == server.version == 2
     )
 
@@ -181,7 +187,7 @@ def test_random_bytes_raise_nothing_but_protocol_error(
         try:
             victim.receive_data(piece)
         except ProtocolError:
-            assert victim.state is State.CLOSED
+            assert victim.state is ConnectionState.CLOSED
             assert victim.receive_data(b"anything more") == []
             return
 
@@ -279,11 +285,11 @@ def test_nothing_follows_a_last_word(open_pair: Pair) -> None:
     for last in (m.Bye("done"), m.Refuse("x", "y")):
         client, server = open_pair(None)
         data = client.send(last)
-        assert client.state is State.CLOSING
+        assert client.state is ConnectionState.CLOSING
         with pytest.raises(ProtocolError, match="out_of_turn"):
             client.send(m.Ping(1))
         assert server.receive_data(data + _raw(m.Ping(1))) == [last]
-        assert server.state is State.CLOSED
+        assert server.state is ConnectionState.CLOSED
         assert server.receive_data(_raw(m.Ping(2))) == []
         assert client.receive_data(_raw(m.Pong(2))) == []
 
@@ -317,7 +323,7 @@ def test_a_refusal_reaches_a_client_that_is_opening(key: bytes | None, pair: Pai
         server.receive_data(client.data_to_send())
     refusal = m.Refuse("directory", "copy the file")
     assert client.receive_data(server.send(refusal)) == [refusal]
-    assert client.state is State.CLOSED and server.state is State.CLOSING
+    assert client.state is ConnectionState.CLOSED and server.state is ConnectionState.CLOSING
 
 
 @pytest.mark.parametrize(
@@ -437,7 +443,7 @@ def test_a_sealed_frame_moved_or_changed_is_refused(tamper: Tamper, open_pair: P
     with pytest.raises(ProtocolError, match=r"bad_seal|malformed"):
         for frame in tamper(frames):
             server.receive_data(frame)
-    assert server.state is State.CLOSED
+    assert server.state is ConnectionState.CLOSED
 
 
 def test_a_frame_cannot_be_sent_back_to_its_sender(open_pair: Pair) -> None:
@@ -469,7 +475,7 @@ def test_a_server_of_another_name_refuses_and_seals_its_refusal(key: bytes | Non
     client = Connection(Side.CLIENT, "motion", key=key, nonce=NONCES[Side.CLIENT] if key else b"")
     server = Connection(Side.SERVER, "vision", key=key, nonce=NONCES[Side.SERVER] if key else b"")
     with pytest.raises(
-        ProtocolError, match="wrong_node: this is vision, motion was asked for"
+        ProtocolError, match="wrong_node: this is vision, but the client asked for motion"
     ) as fault:
         server.receive_data(client.send(HELLO))
         client.receive_data(server.data_to_send())
@@ -486,7 +492,9 @@ def test_a_welcome_of_another_name_is_refused_though_its_proof_is_good(
     if server.receive_data(client.send(HELLO)) == []:
         client.receive_data(server.data_to_send())
         server.receive_data(client.data_to_send())
-    with pytest.raises(ProtocolError, match="wrong_node: this is motion, vision was asked for"):
+    with pytest.raises(
+        ProtocolError, match="wrong_node: this is motion, but the client asked for vision"
+    ):
         client.receive_data(server.send(m.Welcome(2, "motion", "b1")))
     assert client.version == 0
 
@@ -517,7 +525,7 @@ def test_a_refusal_without_the_seal_is_not_proven(when: str, sealed: bool, pair:
     assert client.receive_data(len(body).to_bytes(4, "big") + body) == [
         m.Refuse("old_epoch", "go away")
     ]
-    assert not client.proven and client.state is State.CLOSED
+    assert not client.proven and client.state is ConnectionState.CLOSED
 
 
 def test_two_keys_are_accepted_while_one_takes_the_place_of_the_other() -> None:

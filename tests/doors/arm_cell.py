@@ -16,8 +16,8 @@ from petrobot.services.comm.canopen.byte_stream import connect
 from petrobot.services.comm.canopen.cia402 import (
     RECEIVED,
     SENT,
-    Command,
-    State,
+    DriveCommand,
+    DriveState,
     command_of,
     state_of,
 )
@@ -142,9 +142,9 @@ class Ear:
         self._over = threading.Event()
         self._changed = threading.Condition()
         self._rpdo, self._tpdo = canopen.pdo_struct(RECEIVED), canopen.pdo_struct(SENT)
-        self.commands: dict[int, Command | None] = {}
+        self.commands: dict[int, DriveCommand | None] = {}
         """Newest command to each drive."""
-        self.states: dict[int, State] = {}
+        self.states: dict[int, DriveState] = {}
         self.nmt: dict[int, int] = {}
         """NMT state of each node, as its heartbeat shows it."""
         self.positions: dict[int, int] = {}
@@ -177,9 +177,9 @@ class Ear:
             abs(self.positions[n] - self._origin.get(n, self.positions[n])) > 20_000
             for n in self.positions
         ]
-        return self.all_in(State.OPERATION_ENABLED) and any(far)
+        return self.all_in(DriveState.OPERATION_ENABLED) and any(far)
 
-    def all_in(self, state: State) -> bool:
+    def all_in(self, state: DriveState) -> bool:
         """Whether all drives are in this state."""
         return [self.states.get(n) for n in DRIVES] == [state] * len(DRIVES)
 
@@ -211,12 +211,15 @@ class Ear:
         if base == canopen.RPDO1_BASE and node in DRIVES:
             word, _ = self._rpdo.unpack(frame.data)
             self.commands[node] = command_of(word)
-            if self.commands[node] is Command.QUICK_STOP and self.quick_stop_at is None:
+            if self.commands[node] is DriveCommand.QUICK_STOP and self.quick_stop_at is None:
                 self.quick_stop_at = now
         elif base == canopen.TPDO1_BASE and node in DRIVES:
             status, self.positions[node], _ = self._tpdo.unpack(frame.data)
             self.states[node] = state_of(status)
-            self.energised += self.states[node] in (State.SWITCHED_ON, State.OPERATION_ENABLED)
+            self.energised += self.states[node] in (
+                DriveState.SWITCHED_ON,
+                DriveState.OPERATION_ENABLED,
+            )
         elif base == canopen.HEARTBEAT_BASE and frame.data:
             self.nmt[node] = frame.data[0]
 

@@ -15,8 +15,8 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from petrobot.services.comm.calls.callee import Callee, Keeping, Offer
-from petrobot.services.comm.calls.link import Limits, Timing
+from petrobot.services.comm.calls.callee import Callee, Offer, Retention
+from petrobot.services.comm.calls.link import LinkLimits, LinkTiming
 from petrobot.services.comm.calls.server import Server
 from petrobot.services.comm.protocol.messages import Call, Outcome
 from petrobot.services.comm.tls.credentials import Credentials
@@ -39,10 +39,13 @@ def build(settings: dict[str, Any]) -> Server:
         "big": Offer(inline=big),
         "tune": Offer(scope="local", inline=echo),
     }
-    callee = Callee("vision", "v1", offers, keeping=Keeping(**settings.get("keeping", {})))
+    callee = Callee("vision", "v1", offers, keeping=Retention(**settings.get("keeping", {})))
     key = bytes.fromhex(settings["key"]) if "key" in settings else None
     proves = Credentials("vision", key, Path(settings["folder"]) if "folder" in settings else None)
-    timing, limits = Timing(**settings.get("timing", {})), Limits(**settings.get("limits", {}))
+    timing, limits = (
+        LinkTiming(**settings.get("timing", {})),
+        LinkLimits(**settings.get("limits", {})),
+    )
     return Server(callee, key=proves.key, tls=proves.server(), timing=timing, limits=limits)
 
 

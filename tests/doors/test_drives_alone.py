@@ -15,7 +15,7 @@ import pytest
 
 from petrobot.coordinator.launch import local_programs
 from petrobot.coordinator.run.supervisor import Supervisor
-from petrobot.services.comm.canopen.cia402 import Fault, State, state_of
+from petrobot.services.comm.canopen.cia402 import DriveFault, DriveState, state_of
 from tests.doors.arm_cell import DRIVES, cell_in, ear_on
 from tests.doors.test_estop import LIMIT, Cell
 
@@ -60,7 +60,7 @@ class Bench:
         self._network.disconnect()
 
 
-def left_alone(channel: str) -> tuple[list[State], list[int], list[int], list[int]]:
+def left_alone(channel: str) -> tuple[list[DriveState], list[int], list[int], list[int]]:
     """States and error codes once every drive has faulted, and positions at two times a quarter of
     a second apart."""
     with warnings.catch_warnings():
@@ -70,7 +70,7 @@ def left_alone(channel: str) -> tuple[list[State], list[int], list[int], list[in
         try:
             for _ in range(int(LIMIT / 0.05)):
                 states = [state_of(word) for word in bench.read(STATUSWORD)]
-                if all(state is State.FAULT for state in states):
+                if all(state is DriveState.FAULT for state in states):
                     break
                 pause.wait(0.05)
             codes = bench.read(ERROR_CODE)
@@ -100,6 +100,6 @@ async def test_drives_stop_by_themselves_when_their_master_is_killed(tmp_path: P
                 if cell.coordinator is not None:
                     cell.coordinator.kill()
                     cell.coordinator.communicate()
-    assert states == [State.FAULT] * len(DRIVES)
-    assert set(codes) <= {Fault.HEARTBEAT, Fault.SYNC_LOST}
+    assert states == [DriveState.FAULT] * len(DRIVES)
+    assert set(codes) <= {DriveFault.HEARTBEAT, DriveFault.SYNC_LOST}
     assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 200, "0.2 mrad: they stand"

@@ -23,7 +23,7 @@ from petrobot.coordinator.operator.emergency_stop import still_stopped
 from petrobot.coordinator.run.folder import NoRunError
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.canopen.cia301 import NmtState
-from petrobot.services.comm.canopen.cia402 import State
+from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
 from tests.doors.arm_cell import DRIVES, ROOT, Ear, cell_in, ear_on
 from tests.waiting import Limit, beat
@@ -108,7 +108,9 @@ class Cell:
 
 def without_power(ear: Ear) -> bool:
     """Whether no drive has power: a drive whose master dies is in FAULT until it is reset."""
-    return all(ear.states.get(n) in (State.SWITCH_ON_DISABLED, State.FAULT) for n in DRIVES)
+    return all(
+        ear.states.get(n) in (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT) for n in DRIVES
+    )
 
 
 @asynccontextmanager
@@ -142,14 +144,16 @@ async def test_estop_stops_the_drives_though_the_coordinator_is_frozen(tmp_path:
         assert (code, node["node"], set(node["devices"])) == (0, "motion", {"arm"})
         assert told["coordinator"].endswith("the coordinator does not answer")
         await cell.heard(lambda ear: ear.quick_stop_at is not None)
-        await cell.heard(lambda ear: ear.all_in(State.SWITCH_ON_DISABLED))
+        await cell.heard(lambda ear: ear.all_in(DriveState.SWITCH_ON_DISABLED))
         await cell.standing()
         cell.coordinator.send_signal(signal.SIGCONT)
         code, _, _ = await finished(cell.coordinator)
         assert code == 1, "the task's own recovery must not have moved the arm"
-        assert cell.ear.all_in(State.SWITCH_ON_DISABLED)
+        assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED)
         assert (await cell.estop("--clear"))[0] == 0
-        assert cell.ear.all_in(State.SWITCH_ON_DISABLED), "clearing alone moves and enables nothing"
+        assert cell.ear.all_in(DriveState.SWITCH_ON_DISABLED), (
+            "clearing alone moves and enables nothing"
+        )
         await (
             cell.sweep()
         )  # by way of the task's error branch: drives are reset by an action, not by themselves

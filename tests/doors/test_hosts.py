@@ -294,7 +294,7 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
         )
         assert stranger.returncode == 3 and "motion" in stranger.stderr
         assert (
-            "its certificate is not that of" if how == "certificates" else "wrong_key"
+            "expected the certificate of" if how == "certificates" else "wrong_key"
         ) in stranger.stderr
     assert token["page token"] and cell.secrets()
     assert list(tmp_path.glob("logs/*.log")) and (tmp_path / "report" / "index.html").exists()

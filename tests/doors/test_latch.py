@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.calls.latch import ALL, STATE, Latch, LatchError, latch_of
+from petrobot.services.host.emergency_latch import ALL, STATE, Latch, LatchError, latch_of
 from petrobot.services.node.emergency_stops import LOOK, NEVER, EmergencyStops
 
 DEVICES = ("arm", "camera", "gripper")
@@ -71,14 +71,16 @@ def test_a_stop_that_cannot_be_kept_is_said_and_holds_all_the_same(tmp_path: Pat
     stuck.paths[0].mkdir(parents=True)
     stops = EmergencyStops(DEVICES, stuck)
     stops.at_start()
-    assert "remove it by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
+    assert (
+        "remove this file by hand once the cell is safe" in stops.clear(["arm"]) and "arm" in stops
+    )
 
 
 def test_a_node_that_can_keep_no_latch_comes_up_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It cannot know whether it was stopped: no file is no proof where none can be."""
-    monkeypatch.setattr("petrobot.services.comm.calls.latch._writable", lambda folder: False)
+    monkeypatch.setattr("petrobot.services.host.emergency_latch._writable", lambda folder: False)
     stops = EmergencyStops(DEVICES, latch(tmp_path))
     assert stops.at_start() == list(DEVICES)
     assert stops.clear(DEVICES) == "" and stops.names == (), (

@@ -42,7 +42,7 @@ def test_certificates_do_not_reach_over_hosts_in_lock_step(
     ):
         cell_key(directory)
     setting = Setting(load_task(TASK))
-    with pytest.raises(KeyNeededError, match="crosses no TLS"):
+    with pytest.raises(KeyNeededError, match="does not use TLS"):
         lockstep_member(directory, lockstep_mission(directory, setting))
     given = [
         "--services",
@@ -55,7 +55,7 @@ def test_certificates_do_not_reach_over_hosts_in_lock_step(
         "--quiet",
     ]
     assert main(["run", str(TASK), *given]) == 2
-    assert "crosses no TLS" in capsys.readouterr().err
+    assert "does not use TLS" in capsys.readouterr().err
 
 
 def test_on_loopback_certificates_need_no_key_and_a_shared_key_goes_anywhere(

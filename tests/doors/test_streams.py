@@ -15,13 +15,12 @@ import pytest
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.canopen.ports import StreamPort
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.protocol.security import new_key, write_key
 from petrobot.services.comm.streams.camera import ImageServer, StreamImages
-from petrobot.services.comm.streams.line import Incoming
-from petrobot.services.comm.streams.stream import StreamReceiver, StreamSender
+from petrobot.services.comm.streams.stream import Incoming, StreamReceiver, StreamSender
 from petrobot.services.comm.tls.certificates import make_certificates
 from petrobot.services.comm.tls.credentials import credentials
 from tests.node.test_processes import CELL, Nodes, Operator
@@ -152,7 +151,7 @@ def test_unprotected_streams_stay_on_this_host(host: str) -> None:
     with pytest.raises(ValueError, match="images are not protected"):
         ImageServer(host, 0)
     with pytest.raises(ValueError, match="the stream is not protected"):
-        Hub(f"tcp://[{host}]:0" if ":" in host else f"tcp://{host}:0")
+        CanHub(f"tcp://[{host}]:0" if ":" in host else f"tcp://{host}:0")
 
 
 def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
@@ -184,7 +183,7 @@ def test_a_crowd_at_the_camera_leaves_the_good_receiver_its_images() -> None:
 
 def test_a_crowd_at_the_simulated_bus_leaves_the_good_ports_their_frames() -> None:
     """Ports are bounded; those that are there go on."""
-    hub = Hub()
+    hub = CanHub()
     near, far = hub.port(), StreamPort(hub.channel)
     hub.poll(1.0)
     address = ("127.0.0.1", int(hub.channel.rpartition(":")[2]))

@@ -15,10 +15,9 @@ import pytest
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.journal import MAGIC, PREFIX, read_journal
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.caller import CallEnded, Caller, Notice
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.notices import Ended, Notice
-from petrobot.services.comm.calls.results import Keeping
+from petrobot.services.comm.calls.runs import Retention
 from petrobot.services.comm.location_file import load
 from petrobot.services.comm.protocol.messages import Call, Hello
 from tests.chaos.shuttle_cell import TASK, moves, shuttle_services
@@ -45,7 +44,7 @@ async def _flood(node: str, port: int, ids: Callable[[int], str], calls: int) ->
 
     def count(_: float, notices: list[Notice]) -> None:
         nonlocal left
-        left -= sum(isinstance(notice, Ended) for notice in notices)
+        left -= sum(isinstance(notice, CallEnded) for notice in notices)
         if left <= 0:
             over.set()
 
@@ -85,7 +84,7 @@ def _without_accepts(path: Path) -> None:
         pytest.param(lambda n: f"flood/{n}", 202_500, id="counted ids", marks=pytest.mark.proof),
         pytest.param(
             lambda n: f"{n} flood",
-            Keeping().id_groups + 2_500,
+            Retention().id_groups + 2_500,
             id="ids without order",
             marks=pytest.mark.proof,
         ),

@@ -12,7 +12,7 @@ from petrobot.coordinator.run.interfaces import FirstAlternative
 from petrobot.coordinator.run.lockstep import CoordinatorParty
 from petrobot.coordinator.task.file import load
 from petrobot.services.comm.location_file import load as load_directory
-from petrobot.services.comm.lockstep.cell import Cell, Delays
+from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
 
 ROOT = Path(__file__).parents[2]
 TASK = ROOT / "coordinator" / "tasks" / "follow_track.toml"
@@ -29,7 +29,7 @@ def run(
     setting = Setting(load(TASK), {"regime": regime}, None, seed, FirstAlternative(use))
     party = CoordinatorParty(directory, lockstep_mission(directory, setting))
     nodes = {node.name: lockstep_party(directory, node) for node in directory.nodes.values()}
-    cell = Cell([party, *nodes.values()], Delays(directory.delays()))
+    cell = LockStepCell([party, *nodes.values()], Delays(directory.delays()))
     struck = faults is None
 
     def over() -> bool:

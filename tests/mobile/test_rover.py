@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.canopen.cia402 import Fault
+from petrobot.services.comm.canopen.cia402 import DriveFault
 from petrobot.services.mobile import driving
 from petrobot.services.mobile.odometry import Pose as Odo
 from petrobot.services.mobile.odometry import turned
@@ -232,7 +232,7 @@ def test_a_drive_fault_ends_the_run_and_a_reset_mends_it() -> None:
 
     def trip(now: float) -> None:
         if abs(now - 1.5) < 0.001:
-            yard.bus.bus.trip(0, Fault.OVERCURRENT)
+            yard.bus.bus.trip(0, DriveFault.OVERCURRENT)
 
     result = play(yard, driving.follow_feed_forward, happening=trip).result
     assert (result.status, result.cause, result.values["wheel"]) == (

@@ -9,8 +9,8 @@ import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import EMCY_BASE, HEARTBEAT_BASE, TPDO1_BASE, emergency
-from petrobot.services.comm.canopen.cia402 import Command, Fault, State
-from petrobot.services.comm.canopen.master import Phase, Power
+from petrobot.services.comm.canopen.cia402 import DriveCommand, DriveFault, DriveState
+from petrobot.services.comm.canopen.master import MasterPhase, Power
 from petrobot.services.mobile.wheel_drives import SILENT_CYCLES, WheelMaster
 from tests.mobile.conftest import DrawnFloor, DrawnPose
 from tests.mobile.yard import Yard
@@ -69,7 +69,7 @@ def test_a_drive_that_never_answers_is_named_and_tried_again() -> None:
     bench = WheelBench()
     bench.passes = lambda frame: frame.id & 0x7F != RIGHT
     bench.run(2.5)
-    assert bench.master.phase is Phase.CONFIGURING
+    assert bench.master.phase is MasterPhase.CONFIGURING
     assert [trouble.cause for trouble in bench.master.troubles] == ["bus"]
     assert "node 2" in bench.master.troubles[0].text
     bench.passes = lambda frame: True
@@ -100,9 +100,9 @@ def test_silence_of_one_drive_stops_both(base: int, text: str) -> None:
 
 def test_an_emergency_is_told_with_its_wheel_and_its_code() -> None:
     bench = WheelBench().enabled()
-    bench.master.receive(bench.now, emergency(LEFT, Fault.OVERCURRENT, 0x03))
+    bench.master.receive(bench.now, emergency(LEFT, DriveFault.OVERCURRENT, 0x03))
     (trouble,) = bench.master.troubles
-    assert (trouble.cause, trouble.axis, trouble.code) == ("drive_fault", 0, Fault.OVERCURRENT)
+    assert (trouble.cause, trouble.axis, trouble.code) == ("drive_fault", 0, DriveFault.OVERCURRENT)
     assert bench.master.wheel(trouble) == "left wheel"
     bench.master.receive(bench.now, Frame(EMCY_BASE + LEFT, b"\0"))
     bench.master.receive(bench.now, Frame(TPDO1_BASE + LEFT, b"\0"))
@@ -122,8 +122,10 @@ def test_a_restarted_sensor_is_no_trouble_and_a_restarted_drive_is() -> None:
 
 def test_power_brakes_first_and_resets_a_fault_only_now_and_then() -> None:
     power = Power(reset_cycles=5, stop_cycles=3)
-    words = [power.word(State.OPERATION_ENABLED, False, False) for _ in range(5)]
-    assert words == [Command.QUICK_STOP.word] * 3 + [Command.DISABLE_VOLTAGE.word] * 2
-    resets = [power.word(State.FAULT, True, True) == Command.FAULT_RESET.word for _ in range(10)]
+    words = [power.word(DriveState.OPERATION_ENABLED, False, False) for _ in range(5)]
+    assert words == [DriveCommand.QUICK_STOP.word] * 3 + [DriveCommand.DISABLE_VOLTAGE.word] * 2
+    resets = [
+        power.word(DriveState.FAULT, True, True) == DriveCommand.FAULT_RESET.word for _ in range(10)
+    ]
     assert resets == [True, False, False, False, False] * 2
-    assert power.word(State.FAULT, True, False) == Command.DISABLE_VOLTAGE.word
+    assert power.word(DriveState.FAULT, True, False) == DriveCommand.DISABLE_VOLTAGE.word

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from petrobot.services.action import Status
-from petrobot.services.comm.canopen.cia402 import Fault
+from petrobot.services.comm.canopen.cia402 import DriveFault
 from petrobot.services.motion import actions
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.limits import CollisionGuard
@@ -108,11 +108,11 @@ def test_intercept_with_a_faulty_drive(play: Any) -> None:
     def world(play: Any) -> None:
         ball(play)
         if play.now - (ball.begun or 0.0) > 0.3:
-            play.rig.drives.trip(2, Fault.OVERHEATED)
+            play.rig.drives.trip(2, DriveFault.OVERHEATED)
 
     result = play.play(actions.intercept_tilted(play), world)
     assert (result.status, result.cause) == (Status.ERROR, "drive_fault")
-    assert result.values == {"joint": 2, "code": Fault.OVERHEATED}
+    assert result.values == {"joint": 2, "code": DriveFault.OVERHEATED}
 
 
 @pytest.mark.parametrize("action", [actions.intercept_tilted, actions.follow_and_wait])
@@ -197,7 +197,7 @@ def test_a_ball_that_sticks_is_an_error(play: Any) -> None:
 def test_reset_and_home_recovers_from_a_fault(play: Any) -> None:
     play.rig.arm.command(play.now, {"do": "move", "pose": "empty"})
     play.rig.run(0.5)
-    play.rig.drives.trip(0, Fault.OVERCURRENT)
+    play.rig.drives.trip(0, DriveFault.OVERCURRENT)
     play.rig.run(0.5)
     result = play.play(actions.reset_and_home(play))
     assert result.status is Status.SUCCESS

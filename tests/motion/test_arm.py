@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from petrobot.services.comm.canopen.cia402 import Fault
+from petrobot.services.comm.canopen.cia402 import DriveFault
 from petrobot.services.motion.kinematics import Puma
 from petrobot.services.motion.limits import CollisionGuard
 from petrobot.services.motion.model import nominal_arm, nominal_cell
@@ -301,8 +301,10 @@ def test_disable_stops_first_and_then_lets_the_brakes_hold(rig: Any) -> None:
     assert rig.arm.stopped()
 
 
-@pytest.mark.parametrize("fault", [Fault.OVERCURRENT, Fault.OVERHEATED, Fault.ENCODER])
-def test_a_drive_fault_stops_all_and_a_reset_brings_them_back(rig: Any, fault: Fault) -> None:
+@pytest.mark.parametrize(
+    "fault", [DriveFault.OVERCURRENT, DriveFault.OVERHEATED, DriveFault.ENCODER]
+)
+def test_a_drive_fault_stops_all_and_a_reset_brings_them_back(rig: Any, fault: DriveFault) -> None:
     rig.arm.command(rig.now, {"do": "move", "pose": AWAY})
     rig.run(0.3)
     rig.drives.trip(3, fault)
@@ -399,7 +401,7 @@ def test_a_blocked_joint_ends_in_a_following_error(rig: Any) -> None:
     rig.run(0.2)
     rig.plant.step = lambda dt, tau: None
     assert rig.run(0.5, lambda: bool(rig.arm.state()["faults"]))
-    assert {fault[2] for fault in rig.arm.state()["faults"]} == {Fault.FOLLOWING_ERROR}
+    assert {fault[2] for fault in rig.arm.state()["faults"]} == {DriveFault.FOLLOWING_ERROR}
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.3])

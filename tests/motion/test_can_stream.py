@@ -26,7 +26,7 @@ from petrobot.services.comm.canopen.byte_stream import (
     encode,
     parse_channel,
 )
-from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.services.comm.canopen.ports import PythonCanBus, StreamPort, open_can
 from tests.waiting import Limit
 
@@ -37,7 +37,7 @@ class RunningHub:
     """A hub polled by a thread until it is closed."""
 
     def __init__(self, channel: str) -> None:
-        self.hub = Hub(channel)
+        self.hub = CanHub(channel)
         self.channel = self.hub.channel
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._serve)
@@ -179,16 +179,16 @@ def test_can_fd_is_refused(pair: tuple[can.BusABC, can.BusABC], channel: str) ->
     [
         ("tcp://192.0.2.1:7303", "allow_remote=True"),
         ("tcp://0.0.0.0:7303", "allow_remote=True"),
-        ("tcp://127.0.0.1", "write tcp://127.0.0.1:7303"),
-        ("can0", "write tcp://127.0.0.1:7303"),
-        ("unix://", "write tcp://127.0.0.1:7303"),
+        ("tcp://127.0.0.1", "expected tcp://127.0.0.1:7303"),
+        ("can0", "expected tcp://127.0.0.1:7303"),
+        ("unix://", "expected tcp://127.0.0.1:7303"),
     ],
 )
 def test_bad_channels_are_refused_with_a_remedy(bad: str, says: str) -> None:
     with pytest.raises(can.CanInitializationError, match=says):
         _open(bad)
     with pytest.raises(ValueError, match=says):
-        Hub(bad)
+        CanHub(bad)
 
 
 def test_another_host_can_be_allowed() -> None:
@@ -220,7 +220,7 @@ def test_a_hub_that_goes_is_noticed() -> None:
     port.close()
 
 
-def _poll_until(hub: Hub, condition: Any) -> None:
+def _poll_until(hub: CanHub, condition: Any) -> None:
     for _ in range(500):
         if condition():
             return
@@ -228,7 +228,7 @@ def _poll_until(hub: Hub, condition: Any) -> None:
     raise AssertionError("the hub did not get there")
 
 
-def _collect(hub: Hub, port: CanBus, got: list[Frame]) -> None:
+def _collect(hub: CanHub, port: CanBus, got: list[Frame]) -> None:
     """Poll until frames have come to a port."""
 
     def some() -> bool:
@@ -243,7 +243,7 @@ def _collect(hub: Hub, port: CanBus, got: list[Frame]) -> None:
     [b"GET / HTTP/1.1\r\n", GREETING + b"\x00\x00\x01\x23\x09", GREETING + b"\x00\x00\x08\x00\x00"],
 )
 def test_a_port_that_talks_rubbish_is_dropped_and_the_others_go_on(rubbish: bytes) -> None:
-    hub = Hub()
+    hub = CanHub()
     good, other = StreamPort(hub.channel), StreamPort(hub.channel)
     host, port = parse_channel(hub.channel)[1]
     with socket.create_connection((host, port)) as bad:
@@ -260,7 +260,7 @@ def test_a_port_that_talks_rubbish_is_dropped_and_the_others_go_on(rubbish: byte
 
 
 def test_a_port_that_does_not_read_is_dropped_and_does_not_stop_the_bus() -> None:
-    hub = Hub()
+    hub = CanHub()
     lazy = socket.create_connection(parse_channel(hub.channel)[1])
     lazy.sendall(GREETING)
     reader, mine = StreamPort(hub.channel), hub.port()
@@ -283,7 +283,7 @@ def test_a_port_that_does_not_read_is_dropped_and_does_not_stop_the_bus() -> Non
 
 
 def test_local_ports_and_python_can_and_stream_ports_hear_each_other() -> None:
-    hub = Hub()
+    hub = CanHub()
     local, stream = hub.port(), StreamPort(hub.channel)
     foreign = PythonCanBus(_open(hub.channel))
     _poll_until(hub, lambda: hub.ports == 2)
@@ -329,9 +329,9 @@ def test_a_socket_file_left_behind_is_replaced_but_one_in_use_is_not(tmp_path: P
     path = tmp_path / "can"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
-    hub = Hub(f"unix://{path}")
+    hub = CanHub(f"unix://{path}")
     with pytest.raises(OSError, match="listens on"):
-        Hub(f"unix://{path}")
+        CanHub(f"unix://{path}")
     hub.close()
     assert not path.exists()
 

@@ -12,16 +12,16 @@ from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen import cia402
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import (
-    Abort,
+    AbortCode,
+    DataType,
     Mapped,
     NmtCommand,
     NmtState,
     SdoAbortError,
     SdoClient,
     Transfer,
-    Type,
 )
-from petrobot.services.comm.canopen.cia402 import Command, State
+from petrobot.services.comm.canopen.cia402 import DriveCommand, DriveState
 from tests.waiting import Limit
 
 WRITTEN_OUT = [
@@ -43,7 +43,7 @@ WRITTEN_OUT = [
     (canopen.sdo_write_reply(1, 0x6060, 0), 0x581, "60 60 60 00 00 00 00 00"),
     (canopen.sdo_read_reply(6, 0x6041, 0, b"\x37\x12"), 0x586, "4b 41 60 00 37 12 00 00"),
     (canopen.sdo_read_reply(6, 0x1000, 0, b"\x92\x01\x02\x00"), 0x586, "43 00 10 00 92 01 02 00"),
-    (canopen.sdo_abort(0x581, 0x6041, 0, Abort.READ_ONLY), 0x581, "80 41 60 00 02 00 01 06"),
+    (canopen.sdo_abort(0x581, 0x6041, 0, AbortCode.READ_ONLY), 0x581, "80 41 60 00 02 00 01 06"),
 ]
 
 
@@ -65,7 +65,7 @@ def test_process_data_byte_by_byte() -> None:
 
 def test_a_pdo_has_eight_bytes() -> None:
     with pytest.raises(ValueError, match="these objects need 12"):
-        canopen.pdo_struct([Mapped(0x6064, 0, Type.INTEGER32)] * 3)
+        canopen.pdo_struct([Mapped(0x6064, 0, DataType.INTEGER32)] * 3)
 
 
 def test_mapping_is_written_in_the_order_of_the_standard() -> None:
@@ -98,14 +98,14 @@ def test_any_bytes_are_an_sdo_message_or_refused(data: bytes) -> None:
     except ValueError:
         assert len(data) != 8
     except SdoAbortError as reason:
-        assert reason.code == Abort.COMMAND
+        assert reason.code == AbortCode.COMMAND
     else:
         assert (message.index, message.sub) == struct.unpack_from("<HB", data, 1)
 
 
-@given(st.sampled_from(list(Type)), st.integers(-(1 << 33), 1 << 33))
-def test_values_fit_their_type_or_are_refused(kind: Type, value: int) -> None:
-    if kind is Type.BOOLEAN:
+@given(st.sampled_from(list(DataType)), st.integers(-(1 << 33), 1 << 33))
+def test_values_fit_their_type_or_are_refused(kind: DataType, value: int) -> None:
+    if kind is DataType.BOOLEAN:
         return
     bits = 8 * kind.size
     signed = kind.name.startswith("INTEGER")
@@ -119,7 +119,9 @@ def test_values_fit_their_type_or_are_refused(kind: Type, value: int) -> None:
 
 def test_client_writes_and_reads_one_after_another() -> None:
     client = SdoClient(4)
-    client.begin([Transfer(0x6060, 0, Type.INTEGER8, 8), Transfer(0x6041, 0, Type.UNSIGNED16)])
+    client.begin(
+        [Transfer(0x6060, 0, DataType.INTEGER8, 8), Transfer(0x6041, 0, DataType.UNSIGNED16)]
+    )
     assert client.advance(0.0) == [canopen.sdo_write_request(4, 0x6060, 0, b"\x08")]
     assert client.advance(0.1) == []
     client.receive(canopen.sdo_write_reply(5, 0x6060, 0))  # of another node
@@ -135,10 +137,10 @@ def test_client_writes_and_reads_one_after_another() -> None:
 
 def test_client_gives_up_after_its_timeout_and_says_so() -> None:
     client = SdoClient(4, timeout=0.5)
-    client.begin([Transfer(0x1000, 0, Type.UNSIGNED32)])
+    client.begin([Transfer(0x1000, 0, DataType.UNSIGNED32)])
     client.advance(1.0)
     assert client.advance(1.49) == []
-    assert client.advance(1.5) == [canopen.sdo_abort(0x604, 0x1000, 0, Abort.TIMEOUT)]
+    assert client.advance(1.5) == [canopen.sdo_abort(0x604, 0x1000, 0, AbortCode.TIMEOUT)]
     assert client.failure == "node 4: no answer from 0x1000:0 within 0.5 s"
     assert not client.busy
 
@@ -146,15 +148,17 @@ def test_client_gives_up_after_its_timeout_and_says_so() -> None:
 @pytest.mark.parametrize(
     ("reply", "says"),
     [
-        (canopen.sdo_abort(0x584, 0x1000, 0, Abort.NO_OBJECT), "no object"),
+        (canopen.sdo_abort(0x584, 0x1000, 0, AbortCode.NO_OBJECT), "no object"),
         (canopen.sdo_write_reply(4, 0x1000, 0), "command"),
-        (canopen.sdo_read_reply(4, 0x1000, 0, b"\x01"), "1 bytes are no UNSIGNED32"),
+        (canopen.sdo_read_reply(4, 0x1000, 0, b"\x01"), "expected 4 bytes for UNSIGNED32, got 1"),
         (Frame(0x584, bytes.fromhex("41 00 10 00 10 00 00 00")), "command"),
     ],
 )
 def test_client_names_what_went_wrong(reply: Frame, says: str) -> None:
     client = SdoClient(4)
-    client.begin([Transfer(0x1000, 0, Type.UNSIGNED32), Transfer(0x1001, 0, Type.UNSIGNED8)])
+    client.begin(
+        [Transfer(0x1000, 0, DataType.UNSIGNED32), Transfer(0x1001, 0, DataType.UNSIGNED8)]
+    )
     client.advance(0.0)
     client.receive(reply)
     assert says in client.failure
@@ -162,82 +166,84 @@ def test_client_names_what_went_wrong(reply: Frame, says: str) -> None:
 
 
 STATUSWORDS = [
-    (0x0000, State.NOT_READY_TO_SWITCH_ON),
-    (0x0250, State.SWITCH_ON_DISABLED),
-    (0x0270, State.SWITCH_ON_DISABLED),
-    (0x0231, State.READY_TO_SWITCH_ON),
-    (0x0233, State.SWITCHED_ON),
-    (0x1237, State.OPERATION_ENABLED),
-    (0x0217, State.QUICK_STOP_ACTIVE),
-    (0x021F, State.FAULT_REACTION_ACTIVE),
-    (0x023F, State.FAULT_REACTION_ACTIVE),
-    (0x0218, State.FAULT),
-    (0x0238, State.FAULT),
+    (0x0000, DriveState.NOT_READY_TO_SWITCH_ON),
+    (0x0250, DriveState.SWITCH_ON_DISABLED),
+    (0x0270, DriveState.SWITCH_ON_DISABLED),
+    (0x0231, DriveState.READY_TO_SWITCH_ON),
+    (0x0233, DriveState.SWITCHED_ON),
+    (0x1237, DriveState.OPERATION_ENABLED),
+    (0x0217, DriveState.QUICK_STOP_ACTIVE),
+    (0x021F, DriveState.FAULT_REACTION_ACTIVE),
+    (0x023F, DriveState.FAULT_REACTION_ACTIVE),
+    (0x0218, DriveState.FAULT),
+    (0x0238, DriveState.FAULT),
 ]
 
 
 @pytest.mark.parametrize(("word", "state"), STATUSWORDS)
-def test_statuswords(word: int, state: State) -> None:
+def test_statuswords(word: int, state: DriveState) -> None:
     assert cia402.state_of(word) is state
     assert cia402.state_of(word | 0xFF80 & ~0x0) is state or word & 0x80
 
 
 def test_a_statusword_that_shows_no_state_is_refused() -> None:
-    with pytest.raises(ValueError, match="shows no state"):
+    with pytest.raises(ValueError, match="is not a state"):
         cia402.state_of(0x0002)
 
 
 CONTROLWORDS = [
-    (0x0000, Command.DISABLE_VOLTAGE),
-    (0x000D, Command.DISABLE_VOLTAGE),
-    (0x0002, Command.QUICK_STOP),
-    (0x000B, Command.QUICK_STOP),
-    (0x0006, Command.SHUTDOWN),
-    (0x000E, Command.SHUTDOWN),
-    (0x0007, Command.SWITCH_ON),
-    (0x000F, Command.ENABLE_OPERATION),
-    (0x001F, Command.ENABLE_OPERATION),
-    (0x0080, Command.FAULT_RESET),
-    (0x008F, Command.FAULT_RESET),
+    (0x0000, DriveCommand.DISABLE_VOLTAGE),
+    (0x000D, DriveCommand.DISABLE_VOLTAGE),
+    (0x0002, DriveCommand.QUICK_STOP),
+    (0x000B, DriveCommand.QUICK_STOP),
+    (0x0006, DriveCommand.SHUTDOWN),
+    (0x000E, DriveCommand.SHUTDOWN),
+    (0x0007, DriveCommand.SWITCH_ON),
+    (0x000F, DriveCommand.ENABLE_OPERATION),
+    (0x001F, DriveCommand.ENABLE_OPERATION),
+    (0x0080, DriveCommand.FAULT_RESET),
+    (0x008F, DriveCommand.FAULT_RESET),
 ]
 
 
 @pytest.mark.parametrize(("word", "command"), CONTROLWORDS)
-def test_controlwords(word: int, command: Command) -> None:
+def test_controlwords(word: int, command: DriveCommand) -> None:
     assert cia402.command_of(word) is command
 
 
 def test_every_controlword_is_a_command_and_every_command_has_its_word() -> None:
     assert all(cia402.command_of(word) is not None for word in range(256))
-    assert all(cia402.command_of(command.word) is command for command in Command)
+    assert all(cia402.command_of(command.word) is command for command in DriveCommand)
 
 
 def test_enabling_leads_from_every_resting_state_to_operation() -> None:
     for start in (
-        State.SWITCH_ON_DISABLED,
-        State.FAULT,
-        State.QUICK_STOP_ACTIVE,
-        State.SWITCHED_ON,
+        DriveState.SWITCH_ON_DISABLED,
+        DriveState.FAULT,
+        DriveState.QUICK_STOP_ACTIVE,
+        DriveState.SWITCHED_ON,
     ):
         state = start
         limit = Limit("operation", steps=5)
-        while state is not State.OPERATION_ENABLED and limit.left():
+        while state is not DriveState.OPERATION_ENABLED and limit.left():
             state = cia402.after(state, cia402.ENABLING[state])
 
 
-@pytest.mark.parametrize("command", list(Command))
-def test_a_fault_is_left_by_a_reset_alone(command: Command) -> None:
-    expected = State.SWITCH_ON_DISABLED if command is Command.FAULT_RESET else State.FAULT
-    assert cia402.after(State.FAULT, command) is expected
+@pytest.mark.parametrize("command", list(DriveCommand))
+def test_a_fault_is_left_by_a_reset_alone(command: DriveCommand) -> None:
+    expected = (
+        DriveState.SWITCH_ON_DISABLED if command is DriveCommand.FAULT_RESET else DriveState.FAULT
+    )
+    assert cia402.after(DriveState.FAULT, command) is expected
 
 
 def test_no_state_but_switched_on_and_quick_stop_leads_into_operation() -> None:
     ways = {
         state
         for (state, _), after in cia402.TRANSITIONS.items()
-        if after is State.OPERATION_ENABLED
+        if after is DriveState.OPERATION_ENABLED
     }
-    assert ways == {State.SWITCHED_ON, State.QUICK_STOP_ACTIVE}
+    assert ways == {DriveState.SWITCHED_ON, DriveState.QUICK_STOP_ACTIVE}
 
 
 @given(st.floats(-600.0, 600.0))
@@ -248,4 +254,4 @@ def test_units_keep_a_micro_radian(angle: float) -> None:
 def test_faults_have_words() -> None:
     assert cia402.fault_text(0x8611) == "following error too large"
     assert cia402.fault_text(0x1234) == "error code 0x1234"
-    assert set(cia402.FAULT_TEXT) == set(cia402.Fault)
+    assert set(cia402.FAULT_TEXT) == set(cia402.DriveFault)

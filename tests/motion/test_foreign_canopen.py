@@ -16,15 +16,15 @@ import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia402 import (
-    Command,
-    Fault,
-    Object,
-    State,
+    DriveCommand,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
     command_of,
     from_units,
 )
-from petrobot.services.comm.canopen.hub import Hub
-from petrobot.services.comm.canopen.master import Phase
+from petrobot.services.comm.canopen.hub import CanHub
+from petrobot.services.comm.canopen.master import MasterPhase
 from petrobot.services.motion.drive_master import DriveMaster, DriveSettings
 from petrobot.sim.catching.drives import DriveBus, ratings
 
@@ -39,7 +39,7 @@ class LiveDrives:
     """Our drives on a hub, kept going by a thread; simulated time goes on with the wall's."""
 
     def __init__(self, plant: Any, table: Any) -> None:
-        self.hub = Hub()
+        self.hub = CanHub()
         self.channel = self.hub.channel
         self.drives = DriveBus(plant, ratings(table))
         self._port = self.hub.port()
@@ -138,31 +138,31 @@ def test_the_canopen_package_masters_our_drive(live: LiveDrives, network: Any) -
     with pytest.raises(canopen.SdoAbortedError) as refused:
         node.sdo[0x6060].raw = 1
     assert refused.value.code in (0x06090030, 0x08000022)
-    live.drives.trip(0, Fault.OVERHEATED)
+    live.drives.trip(0, DriveFault.OVERHEATED)
     _until(lambda: bool(node.emcy.log), "no EMCY came")
-    assert node.emcy.log[0].code == Fault.OVERHEATED
+    assert node.emcy.log[0].code == DriveFault.OVERHEATED
 
 
 class ForeignDrive:
     """A drive whose protocol is the `canopen` package's LocalNode; the state machine is written
     here from the standard."""
 
-    WORDS: dict[State, int] = {  # noqa: RUF012
-        State.SWITCH_ON_DISABLED: 0x0250,
-        State.READY_TO_SWITCH_ON: 0x0231,
-        State.SWITCHED_ON: 0x0233,
-        State.OPERATION_ENABLED: 0x1237,
+    WORDS: dict[DriveState, int] = {  # noqa: RUF012
+        DriveState.SWITCH_ON_DISABLED: 0x0250,
+        DriveState.READY_TO_SWITCH_ON: 0x0231,
+        DriveState.SWITCHED_ON: 0x0233,
+        DriveState.OPERATION_ENABLED: 0x1237,
     }
-    NEXT: dict[tuple[State, Command | None], State] = {  # noqa: RUF012
-        (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,
-        (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): State.SWITCHED_ON,
-        (State.SWITCHED_ON, Command.ENABLE_OPERATION): State.OPERATION_ENABLED,
-        (State.OPERATION_ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,
+    NEXT: dict[tuple[DriveState, DriveCommand | None], DriveState] = {  # noqa: RUF012
+        (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,
+        (DriveState.READY_TO_SWITCH_ON, DriveCommand.SWITCH_ON): DriveState.SWITCHED_ON,
+        (DriveState.SWITCHED_ON, DriveCommand.ENABLE_OPERATION): DriveState.OPERATION_ENABLED,
+        (DriveState.OPERATION_ENABLED, DriveCommand.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,
     }
 
     def __init__(self, network: Any, number: int) -> None:
         self.node = network.create_node(number, EDS)
-        self.state = State.SWITCH_ON_DISABLED
+        self.state = DriveState.SWITCH_ON_DISABLED
         self.position = 1000 * number
         self.node.sdo[0x607F].raw = 2_000_000
         network.subscribe(0x200 + number, self._received)
@@ -178,7 +178,7 @@ class ForeignDrive:
     def _sync(self, cob_id: int, data: bytearray, timestamp: float) -> None:
         if self.node.nmt.state != "OPERATIONAL" or self.node.sdo[0x1800][1].raw & 0x80000000:
             return
-        if self.state is State.OPERATION_ENABLED:
+        if self.state is DriveState.OPERATION_ENABLED:
             self.position = self._target
         sent = (
             self.WORDS[self.state].to_bytes(2, "little")
@@ -212,7 +212,7 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
             if master.enabled:
                 moved += 1
                 targets = [target + 0.001 for target in targets]
-            elif master.phase is Phase.RUNNING:
+            elif master.phase is MasterPhase.RUNNING:
                 targets = master.positions
             for frame in master.advance(now, targets):
                 bus.send(
@@ -221,13 +221,13 @@ def test_our_master_runs_drives_of_the_canopen_package() -> None:
             pause.wait(0.004)
         assert not master.troubles
         for drive, target in zip(drives, targets, strict=True):
-            assert drive.state is State.OPERATION_ENABLED
+            assert drive.state is DriveState.OPERATION_ENABLED
             assert from_units(drive.position) == pytest.approx(target, abs=0.0101)
             dictionary = drive.node.sdo
             assert dictionary[0x6060].raw == 8
             assert dictionary[0x1016][1].raw == 0x007F00C8
             assert dictionary[0x1A00][0].raw == 3
-            assert dictionary[Object.FOLLOWING_ERROR_WINDOW].raw == 100_000
+            assert dictionary[ObjectIndex.FOLLOWING_ERROR_WINDOW].raw == 100_000
             assert master.drives[0].max_speed == 2.0
             assert drive.node.nmt.state == "OPERATIONAL"
     finally:

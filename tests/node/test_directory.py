@@ -259,7 +259,7 @@ def test_an_unreadable_file_raises_what_the_system_says(tmp_path: Path) -> None:
         ),
         (
             "broken_driver:Driver",
-            "importing 'broken_driver' raises ZeroDivisionError: division by zero; mend the module",
+            "importing 'broken_driver' raises ZeroDivisionError: division by zero; correct the module",
         ),
     ],
 )

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from petrobot.services.comm.calls.notices import Ended
+from petrobot.services.comm.calls.caller import CallEnded
 from petrobot.services.comm.location_file import load, verify_imports
-from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.comm.lockstep.cell import LockStepCell
 from petrobot.services.node.lockstep import LockstepNode
 from petrobot.services.scripted import load as load_script
 from tests.node.test_lockstep import Coordinator
@@ -57,9 +57,9 @@ def test_the_pages_node_runs_its_action(files: Path, mocked: bool) -> None:
         directory, "bench", substitutes=load_script(files / "script.toml") if mocked else None
     )
     coordinator = Coordinator(directory, [(2, "grip", {}), (400, "grip", {})])
-    cell = Cell([node, coordinator])
+    cell = LockStepCell([node, coordinator])
     cell.run(lambda: False, 800)
-    ends = [n.outcome for _, n in coordinator.heard if isinstance(n, Ended)]
+    ends = [n.outcome for _, n in coordinator.heard if isinstance(n, CallEnded)]
     assert [(e.status, e.cause) for e in ends] == [
         ("failure", "empty") if mocked else ("success", ""),
         ("success", ""),

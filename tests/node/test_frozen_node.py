@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from petrobot.coordinator.cli import main
-from petrobot.services.comm.calls.latch import ALL, Latch, latch_of
+from petrobot.services.host.emergency_latch import ALL, Latch, latch_of
 from petrobot.services.node.emergency_stops import AGAIN, BEAT, GUARD_LOOK, SILENCE, Guard
 from petrobot.services.worker.device_process import DeviceLoop
 from petrobot.services.worker.pipe import Pipe

@@ -14,17 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.services.comm.calls.caller import (
-    Accepted,
-    Answered,
+    CallAccepted,
+    CallEnded,
     Caller,
-    Ended,
+    CallProgress,
+    CommandAnswered,
     EventArrived,
     Notice,
-    Progress,
 )
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.location_file import Directory, DirectoryError, parse
-from petrobot.services.comm.lockstep.cell import Cell, Delays
+from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
 from petrobot.services.comm.lockstep.channels import (
     can_body,
     image_body,
@@ -182,7 +182,9 @@ class Coordinator:
 
     def ended(self, identity: str) -> Any:
         (end,) = [
-            n.outcome for _, n in self.heard if isinstance(n, Ended) and n.outcome.id == identity
+            n.outcome
+            for _, n in self.heard
+            if isinstance(n, CallEnded) and n.outcome.id == identity
         ]
         return end
 
@@ -197,7 +199,7 @@ class Bench:
         self.coordinator = Coordinator(places, script)
         nodes = [n for n in places.nodes.values() if not n.sim]
         self.nodes = {n.name: LockstepNode(places, n.name, substitutes=mock) for n in nodes}
-        self.cell = Cell(
+        self.cell = LockStepCell(
             [self.coordinator, self.world, *self.nodes.values()], Delays(places.delays())
         )
 
@@ -325,7 +327,7 @@ def test_a_local_service_is_refused_to_another_host() -> None:
     end = Bench(far).call("delegate", service="secret")
     assert (
         end.values["cause"] == "local_only"
-        and "serves callers on the host of right alone" in end.values["text"]
+        and "only serves callers on the host of right" in end.values["text"]
     )
 
 
@@ -344,9 +346,11 @@ def test_one_run_a_device_and_cancel() -> None:
 def test_feedback_and_events_reach_the_caller() -> None:
     bench = Bench(directory())
     end = bench.call("tell", name="hello")
-    kinds = [type(n) for _, n in bench.coordinator.heard if not isinstance(n, Ended)]
+    kinds = [type(n) for _, n in bench.coordinator.heard if not isinstance(n, CallEnded)]
     assert (
-        kinds.count(Accepted) == 1 and kinds.count(Progress) == 1 and kinds.count(EventArrived) == 1
+        kinds.count(CallAccepted) == 1
+        and kinds.count(CallProgress) == 1
+        and kinds.count(EventArrived) == 1
     )
     assert end.values["draw"] == Bench(directory("right")).call("tell", name="x").values["draw"]
 
@@ -358,7 +362,9 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
     for peer, caller in bench.coordinator.callers.items():
         caller.command(bench.cell.now, Command(f"hold {peer}", "hold"))
     bench.run(3.0)
-    answers = {n.answer.id: n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered)}
+    answers = {
+        n.answer.id: n.answer for _, n in bench.coordinator.heard if isinstance(n, CommandAnswered)
+    }
     assert answers["hold left"].ok and answers["hold left"].data["answers"] == {
         "slide": "held",
         "left": "held",
@@ -372,7 +378,7 @@ def test_hold_stops_the_arm_and_its_run_but_not_the_eye() -> None:
     status = next(
         n.answer
         for _, n in bench.coordinator.heard
-        if isinstance(n, Answered) and n.answer.id == "s"
+        if isinstance(n, CommandAnswered) and n.answer.id == "s"
     )
     assert status.data["devices"]["slide"]["runs"] == [first]
     assert 0.15 < status.data["devices"]["slide"]["state"]["position"] < 0.25
@@ -392,7 +398,7 @@ def test_commands_that_mean_nothing(verb: str, target: str, cause: str) -> None:
     bench.run(0.05)
     bench.coordinator.callers["left"].command(bench.cell.now, Command("x", verb, target))
     bench.run(0.05)
-    (answer,) = [n.answer for _, n in bench.coordinator.heard if isinstance(n, Answered)]
+    (answer,) = [n.answer for _, n in bench.coordinator.heard if isinstance(n, CommandAnswered)]
     assert not answer.ok and answer.data["cause"] == cause
 
 
@@ -461,7 +467,7 @@ def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
     """All that a coordinator heard, with the tick, but for what belongs to a process."""
     rows: list[tuple[Any, ...]] = []
     for tick, notice in coordinator.heard:
-        if isinstance(notice, Ended):
+        if isinstance(notice, CallEnded):
             o = notice.outcome
             values = {k: v for k, v in o.values.items() if k != "pid"}
             rows.append(
@@ -477,7 +483,7 @@ def trace_of(coordinator: Coordinator) -> list[tuple[Any, ...]]:
                     repr(notice.event.data),
                 )
             )
-        elif isinstance(notice, Accepted | Progress):
+        elif isinstance(notice, CallAccepted | CallProgress):
             rows.append((tick, notice.id, type(notice).__name__))
     return sorted(rows, key=repr)
 

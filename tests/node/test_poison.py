@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from petrobot.services.action import Result, Status, success
-from petrobot.services.comm.calls.notices import PeerLost
+from petrobot.services.comm.calls.caller import PeerLost
 from petrobot.services.comm.location_file import parse
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.codec import ProtocolError, decode, encode

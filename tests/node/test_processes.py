@@ -17,9 +17,14 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.caller import (
+    CallAccepted,
+    Caller,
+    CommandAnswered,
+    EventArrived,
+    Notice,
+)
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.notices import Accepted, Answered, EventArrived, Notice
 from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.comm.lockstep.mesh import Member
 from petrobot.services.comm.protocol.messages import Answer, Call, Command, Hello, Outcome
@@ -137,7 +142,7 @@ class Operator:
         client, identity = self.clients[node], f"{verb} {self.numbers}"
         client.caller.command(client.now(), Command(identity, verb, target))
         client.flush()
-        answered = await self.heard(Answered, lambda notice: notice.answer.id == identity)
+        answered = await self.heard(CommandAnswered, lambda notice: notice.answer.id == identity)
         answer: Answer = answered.answer
         return answer
 
@@ -304,7 +309,7 @@ async def test_a_hanging_action_is_ended_at_its_deadline_while_the_node_answers(
 ) -> None:
     before = await pids(operator, "left", "")
     hanging = asyncio.create_task(operator.call("hang"))
-    await operator.heard(Accepted)
+    await operator.heard(CallAccepted)
     answered, limit = 0, Limit("the end of the call that hangs")
     while not hanging.done() and limit.left():
         status = await operator.command("left", "status", "slide")
@@ -400,7 +405,7 @@ async def test_a_device_without_cycle_has_one_process(operator: Operator) -> Non
 async def test_cancel_hold_and_release(operator: Operator) -> None:
     left = operator.clients["left"]
     running = asyncio.create_task(operator.call("go", to=91.0, timeout=PATIENCE))
-    await operator.heard(Accepted)
+    await operator.heard(CallAccepted)
     assert (await operator.command("left", "hold", "slide")).data["answers"] == {"slide": "held"}
     first = await operator.command("left", "status", "slide")
     await operator.call("nap", seconds=0.1)
@@ -436,7 +441,7 @@ async def test_an_orphaned_run_is_stopped(nodes: Nodes, operator: Operator) -> N
     assert await client.connected(PATIENCE)
     client.caller.call(client.now(), Call("orphan", "nap", {"seconds": 60.0}))
     client.flush()
-    await other.heard(Accepted)
+    await other.heard(CallAccepted)
     await client.close()
 
     async def gone() -> bool:
@@ -457,7 +462,7 @@ async def test_sigterm_ends_a_node_and_all_its_processes(tmp_path: Path) -> None
         left = operator.clients["left"]
         left.caller.call(left.now(), call)
         left.flush()
-        await operator.heard(Accepted)
+        await operator.heard(CallAccepted)
         assert await asyncio.to_thread(running.stop) == {"left": 0}
     assert not [name for name, pid in children.items() if alive(pid)]
 
@@ -470,7 +475,7 @@ async def test_kill_9_of_a_node_ends_its_processes(tmp_path: Path) -> None:
             "general": (await pids(operator, "left", ""))["actions"],
         }
         hanging = asyncio.create_task(operator.call("hang", 30.0))
-        await operator.heard(Accepted)
+        await operator.heard(CallAccepted)
         running.processes["left"].kill()
         assert (await hanging).executed == "unknown"
 

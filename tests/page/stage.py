@@ -49,7 +49,7 @@ from petrobot.coordinator.run.journal import JournalWriter
 from petrobot.coordinator.run.recording import JournalStore
 from petrobot.coordinator.task import Executed, Status, Task
 from petrobot.coordinator.task.file import TaskFileError, loads
-from petrobot.services.comm.calls.notices import Progress
+from petrobot.services.comm.calls.caller import CallProgress
 
 FREE = frozenset({"estop", "take_controls", "ask_controls", "release_controls"})
 BEAT_S = 0.02
@@ -398,7 +398,7 @@ class Stage:
             if playing.start.action in self.kept:
                 fraction = min(fraction, 0.9)
             if fraction < 1.0:
-                self.narrator.progress(self.clock, run, Progress(run, fraction, {}))
+                self.narrator.progress(self.clock, run, CallProgress(run, fraction, {}))
                 continue
             del self._playing[run]
             part = playing.part

@@ -13,11 +13,11 @@ from petrobot.coordinator.engine import Begin, RunRecorded
 from petrobot.coordinator.run.fences import STOP_MARGIN
 from petrobot.coordinator.run.recording import Step
 from petrobot.coordinator.task import Executed, Status
-from petrobot.services.comm.calls.callee import Callee, CancelRun, Keeping, Offer, StartRun
+from petrobot.services.comm.calls.callee import Callee, CancelOrder, Offer, Retention, StartOrder
 from petrobot.services.comm.protocol import messages as m
 from tests.run.toy_arm import TIDY, WORK, Bench
 
-KEEPING = Keeping(results=10.0, result_count=2, id_groups=2)
+KEEPING = Retention(results=10.0, result_count=2, id_groups=2)
 TURNS = 300
 """Of 0.5 s each, within which every mission run of these tests ends, whatever happened before."""
 
@@ -26,7 +26,7 @@ class World:
     """A coordinator whose steps are all kept, and a node whose actions end when the test says
     so."""
 
-    def __init__(self, keeping: Keeping = KEEPING) -> None:
+    def __init__(self, keeping: Retention = KEEPING) -> None:
         self.now = 0.0
         self.boots = self.epoch = 1
         self.floods = 0
@@ -143,10 +143,10 @@ class World:
 
     def _obey(self) -> None:
         for order in self.callee.orders():
-            if isinstance(order, StartRun):
+            if isinstance(order, StartOrder):
                 self.started[order.call.id] += 1
                 self.active.append(order.call.id)
-            elif isinstance(order, CancelRun) and order.id in self.active:
+            elif isinstance(order, CancelOrder) and order.id in self.active:
                 self.active.remove(order.id)
                 self.callee.finish(self.now, order.id, "error", cause="cancelled")
 
@@ -220,7 +220,9 @@ def test_a_run_that_the_node_has_forgotten_ends_unknown_and_its_device_is_fenced
 ) -> None:
     """Its result is gone by number or by age, or even its id is; the coordinator's journal knows
     that it was ordered."""
-    world = World(Keeping(results=10.0, result_count=2, id_groups=100_000 if how != "flood" else 2))
+    world = World(
+        Retention(results=10.0, result_count=2, id_groups=100_000 if how != "flood" else 2)
+    )
     if accepted:
         world.exchange()
     world.kill(True)
@@ -276,7 +278,7 @@ def test_a_run_of_another_boot_that_is_cancelled_again_is_not_said_never_to_have
 
 def test_a_call_lost_on_its_way_is_made_again_by_a_node_that_forgot_nothing() -> None:
     """The guard costs nothing where it is not needed: a day later too."""
-    world = World(Keeping())
+    world = World(Retention())
     world.kill(False)
     world.flood(2_000)
     world.pass_time(86_400.0)

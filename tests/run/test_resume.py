@@ -26,7 +26,7 @@ from petrobot.coordinator.run.mission import Mission
 from petrobot.coordinator.run.recording import JournalStore, ReplayError, replay
 from petrobot.coordinator.task import Status, Task
 from petrobot.services.action import Status as ActionStatus
-from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.comm.lockstep.cell import LockStepCell
 from petrobot.services.scripted import Line
 from tests.run.scripted_cell import directory_for, scripts
 
@@ -94,7 +94,7 @@ class Laboratory:
         self.executed: Counter[str] = Counter()
         counted = {name: self._counting(action) for name, action in scripts(task, LINES).items()}
         self.node = lockstep_party(self.directory, self.directory.nodes["node"], counted)
-        self.cell: Cell | None = None
+        self.cell: LockStepCell | None = None
 
     def _counting(self, action: Callable[..., Any]) -> Callable[..., Any]:
         def counting(ctx: Any, **arguments: Any) -> Any:
@@ -135,7 +135,7 @@ class Laboratory:
         """Run the cell with this coordinator until it is over; raises CrashError when it dies."""
         party = CoordinatorParty(self.directory, mission, begin=begin)
         if self.cell is None:
-            self.cell = Cell([party, self.node])
+            self.cell = LockStepCell([party, self.node])
         else:
             self.cell.replace(party)
         assert self.cell.run(lambda: party.over, 100_000)

@@ -21,8 +21,8 @@ from petrobot.coordinator.run.timeline import Timeline
 from petrobot.coordinator.studies.campaign.trials import TrialLog
 from petrobot.coordinator.task import Status
 from petrobot.services.comm.calls.callee import Callee, Offer
-from petrobot.services.comm.calls.verdicts import VerdictSaid, mission_of, verdict_event
-from petrobot.services.comm.lockstep.cell import Cell
+from petrobot.services.comm.calls.events import RunVerdict, mission_of, verdict_event
+from petrobot.services.comm.lockstep.cell import LockStepCell
 from petrobot.services.comm.protocol import messages as m
 from tests.run.judged_parts import (
     FAIL,
@@ -51,7 +51,7 @@ class Cellar:
         self.nodes = [
             lockstep_party(self.directory, node) for node in self.directory.nodes.values()
         ]
-        self.cell: Cell | None = None
+        self.cell: LockStepCell | None = None
 
     def begin(self, lives: int = 0, *observers: Any) -> tuple[Mission, MortalStore]:
         header = {"mission": "m", "mode": "lockstep", "seed": 1, "runs": PARTS, "parameters": {}}
@@ -82,7 +82,7 @@ class Cellar:
     def _go(self, mission: Mission, begin: Callable[[float], None] | None = None) -> None:
         party = CoordinatorParty(self.directory, mission, begin=begin)
         if self.cell is None:
-            self.cell = Cell([party, *self.nodes])
+            self.cell = LockStepCell([party, *self.nodes])
         else:
             self.cell.replace(party)
         assert self.cell.run(lambda: party.over, 100_000)
@@ -242,7 +242,7 @@ class Judges(Bench):
     ) -> None:
         """Somebody on the node says what a run came to. `other`: what stands in its data in place
         of that."""
-        data = {**VerdictSaid(run, status, cause).to_data(), **other.get("data", {})}
+        data = {**RunVerdict(run, status, cause).to_data(), **other.get("data", {})}
         self.node.raise_event(now, verdict_event("m"), data, source="judge", latched=True)
 
     @property

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from petrobot.coordinator.run.journal import JournalWriter, read_journal
-from petrobot.services.comm.calls.latch import Latch
 from petrobot.services.comm.protocol.security import new_key, read_key, write_key
+from petrobot.services.host.emergency_latch import Latch
 from petrobot.services.host.whole_file import make_folder, write_whole
 from tests.power_cut import power_cut
 

@@ -20,8 +20,7 @@ from petrobot.coordinator.run.executor import Executor
 from petrobot.coordinator.run.interfaces import Forgetful, Store
 from petrobot.coordinator.run.recording import Step
 from petrobot.coordinator.task.file import loads
-from petrobot.services.comm.calls.caller import Caller
-from petrobot.services.comm.calls.notices import Progress
+from petrobot.services.comm.calls.caller import Caller, CallProgress
 from petrobot.services.comm.location_file import Directory, parse
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.protocol.messages import Event, Message
@@ -151,7 +150,7 @@ class Bench:
         elif isinstance(instruction, Report):
             self.reports.append(instruction.key)
 
-    def progress(self, now: float, run: str, notice: Progress) -> None:
+    def progress(self, now: float, run: str, notice: CallProgress) -> None:
         """Not kept."""
 
     def settled(self, now: float, state: State) -> None:

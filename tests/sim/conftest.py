@@ -15,8 +15,21 @@ import numpy as np
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import NmtCommand, Type, map_pdo, nmt, sdo_write_request
-from petrobot.services.comm.canopen.cia402 import RECEIVED, SENT, Mode, Object, from_units, to_units
+from petrobot.services.comm.canopen.cia301 import (
+    DataType,
+    NmtCommand,
+    map_pdo,
+    nmt,
+    sdo_write_request,
+)
+from petrobot.services.comm.canopen.cia402 import (
+    RECEIVED,
+    SENT,
+    ObjectIndex,
+    OperationMode,
+    from_units,
+    to_units,
+)
 from petrobot.sim.catching.laboratory import CatchingLaboratory
 from petrobot.sim.catching.puma_model import PumaModel
 from petrobot.sim.catching.site import Site, read_site
@@ -65,12 +78,22 @@ class Master:
     def _setup_frames() -> list[list[Frame]]:
         groups = [[nmt(NmtCommand.ENTER_PREOPERATIONAL)]]
         for node in range(1, 7):
-            transfers = map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, 0x200 + node, 1, RECEIVED)
-            transfers += map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, 0x180 + node, 1, SENT)
+            transfers = map_pdo(
+                ObjectIndex.RPDO1, ObjectIndex.RPDO1_MAPPING, 0x200 + node, 1, RECEIVED
+            )
+            transfers += map_pdo(
+                ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, 0x180 + node, 1, SENT
+            )
             writes = [(t.index, t.sub, t.type.pack(t.value or 0)) for t in transfers]
-            writes.append((Object.MODE, 0, Type.INTEGER8.pack(Mode.CYCLIC_SYNCHRONOUS_POSITION)))
+            writes.append(
+                (
+                    ObjectIndex.MODE,
+                    0,
+                    DataType.INTEGER8.pack(OperationMode.CYCLIC_SYNCHRONOUS_POSITION),
+                )
+            )
             groups.append([sdo_write_request(node, *write) for write in writes])
-        u32, u16 = Type.UNSIGNED32.pack, Type.UNSIGNED16.pack
+        u32, u16 = DataType.UNSIGNED32.pack, DataType.UNSIGNED16.pack
         inputs = [
             sdo_write_request(7, 0x1800, 1, u32(0x187)),
             sdo_write_request(7, 0x1800, 5, u16(100)),
@@ -102,8 +125,8 @@ class Master:
             node = frame.id - 0x180
             if 1 <= node <= 6:
                 self._heard += 1
-                self.status[node - 1] = Type.UNSIGNED16.unpack(frame.data[:2])
-                self.position[node - 1] = from_units(Type.INTEGER32.unpack(frame.data[2:6]))
+                self.status[node - 1] = DataType.UNSIGNED16.unpack(frame.data[:2])
+                self.position[node - 1] = from_units(DataType.INTEGER32.unpack(frame.data[2:6]))
             elif node == 7:
                 self.inputs = frame.data[0]
             elif 0x81 <= frame.id <= 0x87:

@@ -12,14 +12,18 @@ from hypothesis import strategies as st
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import NmtCommand, NmtState
-from petrobot.services.comm.canopen.cia402 import RECEIVED, Command, to_units
+from petrobot.services.comm.canopen.cia402 import RECEIVED, DriveCommand, to_units
 from petrobot.sim.catching.drives import DriveBus
 from petrobot.sim.catching.puma import ArmPlant
 from petrobot.sim.catching.site import Site
 
 CYCLE, STEP = 0.004, 0.002
 RPDO = canopen.pdo_struct(RECEIVED)
-ENABLING = [Command.SHUTDOWN.word, Command.SWITCH_ON.word, Command.ENABLE_OPERATION.word]
+ENABLING = [
+    DriveCommand.SHUTDOWN.word,
+    DriveCommand.SWITCH_ON.word,
+    DriveCommand.ENABLE_OPERATION.word,
+]
 
 DEEDS = st.one_of(
     st.builds(lambda to: ("aim", to), st.floats(-0.05, 0.05)),

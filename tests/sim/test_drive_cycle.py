@@ -11,8 +11,21 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
-from petrobot.services.comm.canopen.cia301 import NmtCommand, NmtState, SdoClient, Transfer, Type
-from petrobot.services.comm.canopen.cia402 import RECEIVED, SENT, Command, Fault, Object, to_units
+from petrobot.services.comm.canopen.cia301 import (
+    DataType,
+    NmtCommand,
+    NmtState,
+    SdoClient,
+    Transfer,
+)
+from petrobot.services.comm.canopen.cia402 import (
+    RECEIVED,
+    SENT,
+    DriveCommand,
+    DriveFault,
+    ObjectIndex,
+    to_units,
+)
 from petrobot.sim.catching import drives
 from petrobot.sim.catching.drives import DriveBus, ServoDrive
 from petrobot.sim.catching.servo import DriveRating
@@ -21,9 +34,9 @@ from tests.waiting import Limit
 CYCLE = 0.004
 RPDO = canopen.pdo_struct(RECEIVED)
 READ = (
-    (Object.STATUSWORD, Type.UNSIGNED16),
-    (Object.POSITION, Type.INTEGER32),
-    (Object.VELOCITY, Type.INTEGER32),
+    (ObjectIndex.STATUSWORD, DataType.UNSIGNED16),
+    (ObjectIndex.POSITION, DataType.INTEGER32),
+    (ObjectIndex.VELOCITY, DataType.INTEGER32),
 )
 
 
@@ -72,10 +85,10 @@ class CycleBench:
     def configure(self, node: int) -> None:
         one, other = canopen.RPDO1_BASE + node, canopen.TPDO1_BASE + node
         transfers = [
-            Transfer(Object.MODE, 0, Type.INTEGER8, 8),
-            Transfer(Object.SYNC_PERIOD, 0, Type.UNSIGNED32, 4000),
-            *canopen.map_pdo(Object.RPDO1, Object.RPDO1_MAPPING, one, 1, RECEIVED),
-            *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, other, 1, SENT),
+            Transfer(ObjectIndex.MODE, 0, DataType.INTEGER8, 8),
+            Transfer(ObjectIndex.SYNC_PERIOD, 0, DataType.UNSIGNED32, 4000),
+            *canopen.map_pdo(ObjectIndex.RPDO1, ObjectIndex.RPDO1_MAPPING, one, 1, RECEIVED),
+            *canopen.map_pdo(ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, other, 1, SENT),
         ]
         self.transfer(node, *transfers)
 
@@ -113,7 +126,7 @@ class CycleBench:
         if what == "aim":
             self.targets = [target + 1e-3 * (number - 10) for target in self.targets]
         elif what == "trip":
-            self.bus.trip(number % 6, Fault.OVERHEATED)
+            self.bus.trip(number % 6, DriveFault.OVERHEATED)
         elif what == "power":
             self.bus.power(number % 2 == 0)
         elif what == "slow":
@@ -125,11 +138,16 @@ class CycleBench:
             self.now += 0.003 * number
         elif what == "asynchronous":
             self.transfer(
-                1 + number % 6, Transfer(Object.TPDO1, 2, Type.UNSIGNED8, 255 if number % 2 else 1)
+                1 + number % 6,
+                Transfer(ObjectIndex.TPDO1, 2, DataType.UNSIGNED8, 255 if number % 2 else 1),
             )
 
 
-WORDS = [Command.SHUTDOWN.word, Command.SWITCH_ON.word, Command.ENABLE_OPERATION.word]
+WORDS = [
+    DriveCommand.SHUTDOWN.word,
+    DriveCommand.SWITCH_ON.word,
+    DriveCommand.ENABLE_OPERATION.word,
+]
 happenings = st.tuples(
     st.sampled_from(
         ["aim"] * 6 + ["trip", "power", "slow", "stop", "silence", "asynchronous", "order", "rest"]
@@ -150,9 +168,11 @@ def test_the_quick_way_sends_what_the_steps_send(course: list[tuple[str, int, bo
             bench.cycle(word, None, False)
         for what, number, asks in course:
             bench.happen(what, number)
-            word = (Command.ENABLE_OPERATION, Command.QUICK_STOP, Command.FAULT_RESET)[
-                number % 3 if what == "order" else 0
-            ].word
+            word = (
+                DriveCommand.ENABLE_OPERATION,
+                DriveCommand.QUICK_STOP,
+                DriveCommand.FAULT_RESET,
+            )[number % 3 if what == "order" else 0].word
             bench.cycle(word, number % 6 if what == "order" and number > 15 else None, asks)
             quick += bench is benches[0] and bench.bus.drives[0]._said is not None
     assert benches[0].sent == benches[1].sent

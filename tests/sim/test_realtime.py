@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from petrobot.services.comm.calls.caller import Caller
+from petrobot.services.comm.calls.caller import Caller, CommandAnswered, Notice
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.calls.notices import Answered, Notice
 from petrobot.services.comm.canopen.ports import StreamPort
 from petrobot.services.comm.location_file import load
 from petrobot.services.comm.lockstep.party import TICK
@@ -155,7 +154,7 @@ async def test_it_says_how_it_is(shell: LaboratoryShell) -> None:
     answered: list[Answer] = []
 
     def hear(_: float, notices: list[Notice]) -> None:
-        answered.extend(notice.answer for notice in notices if isinstance(notice, Answered))
+        answered.extend(notice.answer for notice in notices if isinstance(notice, CommandAnswered))
 
     caller = Caller("laboratory", Hello(2, 2, "client", "asking", "a1"))
     client = Client(*shell.server.address, caller, on_notices=hear)

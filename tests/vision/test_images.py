@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from petrobot.services.comm.streams.camera import (
     IMAGE_HEADER,
+    CaptureImages,
     ImageDecoder,
     ImageFormatError,
     ImageServer,
@@ -24,7 +25,6 @@ from petrobot.services.comm.streams.camera import (
     encode_image,
     open_images,
 )
-from petrobot.services.comm.streams.capture import CaptureImages
 from petrobot.services.comm.streams.image import Image, ImageSource
 
 

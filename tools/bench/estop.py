@@ -36,7 +36,7 @@ from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, EmergencyL
 from petrobot.coordinator.run.supervisor import Supervisor
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.calls.client import Client
-from petrobot.services.comm.canopen.cia402 import State
+from petrobot.services.comm.canopen.cia402 import DriveState
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.protocol.messages import Hello
 from petrobot.services.comm.tls.credentials import Credentials
@@ -68,7 +68,7 @@ async def enabled(client: Client, ear: Ear) -> None:
     outcome = await asyncio.wait_for(client.call("ready", deadline=PATIENCE), PATIENCE)
     if outcome.status != "success":
         raise RuntimeError(f"the drives are not ready: {outcome.cause}: {outcome.text}")
-    await asyncio.to_thread(ear.until, lambda e: e.all_in(State.OPERATION_ENABLED), PATIENCE)
+    await asyncio.to_thread(ear.until, lambda e: e.all_in(DriveState.OPERATION_ENABLED), PATIENCE)
 
 
 async def warm(line: EmergencyLine, client: Client, ear: Ear, stops: int) -> list[float]:

@@ -37,15 +37,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tools.bench.processes import load, quantile
 
-from petrobot.services.comm.calls.caller import Accepted, Caller, Ended, Notice, PeerLost
+from petrobot.services.comm.calls.caller import CallAccepted, CallEnded, Caller, Notice, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.protocol import messages as m
 from petrobot.services.comm.streams.stream import STALE_AFTER, Incoming, StreamReceiver
-from tests.comm.fault_parts import HOST, STREAM, Cable, Fault, first_line, inflict, part
+from tests.comm.fault_parts import HOST, STREAM, Cable, LinkFault, first_line, inflict, part
 
-KNOWN_WITHIN = {Fault.KILLED: 0.05, Fault.FROZEN: 1.2, Fault.CUT: 1.2}
+KNOWN_WITHIN = {LinkFault.KILLED: 0.05, LinkFault.FROZEN: 1.2, LinkFault.CUT: 1.2}
 """Floors (s), until the caller knows,"""
-ENDED_WITHIN = {Fault.KILLED: 0.3, Fault.FROZEN: 1.2, Fault.CUT: 1.2}
+ENDED_WITHIN = {LinkFault.KILLED: 0.3, LinkFault.FROZEN: 1.2, LinkFault.CUT: 1.2}
 """and until its run has ended."""
 WATCHED = 4
 """Nodes that live while false alarms are counted."""
@@ -56,7 +56,7 @@ LOOKS = 0.001
 LIMIT = 30.0
 
 
-async def lose_a_node(fault: Fault) -> tuple[float, float]:
+async def lose_a_node(fault: LinkFault) -> tuple[float, float]:
     """Seconds from the fault until the caller knows of it, and until its run has ended."""
     told: dict[type[Notice], float] = {}
     changed = asyncio.Event()
@@ -77,17 +77,17 @@ async def lose_a_node(fault: Fault) -> tuple[float, float]:
         caller = Caller("motion", m.Hello(2, 2, "coordinator", "coord", "c1", 1))
         # What is killed is reached directly: a cable's end that is held open would answer in the
         # dead node's place.
-        port = cable.far if fault is Fault.KILLED else cable.port
+        port = cable.far if fault is LinkFault.KILLED else cable.port
         client = Client(HOST, port, caller, on_notices=take)
         client.start()
         if not await client.connected(LIMIT):
             raise TimeoutError("the node does not answer")
         caller.call(client.now(), m.Call("1", "move"))
         client.flush()
-        await until(Accepted)
+        await until(CallAccepted)
         began = client.now()
         inflict(fault, process, cable)
-        known, ended = await until(PeerLost), await until(Ended)
+        known, ended = await until(PeerLost), await until(CallEnded)
         await client.close()
         cable.close()
     return known - began, ended - began
@@ -96,11 +96,11 @@ async def lose_a_node(fault: Fault) -> tuple[float, float]:
 async def false_alarms(seconds: float) -> dict[str, int]:
     """How often nodes that live were said to be lost, and how their runs ended meanwhile."""
     lost: list[PeerLost] = []
-    ended: list[Ended] = []
+    ended: list[CallEnded] = []
 
     def take(now: float, notices: list[Notice]) -> None:
         lost.extend(one for one in notices if isinstance(one, PeerLost))
-        ended.extend(one for one in notices if isinstance(one, Ended))
+        ended.extend(one for one in notices if isinstance(one, CallEnded))
 
     with contextlib.ExitStack() as stack:
         clients = []
@@ -152,7 +152,7 @@ class Last:
         self.valid = False
 
 
-def lose_a_sender(fault: Fault, period: float) -> tuple[float, float]:
+def lose_a_sender(fault: LinkFault, period: float) -> tuple[float, float]:
     """Seconds from the fault until the last set point counts no more, and the longest between two
     looks at it."""
     last = Last()
@@ -195,7 +195,7 @@ def row(values: Sequence[float], limit: float) -> dict[str, float]:
 def run(rounds: int, periods: Sequence[float]) -> dict[str, dict[str, float]]:
     """All faults."""
     found = {}
-    for fault in Fault:
+    for fault in LinkFault:
         pairs = [asyncio.run(lose_a_node(fault)) for _ in range(rounds)]
         limit = KNOWN_WITHIN[fault]
         found[f"node {fault.value}: known (ms)"] = row(
@@ -205,7 +205,7 @@ def run(rounds: int, periods: Sequence[float]) -> dict[str, dict[str, float]]:
             [1e3 * ended for _, ended in pairs], 1e3 * ENDED_WITHIN[fault]
         )
     for period in periods:
-        for fault in Fault:
+        for fault in LinkFault:
             taken = [lose_a_sender(fault, period) for _ in range(rounds)]
             limit = STALE_AFTER + max(longest for _, longest in taken) / period
             name = f"stream of {1e3 * period:g} ms, sender {fault.value} (periods)"

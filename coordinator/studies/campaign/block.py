@@ -30,7 +30,7 @@ from petrobot.coordinator.task.file import TaskFileError
 from petrobot.coordinator.task.file import load as load_task
 from petrobot.services.comm.location_file import Directory, DirectoryError
 from petrobot.services.comm.location_file import load as load_directory
-from petrobot.services.comm.lockstep.cell import Cell, CellError, Delays
+from petrobot.services.comm.lockstep.cell import CellError, Delays, LockStepCell
 from petrobot.services.comm.lockstep.party import TICK, Party
 
 Weights = Mapping[str, Mapping[str, float]]
@@ -118,7 +118,7 @@ def run_block(bench: LoadedPlan, block: Block, weights: Sequence[Weights]) -> di
     selector.trial = lambda: len(log.trials) - 1
     coordinator = CoordinatorParty(bench.directory, mission)
     try:
-        cell = Cell([coordinator, *parties], Delays(bench.directory.delays()))
+        cell = LockStepCell([coordinator, *parties], Delays(bench.directory.delays()))
         limit = round(LONGEST_TRIAL * block.count / TICK)
         if not cell.run(lambda: coordinator.over, limit):
             raise CampaignError(

@@ -1,38 +1,46 @@
-"""The called end of the node protocol for all callers of a node, as a machine: what runs, how it
-ended, who was told.
+"""Server side of the node protocol for all callers of a node (sans-I/O).
 
-Used alike in real time (`server.py` drives it) and in lock step. The node takes its `orders` and
-reports back with `finish`, `feedback`, `raise_event` and `answer`. What it promises:
+It is used both in real time (`server.py` drives it) and in lock step. The node carries out its
+`orders` and reports back with `finish`, `feedback`, `raise_event` and `answer`. It guarantees:
 
-- A call id is run at most once in the life of this boot: a known id is re-attached or answered from
-  its stored result, one
-  whose result is gone is remembered as an id. Once the memory for ids was full
-  (`FinishedIds.complete`), a call that may have been sent before (`Call.again`) and is not known
-  does not run: it may be among those forgotten.
-- Every run ends with one outcome, kept until its caller acknowledges it or `Keeping.results` is
-  over.
-- A run goes on no longer than its deadline, and no longer without its caller than its offer's
-  `orphan_time`.
-- A device takes orders from one caller at a time: the holder of its lease.
+- A call id runs at most once in one boot of the node. A known id is answered with ACCEPT (active)
+  or with its stored result; an id whose result was dropped is still remembered. Once the memory for
+  ids was full (`FinishedIds.complete` is False), an unknown call that may have been sent before
+  (`Call.again`) does not run, because its id may be a forgotten one.
+- Every run produces one outcome, kept until its caller acknowledges it or until the time
+  `Retention.results` is over.
+- A run is active no longer than its deadline, and no longer than its offer's `orphan_time` without
+  its caller.
+- A device accepts orders from one caller at a time: the holder of its lease.
 
 Refusals are outcomes with status error and executed = no: unknown_service, local_only, old_epoch,
 device_leased, device_needs_coordinator, cancelled (before it began), and busy from the node's
-runner. executed = unknown: rebooted (meant for another boot), forgotten (its result was kept no
-longer, or perhaps not even its id).
+runner. With executed = unknown: rebooted (meant for another boot), and forgotten (its result, or
+perhaps even its id, is no longer kept).
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from petrobot.services.comm.calls.deadlines import DEADLINE, NEVER, GoingRuns, Run
 from petrobot.services.comm.calls.events import EventBoard
-from petrobot.services.comm.calls.orders import CancelRun, Commanded, Inline, Offer, Order, StartRun
-from petrobot.services.comm.calls.peers import COORDINATOR, Peers
-from petrobot.services.comm.calls.results import Keeping, ResultStore
+from petrobot.services.comm.calls.peers import (
+    COORDINATOR,
+    Inline,
+    Offer,
+    Peers,
+)
+from petrobot.services.comm.calls.runs import (
+    DEADLINE,
+    NEVER,
+    ActiveRun,
+    ActiveRuns,
+    ResultStore,
+    Retention,
+)
 from petrobot.services.comm.protocol.messages import (
     Accept,
     Answer,
@@ -57,21 +65,59 @@ from petrobot.services.comm.protocol.messages import (
 from petrobot.services.comm.protocol.plain import NotPlainError, plain
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, negotiate
 
-__all__ = ["Callee", "CancelRun", "Commanded", "Inline", "Keeping", "Offer", "Order", "StartRun"]
+__all__ = [
+    "Callee",
+    "CancelOrder",
+    "CommandOrder",
+    "Inline",
+    "Offer",
+    "Order",
+    "Retention",
+    "StartOrder",
+]
 
 ERROR: Final = "error"
 HOLD, RELEASE, HELD = "hold", "release", "held"
 ANSWERS: Final = 64
-"""Answers to commands that are kept. A command is repeated at once or never, and an answer is some
-hundred bytes."""
+"""How many answers to commands are kept. A command is repeated at once or never, and an answer has
+some hundred bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class StartOrder:
+    """Order: begin this run, and report its end with `finish`."""
+
+    call: Call
+    peer: str
+
+
+@dataclass(frozen=True, slots=True)
+class CancelOrder:
+    """Order: stop this run, stop routine first. `finish` still reports its end. Given once per
+    run."""
+
+    id: str
+    reason: str
+    """"cancelled", "deadline", "orphan", or the text that the caller gave."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandOrder:
+    """Order: carry out a command, and report with `answer`."""
+
+    command: Command
+    peer: str
+
+
+Order = StartOrder | CancelOrder | CommandOrder
 
 
 class Callee:
-    """What a node offers, to all its callers. `offers` are by name; `boot` is drawn anew at each
-    start of the process.
+    """The actions and services of a node, for all its callers.
 
-    Callers are known by their name: one process a name. Raises nothing on what callers do; `finish`
-    and its like raise ValueError when the node itself names a run that does not go on.
+    `offers` are by name. `boot` is a new random text at each start of the process. Callers are
+    known by name: one process per name. Nothing that a caller does raises an exception; `finish`
+    and similar methods raise ValueError when the node itself names a run that is not active.
     """
 
     def __init__(
@@ -82,7 +128,7 @@ class Callee:
         *,
         directory: str = "",
         any_directory: bool = False,
-        keeping: Keeping | None = None,
+        keeping: Retention | None = None,
     ) -> None:
         self.name = name
         self.boot = boot
@@ -90,16 +136,16 @@ class Callee:
         self.directory = directory
         self.events = EventBoard()
         self.soonest = NEVER
-        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for
-        that."""
-        self._keeping = keeping or Keeping()
+        """A time that is never later than `due` (s). A shell whose timer is not set for later need
+        not compute `due`, which is slower."""
+        self._keeping = keeping or Retention()
         self._peers = Peers(name, directory, any_directory, self._keeping.lease)
-        self._running = GoingRuns()
+        self._running = ActiveRuns()
         self._results = ResultStore(self._keeping, self.events.forget_run)
         self._commands: dict[str, tuple[str, str]] = {}
-        """Peer and verb of each command that waits for its answer."""
+        """Caller and verb of each command that waits for its answer."""
         self._answers: OrderedDict[tuple[str, str], Answer] = OrderedDict()
-        """The newest answers by caller and command, for a command that comes again."""
+        """The newest answers by caller and command, for commands that are repeated."""
         self._orders: list[Order] = []
         self._messages: list[tuple[str, Message]] = []
         self._takers: Mapping[type, Callable[[float, str, Any], None]] = {
@@ -114,19 +160,21 @@ class Callee:
             Bye: self._take_bye,
         }
 
-    # Callers come and go.
+    # Connections of callers.
 
     def link_up(
         self, now: float, peer: str, hello: Hello, *, local: bool = True
     ) -> Welcome | Refuse:
-        """A caller has connected (`peer` is its name, `local` whether it lives on this host). Says
-        what to answer it."""
+        """A caller has connected. Return the answer to its HELLO.
+
+        `peer` is its name, `local` whether it lives on this host.
+        """
         refusal = self._peers.refusal(peer, hello)
         if refusal is not None:
             return refusal
         known = self._peers.get(peer)
         if known is None or (known.boot, known.epoch) != (hello.boot, hello.epoch):
-            # Another process of that name counts its commands from the beginning again.
+            # A new process of that name counts its commands from 1 again.
             self._answers = OrderedDict(
                 (key, kept) for key, kept in self._answers.items() if key[0] != peer
             )
@@ -143,7 +191,7 @@ class Callee:
         return Welcome(version, self.name, self.boot, offers, tuple(runs), self.directory)
 
     def link_down(self, now: float, peer: str, *, leaves: bool = False) -> None:
-        """The link of a caller is down; with `leaves` it said good-bye and gives up its leases and
+        """The connection of a caller is closed. With `leaves` it said BYE and gives up leases and
         subscriptions."""
         if not self._peers.go(now, peer, leaves):
             return
@@ -153,10 +201,10 @@ class Callee:
                 self._running.watch_orphan(id_, now + run.orphan_time)
                 self.soonest = min(self.soonest, now + run.orphan_time)
 
-    # What callers say.
+    # Messages of callers.
 
     def receive(self, now: float, peer: str, message: Message) -> None:
-        """Take a message of a caller; kinds that only a client is sent are left alone."""
+        """Handle a message of a caller. Kinds that only a client receives are ignored."""
         taker = self._takers.get(type(message))
         if taker is not None:
             taker(now, peer, message)
@@ -176,13 +224,13 @@ class Callee:
             self._known(peer, id_)
             return
         if call.boot and call.boot != self.boot:
-            text = f"this call was meant for another boot of {self.name}"
-            # Kept: a CANCEL that follows must not be answered as if the call had never left its
-            # caller.
+            text = f"{self.name} was restarted; this call was meant for its previous process"
+            # The outcome is stored. Otherwise a following CANCEL would find no trace of the call
+            # and answer executed = no.
             self._end(now, peer, Outcome(id_, ERROR, {}, "rebooted", text, Executed.UNKNOWN))
             return
         if call.again and not self._results.gone.complete:
-            # Before any refusal: that would say that it was not executed.
+            # Checked before any refusal, because a refusal says executed = no.
             self._end(now, peer, self._maybe_forgotten(id_))
             return
         offer = self.offers.get(call.service)
@@ -196,11 +244,10 @@ class Callee:
             self._start(now, peer, call, offer)
 
     def answer_inline(self, now: float, peer: str, call: Call) -> Outcome | None:
-        """The outcome of a call to a service that is answered on the spot, None if it is another
-        kind of call.
+        """Return the outcome of a call to an inline service; None for any other call.
 
-        As `receive`, but the answer does not go through `messages`: the shell sends it, then has it
-        kept by `keep`.
+        Like `receive`, but the answer does not go through `messages`: the shell sends it, then
+        calls `keep`.
         """
         offer = self.offers.get(call.service)
         id_ = call.id
@@ -220,10 +267,10 @@ class Callee:
         return self._answered(now, offer.inline, call)
 
     def keep(self, now: float, peer: str, outcome: Outcome, weight: int | None = None) -> None:
-        """What `answer_inline` gave is on its way: keep it until it is acknowledged, as every
+        """Store an outcome that `answer_inline` returned until it is acknowledged, like every
         result.
 
-        `weight` is its length on the wire (bytes), None where it is not known.
+        `weight` is its length on the wire (bytes), None if unknown.
         """
         self._results.add(now, peer, outcome, weight)
         due = now + self._keeping.results
@@ -232,29 +279,29 @@ class Callee:
 
     @property
     def has_work(self) -> bool:
-        """Whether there are orders or messages to take out."""
+        """Return whether there are orders or messages to take."""
         return bool(self._orders or self._messages)
 
     def _known(self, peer: str, id_: str) -> None:
-        """A call that came before: tell where it stands, never run it again."""
+        """Answer a call id that came before with what is known; never run it again."""
         run = self._running.get(id_)
         owner = run.peer if run is not None else self._results.owner(id_)
         outcome = self._results.get(id_)
         if owner and owner != peer:
-            text = f"{owner} made a call of this id"
+            text = f"{owner} already made a call with this id; use unique ids"
             self._messages.append((peer, Outcome(id_, ERROR, {}, "id_taken", text, Executed.NO)))
         elif run is not None:
             self._messages.append((peer, Accept(id_)))
         elif outcome is not None:
             self._messages.append((peer, outcome))
         else:
-            text = "its result was kept no longer"
+            text = "this call was handled before, but its result is no longer kept"
             self._messages.append(
                 (peer, Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN))
             )
 
     def _maybe_forgotten(self, id_: str) -> Outcome:
-        text = f"{self.name} has forgotten ids of its oldest calls, and this one may be among them"
+        text = f"{self.name} has forgotten the ids of its oldest calls; this may be one of them"
         return Outcome(id_, ERROR, {}, "forgotten", text, Executed.UNKNOWN)
 
     def _in_use(self, device: str) -> bool:
@@ -265,18 +312,18 @@ class Callee:
         try:
             return inline(now, call)
         except Exception as fault:
-            # A fault in a service is its caller's error, not the node's end.
+            # An exception in a service is an error of this call; it must not end the node.
             text = f"{call.service} failed: {type(fault).__name__}: {fault}"
             return Outcome(call.id, ERROR, {}, "crashed", text, Executed.UNKNOWN)
 
     def _start(self, now: float, peer: str, call: Call, offer: Offer) -> None:
-        self._running[call.id] = Run(call, peer, now, offer.device, offer.orphan_time)
+        self._running[call.id] = ActiveRun(call, peer, now, offer.device, offer.orphan_time)
         deadline = call.deadline if call.deadline is not None else offer.deadline
         if deadline is not None:
             self._running.limit(call.id, now + deadline)
             self.soonest = min(self.soonest, now + deadline)
         self._messages.append((peer, Accept(call.id)))
-        self._orders.append(StartRun(call, peer))
+        self._orders.append(StartOrder(call, peer))
 
     def _take_ack(self, now: float, peer: str, ack: ResultAck) -> None:
         self._results.acknowledge(peer, (ack.id, *ack.more))
@@ -291,7 +338,7 @@ class Callee:
         elif not self._results.gone.complete:
             self._end(now, peer, self._maybe_forgotten(cancel.id))
         else:
-            # The call itself may still be on its way: remember that it must not begin.
+            # The CANCEL may have overtaken its CALL: remember that the call must not begin.
             self._end(
                 now, peer, Outcome(cancel.id, ERROR, {}, "cancelled", cancel.reason, Executed.NO)
             )
@@ -313,18 +360,18 @@ class Callee:
         if command.verb == RELEASE:
             self._running.release_all(now, [command.target] if command.target else None)
             self.soonest = min(self.soonest, self._running.due())
-        self._orders.append(Commanded(command, peer))
+        self._orders.append(CommandOrder(command, peer))
 
     def _known_command(self, peer: str, id_: str) -> None:
-        """A command that came before is not carried out again: its answer is said again, or comes
-        when it is there."""
+        """Answer a repeated command with its stored answer, or not until the answer is there; never
+        carry it out twice."""
         if (answer := self._answers.get((peer, id_))) is not None:
             self._messages.append((peer, answer))
         elif (owner := self._commands[id_][0]) != peer:
-            text = f"{owner} gave a command of this id"
+            text = f"{owner} already gave a command with this id; use unique ids"
             self._messages.append((peer, Answer(id_, False, {"cause": "id_taken", "text": text})))
 
-    # What the node reports.
+    # Reports of the node.
 
     def finish(
         self,
@@ -339,21 +386,20 @@ class Callee:
         cpu_seconds: float = 0.0,
         deferred: bool = False,
     ) -> Outcome:
-        """A run has ended; gives the outcome its caller is told. `seconds` is taken from the clock
-        when left out.
+        """A run has finished: store its outcome, send it to the caller and return it.
 
-        One that was stopped by its deadline ends ERROR `deadline` whatever it says; one stopped for
-        another reason keeps its own status if it had ended before. Raises ValueError if no such run
-        goes on.
+        `seconds` is measured here when it is left out. A run that was stopped by its deadline ends
+        as ERROR `deadline` whatever it reports; one that was stopped for another reason keeps its
+        own status if it finished before. Raises ValueError if no such run is active.
         """
         run = self._running.pop(id, None)
         if run is None:
-            raise ValueError(f"run {id}: no such run goes on")
+            raise ValueError(f"run {id}: no active run has this id")
         took = now - run.began if seconds is None else seconds
         if run.reason == "deadline":
             text = (
                 text
-                or f"it had not ended within its deadline (it ended {status} after {took:.3f} s)"
+                or f"took longer than its deadline (it finished with {status} after {took:.3f} s)"
             )
             outcome = Outcome(id, ERROR, {}, "deadline", text, executed, took, cpu_seconds)
         else:
@@ -373,10 +419,11 @@ class Callee:
         fraction: float,
         data: Mapping[str, Any] | None = None,
     ) -> None:
-        """Tell a run's caller how far it is (0 to 1); nothing is kept for one that is away."""
+        """Report the progress of a run (0 to 1) to its caller. Nothing is stored for a caller that
+        is away."""
         run = self._running.get(id)
         if run is None:
-            raise ValueError(f"run {id}: no such run goes on")
+            raise ValueError(f"run {id}: no active run has this id")
         self._send(run.peer, Feedback(id, min(max(fraction, 0.0), 1.0), plain(data or {}, "data")))
 
     def raise_event(
@@ -389,16 +436,16 @@ class Callee:
         latched: bool = False,
         run: str = "",
     ) -> Event:
-        """Raise an event: of the outside world for whoever subscribed to it, or of a run that goes
-        on, for its caller.
+        """Raise an event of the outside world for its subscribers, or of an active run for its
+        caller.
 
-        A latched one is numbered by its source (default: this node) and kept until it is
+        A latched event is numbered by its source (default: this node) and kept until it is
         acknowledged.
         """
         owner = ""
         if run:
             if run not in self._running:
-                raise ValueError(f"run {run}: no such run goes on")
+                raise ValueError(f"run {run}: no active run has this id")
             owner = self._running[run].peer
         event = Event(name, source or self.name, 0, plain(data or {}, "data"), run)
         event, peers = self.events.raise_event(event, latched, owner)
@@ -407,13 +454,14 @@ class Callee:
         return event
 
     def answer(self, now: float, id: str, ok: bool, data: Mapping[str, Any] | None = None) -> None:  # noqa: A002
-        """Answer a command. Of a `hold`, `answers` in the data say by device (runs without one:
-        this node's name) what became of it: the deadlines of runs that are held stand still until a
-        `release`. Raises ValueError if nobody waits for it.
+        """Answer a command. Raises ValueError if no such command waits for an answer.
+
+        After a `hold`, `answers` in the data says for each device what happened (this node's name
+        stands for runs without a device). The deadlines of held runs stand still until a `release`.
         """
         peer, verb = self._commands.pop(id, ("", ""))
         if not peer:
-            raise ValueError(f"command {id}: nobody waits for its answer")
+            raise ValueError(f"command {id}: no command with this id waits for an answer")
         if verb == HOLD and data is not None:
             answers = data.get("answers", {})
             self._running.hold_all(
@@ -425,46 +473,46 @@ class Callee:
             self._answers.popitem(last=False)
         self._send(peer, answer)
 
-    # What the node takes out.
+    # Output.
 
     def orders(self) -> list[Order]:
-        """What the node has to do, in order; each order is given once."""
+        """Take out what the node must do, in order; each order is returned once."""
         orders, self._orders = self._orders, []
         return orders
 
     def messages(self) -> list[tuple[str, Message]]:
-        """What to send, and to which caller, in order; each message is given once."""
+        """Take out the messages to send, with their callers, in order; each is returned once."""
         messages, self._messages = self._messages, []
         return messages
 
     def running(self) -> dict[str, str]:
-        """Runs that go on: service by call id."""
+        """Return the service of each active run, by call id."""
         return {id_: run.call.service for id_, run in self._running.items()}
 
-    # What time does.
+    # Time.
 
     def advance(self, now: float) -> None:
-        """Stop what is over its deadline or an orphan for too long; forget what was kept long
-        enough."""
+        """Stop runs that are past their deadline or were orphaned for too long; drop old
+        results."""
         for due, kind, id_, run in self._running.over(now):
             if kind == DEADLINE or self._is_orphan(run, due):
                 self._stop(id_, run, kind, kind)
         self._results.advance(now)
 
-    def _is_orphan(self, run: Run, now: float) -> bool:
+    def _is_orphan(self, run: ActiveRun, now: float) -> bool:
         return run.orphan_time is not None and self._peers.is_away(now, run.peer, run.orphan_time)
 
     def due(self) -> float | None:
-        """When `advance` has something to do next (s), None if never."""
+        """Return when `advance` must be called next (s), None if never."""
         soonest = self._running.due()
         results = self._results.due()
         self.soonest = soonest if results is None else min(soonest, results)
         return self.soonest if self.soonest < NEVER else None
 
-    def _stop(self, id_: str, run: Run, reason: str, cause: str) -> None:
+    def _stop(self, id_: str, run: ActiveRun, reason: str, cause: str) -> None:
         if not run.stopping:
             run.stopping, run.reason = True, cause
-            self._orders.append(CancelRun(id_, reason))
+            self._orders.append(CancelOrder(id_, reason))
 
     def _end(self, now: float, peer: str, outcome: Outcome) -> None:
         self._results.add(now, peer, outcome)
@@ -477,11 +525,11 @@ class Callee:
 
 
 def _sendable(outcome: Outcome) -> Outcome:
-    """The outcome in plain data; an ERROR in its place if its values are none."""
+    """Return the outcome in plain data, or an ERROR outcome if its values are not plain."""
     try:
         values = plain(outcome.values, "values") if outcome.values else outcome.values
     except NotPlainError as fault:
-        text = f"what it returned cannot be sent: {fault}"
+        text = f"the values that it returned cannot be sent: {fault}"
         return replace(
             outcome, status=ERROR, values={}, cause="bad_result", text=text, deferred=False
         )

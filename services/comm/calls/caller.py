@@ -1,65 +1,143 @@
-"""The calling end of the node protocol for one peer, as a machine: calls out, how each one ended
-in.
+"""Client side of the node protocol for one peer (sans-I/O). Every call produces exactly one result.
 
-Used alike in real time (`client.py` drives it) and in lock step (its messages travel in envelopes).
-What it promises:
+It is used both in real time (`client.py` drives it) and in lock step (its messages travel in
+envelopes). It guarantees:
 
-- Every call ends with exactly one `Ended`, whatever happens to the link or the peer.
-- No call is ever made again under another id. After a lost link the same call is sent again under
-  the same id to the same
-  boot of the peer, marked `again`: the peer knows the id, or says that it may have forgotten it,
-  and runs it at most once. Another boot is never sent it.
-- What the caller decides by itself is ERROR with a cause (the table in docs/protocol.md): executed
-  = no where the call never
-  left, unknown otherwise, also when its owner names the boot it was meant for: he may have sent it
-  before he was restarted.
+- Every call ends with exactly one `CallEnded`, whatever happens to the connection or the peer.
+- A call is never repeated under another id. After a lost connection the same call is sent again
+  under its id to the same boot of the peer, marked `again`: the peer either knows the id or says
+  that it may have forgotten it, and so runs the call at most once. It is never sent to another
+  boot.
+- A result that the caller itself decides is ERROR with a cause (see the table in docs/protocol.md):
+  executed = no if the call was never sent, otherwise unknown. It is also unknown if the owner named
+  the boot that the call was meant for: the owner may have sent it before its own restart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from petrobot.services.comm.calls.acknowledgements import Settled
-from petrobot.services.comm.calls.active import NEVER, Patience, Pending, UnderWay, Waiter
 from petrobot.services.comm.calls.events import EventIntake
-from petrobot.services.comm.calls.notices import (
-    Accepted,
-    Answered,
-    Ended,
-    EventArrived,
-    Late,
-    Notice,
-    PeerBack,
-    PeerLost,
-    Progress,
+from petrobot.services.comm.calls.pending import (
+    LOST,
+    NEVER,
+    REFUSED,
+    UNREACHABLE,
+    FinishedCalls,
+    Patience,
+    PeerAbsence,
+    PendingCall,
+    PendingCalls,
+    Waiter,
 )
-from petrobot.services.comm.calls.reconnect import LOST, REFUSED, UNREACHABLE, Absence
 from petrobot.services.comm.protocol import messages as m
+from petrobot.services.comm.protocol.messages import Answer, Event, Outcome
 from petrobot.services.comm.protocol.plain import plain
 
+# Notices: what a caller reports to its owner.
+
+
+@dataclass(frozen=True, slots=True)
+class CallAccepted:
+    """The peer accepted the call; its run begins."""
+
+    id: str
+
+
+@dataclass(frozen=True, slots=True)
+class CallProgress:
+    """Progress of a run (0 to 1)."""
+
+    id: str
+    fraction: float
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CallEnded:
+    """The one result of a call."""
+
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class LateResult:
+    """The peer's own result of a call that had already ended here (lost, given up). It is to be
+    recorded and changes nothing."""
+
+    outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class EventArrived:
+    """An event; each number of a source arrives once."""
+
+    event: Event
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAnswered:
+    """Answer to a command. `ok` is False, with `cause` in the data, if the peer gave none."""
+
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLost:
+    """The connection is closed."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PeerBack:
+    """The connection is open. `runs` are ids of this caller's calls that the peer still runs or
+    whose results it keeps."""
+
+    name: str
+    boot: str
+    same_boot: bool
+    """Whether the peer is the same process as before (False at the first connection)."""
+    offers: tuple[str, ...]
+    runs: tuple[str, ...]
+
+
+Notice = (
+    CallAccepted
+    | CallProgress
+    | CallEnded
+    | LateResult
+    | EventArrived
+    | CommandAnswered
+    | PeerLost
+    | PeerBack
+)
+
+
 __all__ = [
-    "Accepted",
-    "Answered",
+    "CallAccepted",
+    "CallEnded",
     "Caller",
-    "Ended",
+    "CommandAnswered",
     "EventArrived",
-    "Late",
+    "LateResult",
     "Notice",
     "Patience",
     "PeerBack",
 ]
-__all__ += ["PeerLost", "Progress"]
+__all__ += ["CallProgress", "PeerLost"]
 
 ERROR: Final = "error"
 
 
 class Caller:
-    """Calls to one peer. `hello` says who calls; its epoch goes into each call that names none.
+    """Calls to one peer. `hello` introduces the caller; its epoch goes into each call that names
+    none.
 
-    With `auto_ack` results and events are acknowledged at once; otherwise the owner says when they
-    are safe.
+    With `auto_ack` results and events are acknowledged at once. Otherwise the owner calls
+    `acknowledge` when it has stored them.
     """
 
     def __init__(
@@ -69,19 +147,19 @@ class Caller:
         self.hello = hello
         self.up = False
         self.boot = ""
-        """Boot of the peer, empty before the first link."""
+        """Boot of the peer; empty before the first connection."""
         self.offers: tuple[str, ...] = ()
         self.soonest = NEVER
-        """Never later than `due` (s): a shell whose timer is set for no later time need not ask for
-        that."""
+        """A time that is never later than `due` (s). A shell whose timer is not set for later need
+        not compute `due`, which is slower."""
         self._auto_ack = auto_ack
         self._patience = patience or Patience()
-        self._absence = Absence(peer, self._patience)
-        self._pending = UnderWay()
+        self._absence = PeerAbsence(peer, self._patience)
+        self._pending = PendingCalls()
         self._commands: dict[str, float] = {}
         self._names: tuple[str, ...] | None = None
         self._events = EventIntake()
-        self._settled = Settled(self._patience.acknowledge)
+        self._settled = FinishedCalls(self._patience.acknowledge)
         self._messages: list[m.Message] = []
         self._notices: list[Notice] = []
         self._takers: Mapping[type, Callable[[float, Any], None]] = {
@@ -97,7 +175,7 @@ class Caller:
         }
 
     def open(self, now: float) -> None:
-        """Say HELLO (lock step; in real time the connection does it)."""
+        """Send HELLO (lock step only; in real time the connection sends it)."""
         self._messages.append(self.hello)
         self.connecting(now)
 
@@ -108,8 +186,8 @@ class Caller:
         self.soonest = min(self.soonest, self._absence.until)
 
     def call(self, now: float, call: m.Call) -> None:
-        """Make a call. Raises ValueError for an id that is under way, NotPlainError for arguments
-        that no message carries."""
+        """Make a call. Raises ValueError for an id that is already pending, NotPlainError for
+        arguments that no message can carry."""
         self.begin(
             now,
             call.id,
@@ -137,13 +215,13 @@ class Caller:
         waiter: Waiter | None = None,
         again: bool = False,
     ) -> int:
-        """`call` by the fields of a Call. `waiter` is told its end in place of a notice, and its
-        result acknowledged then.
+        """Make a call from the fields of a Call. Return how many messages wait to be sent.
 
-        Gives how many messages wait to be taken out.
+        A `waiter` receives the result instead of a notice, and the result is then acknowledged.
+        Raises as `call`.
         """
         if id in self._pending:
-            raise ValueError(f"call {id}: this id is under way already")
+            raise ValueError(f"call {id}: a call with this id is already pending; use unique ids")
         if arguments:
             arguments = plain(arguments, "arguments")
         call = m.Call(
@@ -159,16 +237,16 @@ class Caller:
         )
         if self.up:
             due = now + self._patience.accept
-            self._pending[id] = Pending(call, not boot, now, waiter, True, False, None, due)
+            self._pending[id] = PendingCall(call, not boot, now, waiter, True, False, None, due)
             self._pending.watch_new(due, id)
             self._messages.append(call)
             if due < self.soonest:
                 self.soonest = due
         else:
-            self._begin_unsent(now, Pending(call, not boot, now, waiter))
+            self._begin_unsent(now, PendingCall(call, not boot, now, waiter))
         return len(self._messages)
 
-    def _begin_unsent(self, now: float, pending: Pending) -> None:
+    def _begin_unsent(self, now: float, pending: PendingCall) -> None:
         self._pending[pending.call.id] = pending
         away = self._absence.new_call(now)
         self.soonest = min(self.soonest, self._absence.until)
@@ -176,9 +254,10 @@ class Caller:
             self._end(pending.call.id, *away, pending.if_unsent)
 
     def cancel(self, now: float, id: str, reason: str = "", within: float | None = None) -> None:  # noqa: A002
-        """Ask for a call's run to be stopped; it still ends with one `Ended`, `no_answer` if the
-        peer does not say so `within` seconds (None: `Patience.stop`). An id that is not under way
-        is left alone.
+        """Ask the peer to stop a call's run. An id that is not pending is ignored.
+
+        The call still ends with one `CallEnded`: with cause `no_answer` if the peer does not
+        confirm `within` seconds (None: `Patience.stop`).
         """
         pending = self._pending.get(id)
         if pending is None or pending.cancel is not None:
@@ -193,11 +272,11 @@ class Caller:
             self._messages.append(m.Cancel(id, reason))
 
     def hold(self, now: float, id: str) -> None:  # noqa: A002
-        """The peer holds this call's run: it is not waited for until `release`."""
+        """The peer holds this call's run: the wait for its result stands still until `release`."""
         self._pending.hold(now, id)
 
     def release(self, now: float, id: str) -> None:  # noqa: A002
-        """The run goes on."""
+        """The run continues, and so does the wait for its result."""
         self._pending.release(now, id)
         self.soonest = min(self.soonest, self._pending.due())
 
@@ -207,7 +286,7 @@ class Caller:
             self.cancel(now, id_, reason)
 
     def command(self, now: float, command: m.Command) -> None:
-        """Give a node-level order. Raises NotPlainError for data that no message carries."""
+        """Send a command to the node. Raises NotPlainError for data that no message can carry."""
         if not self.up:
             self._no_answer(command.id, UNREACHABLE)
             return
@@ -216,38 +295,41 @@ class Caller:
         self._messages.append(replace(command, data=plain(command.data, "data")))
 
     def subscribe(self, now: float, names: Iterable[str]) -> None:
-        """Have these events sent from now on, also after each reconnection; replaces an earlier
+        """Subscribe to these events, also after each reconnection; replaces an earlier
         subscription."""
         self._names = tuple(names)
         if self.up:
             self._messages.append(m.Subscribe(self._names))
 
     def acknowledge(self, now: float, id: str) -> None:  # noqa: A002
-        """The result of this call is safe; the peer may forget it. After a restart also of a call
-        of the time before. One that was given up here has no result yet."""
+        """The owner has stored the result of this call, so the peer may forget it.
+
+        After a restart of the owner this also works for calls of the time before. A call that was
+        given up here has no result yet; it is ignored.
+        """
         settled = self._settled
         if id not in self._pending and not settled.is_safe(id) and not settled.was_given_up(id):
             self._ack(now, id)
 
     def disown(self, now: float, id: str) -> None:  # noqa: A002
-        """A run that the peer still keeps (`PeerBack.runs`) is of no use: stop it; its result comes
-        as `Late`."""
+        """Stop a run that the peer still keeps (`PeerBack.runs`) and the owner cannot use. Its
+        result comes as `LateResult`."""
         if id not in self._pending and self.up:
             self._settled.give_up(id)
             self._messages.append(m.Cancel(id, "disowned"))
 
     def acknowledge_event(self, now: float, event: m.Event) -> None:
-        """This event of its source and all before it are safe."""
+        """The owner has stored this event and all before it of the same source."""
         ack = self._events.acknowledge(event)
         if ack is not None and self.up:
             self._messages.append(ack)
 
     def under_way(self) -> tuple[str, ...]:
-        """Ids of the calls that have not ended."""
+        """Return the ids of the pending calls."""
         return tuple(self._pending)
 
     def link_up(self, now: float, welcome: m.Welcome) -> None:
-        """The peer welcomed us: what was under way is sent again under its id, or ends if this is
+        """The peer welcomed us: send pending calls again under their ids, or end them if it is
         another boot."""
         same = welcome.boot == self.boot
         self.up = True
@@ -267,17 +349,17 @@ class Caller:
         self._settle_again(now, welcome.runs)
 
     def _forget_boot(self) -> None:
-        """The peer is another process now: what the old one was sent is lost, its event numbers
-        begin anew."""
+        """The peer is a new process: calls sent to the old one are lost, and its event numbers
+        begin at 1 again."""
         self._events.clear()
         for id_, pending in list(self._pending.items()):
             if pending.sent:
-                self._end(id_, "rebooted", f"{self.peer} was started anew", m.Executed.UNKNOWN)
+                self._end(id_, "rebooted", f"{self.peer} was restarted", m.Executed.UNKNOWN)
         self._settled.peer_is_new()
 
     def _settle_again(self, now: float, runs: Iterable[str]) -> None:
-        """Runs that the peer still keeps although they ended here: stop what was given up,
-        acknowledge what was lost."""
+        """Handle runs that the peer still keeps although they ended here: cancel those given up,
+        acknowledge those whose acknowledgement was lost."""
         for id_ in runs:
             if self._settled.was_given_up(id_):
                 self._messages.append(m.Cancel(id_, "given up"))
@@ -285,8 +367,8 @@ class Caller:
                 self._ack(now, id_)
 
     def link_down(self, now: float, reason: str, *, final: bool = False) -> None:
-        """The link broke. Calls wait for it to come back, unless `final` (the peer was silent for
-        long already)."""
+        """The connection broke. Calls wait for it to come back, unless `final`: the peer has
+        already been silent for long."""
         self._absence.fail(reason)
         if not self.up:
             return
@@ -302,15 +384,17 @@ class Caller:
             self.connecting(now)
 
     def unreached(self, now: float, trouble: str, *, gone: bool = False) -> None:
-        """An attempt to connect has failed; `gone`: nothing listens at the peer's address. A
-        process that we were connected to has ended then, so its calls end at once; what was never
-        connected may still be starting."""
+        """An attempt to connect failed. `gone`: nothing listens at the peer's address.
+
+        In that case a process to which we were connected has ended, so its calls end at once. A
+        peer to which we were never connected may still be starting.
+        """
         self._absence.fail(trouble)
         if gone and self.boot and not self.up and self._absence.until < NEVER:
             self._end_all(*self._absence.give_up())
 
     def link_refused(self, now: float, refuse: m.Refuse) -> None:
-        """The peer refuses us: every call ends, also those to come, until it welcomes us."""
+        """The peer refuses us: end every call, including new ones, until it welcomes us."""
         was_up, self.up = self.up, False
         away = self._absence.refuse(refuse.code, refuse.text)
         self._messages.clear()
@@ -321,13 +405,13 @@ class Caller:
         self._end_all(*away)
 
     def receive(self, now: float, message: m.Message) -> None:
-        """Take a message of the peer; kinds that only a server is sent are left alone."""
+        """Handle a message of the peer. Kinds that only a server receives are ignored."""
         taker = self._takers.get(type(message))
         if taker is not None:
             taker(now, message)
 
     def take_outcomes(self, now: float, outcomes: Iterable[m.Outcome]) -> None:
-        """`receive` of results."""
+        """Handle several results at once (as `receive`)."""
         safe: list[str] = []
         take = self._pending.pop
         for outcome in outcomes:
@@ -347,7 +431,7 @@ class Caller:
                 safe.append(id_)
             else:
                 self._settled.end(id_, False)
-            self._notices.append(Ended(outcome))
+            self._notices.append(CallEnded(outcome))
         if safe:
             self._ack(now, *safe)
 
@@ -357,7 +441,7 @@ class Caller:
         if safe is None:
             self._settled.turn_up(id_)
             if outcome.executed is not m.Executed.UNKNOWN:
-                self._notices.append(Late(outcome))
+                self._notices.append(LateResult(outcome))
         if safe is not False:
             self._ack(now, id_)
 
@@ -366,13 +450,13 @@ class Caller:
         if pending is None or pending.accepted:
             return
         pending.accepted = True
-        self._notices.append(Accepted(accept.id))
+        self._notices.append(CallAccepted(accept.id))
         if pending.call.deadline is not None:
             self._watch(pending, pending.made + pending.call.deadline + self._patience.stop)
 
     def _take_feedback(self, now: float, feedback: m.Feedback) -> None:
         if feedback.id in self._pending:
-            self._notices.append(Progress(feedback.id, feedback.fraction, feedback.data))
+            self._notices.append(CallProgress(feedback.id, feedback.fraction, feedback.data))
 
     def _take_event(self, now: float, event: m.Event) -> None:
         new, ack = self._events.take(event, self._auto_ack)
@@ -383,10 +467,10 @@ class Caller:
 
     def _take_answer(self, now: float, answer: m.Answer) -> None:
         if self._commands.pop(answer.id, None) is not None:
-            self._notices.append(Answered(answer))
+            self._notices.append(CommandAnswered(answer))
 
     def advance(self, now: float) -> None:
-        """End what has waited too long."""
+        """End the calls that have waited too long."""
         away = self._absence.advance(now)
         if away is not None:
             self._end_all(*away)
@@ -395,43 +479,45 @@ class Caller:
                 self._give_up(
                     id_,
                     "not_accepted",
-                    f"{self.peer} did not accept it in {self._patience.accept:g} s",
+                    f"{self.peer} did not accept the call within {self._patience.accept:g} s",
                 )
         for id_ in self._pending.not_answered(now):
-            self._give_up(id_, "no_answer", f"{self.peer} gave no result in time")
+            self._give_up(id_, "no_answer", f"{self.peer} sent no result in time")
         for id_ in [id_ for id_, due in self._commands.items() if due <= now]:
             self._no_answer(id_, "no_answer")
 
     def due(self) -> float | None:
-        """When `advance` has something to do next (s), None if never."""
+        """Return when `advance` must be called next (s), None if never."""
         waits = (self._pending.due(), self._settled.due, self._absence.until)
         self.soonest = soonest = min(*waits, *self._commands.values())
         return soonest if soonest < NEVER else None
 
     @property
     def calls(self) -> int:
-        """How many calls are under way."""
+        """Return how many calls are pending."""
         return len(self._pending)
 
     @property
     def has_news(self) -> bool:
-        """Whether there are notices to take out."""
+        """Return whether there are notices to take."""
         return bool(self._notices)
 
     def messages(self, now: float | None = None) -> list[m.Message]:
-        """What to send, in order; each message is given once. Acknowledgements wait for others
-        until `now` reaches theirs."""
+        """Take out the messages to send, in order; each is returned once.
+
+        Acknowledgements wait for others until `now` reaches their time (None: do not wait).
+        """
         if now is None or now >= self._settled.due:
             self._messages += self._settled.take_acks()
         messages, self._messages = self._messages, []
         return messages
 
     def notices(self) -> list[Notice]:
-        """What the owner should know, in order; each notice is given once."""
+        """Take out the notices for the owner, in order; each is returned once."""
         notices, self._notices = self._notices, []
         return notices
 
-    def _send(self, now: float, pending: Pending) -> None:
+    def _send(self, now: float, pending: PendingCall) -> None:
         call = pending.call
         if pending.any_boot and call.boot != self.boot:
             call = pending.call = replace(call, boot=self.boot)
@@ -443,7 +529,7 @@ class Caller:
         self._messages.append(call)
         self.soonest = min(self.soonest, due)
 
-    def _watch(self, pending: Pending, due: float) -> None:
+    def _watch(self, pending: PendingCall, due: float) -> None:
         self._pending.watch_result(pending, due)
         self.soonest = min(self.soonest, due)
 
@@ -468,10 +554,10 @@ class Caller:
             self._settled.give_up(id_)
         outcome, waiter = m.Outcome(id_, ERROR, {}, cause, text, executed), pending.waiter
         if waiter is None:
-            self._notices.append(Ended(outcome))
+            self._notices.append(CallEnded(outcome))
         elif not waiter.done():
             waiter.set_result(outcome)
 
     def _no_answer(self, id_: str, cause: str) -> None:
         self._commands.pop(id_, None)
-        self._notices.append(Answered(m.Answer(id_, False, {"cause": cause})))
+        self._notices.append(CommandAnswered(m.Answer(id_, False, {"cause": cause})))

@@ -1,8 +1,8 @@
-"""The connecting end: a `Caller` on asyncio, connected again and again until it is closed.
+"""Connecting side: a `Caller` on asyncio that reconnects until it is closed.
 
 client = Client("127.0.0.1", 7001, caller, on_notices=executor.take)
 client.start()
-caller.call(client.now(), Call(...)); client.flush()      # its end comes as a notice
+caller.call(client.now(), Call(...)); client.flush()      # its result comes as a notice
 outcome = await client.call("memory.get", {"name": "x"})  # or as an awaited outcome
 """
 
@@ -18,16 +18,16 @@ import ssl
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-from petrobot.services.comm.calls.active import NEVER
 from petrobot.services.comm.calls.caller import Caller, Notice
 from petrobot.services.comm.calls.link import (
     READ_BUFFER,
-    Limits,
-    Link,
-    Timing,
+    AsyncLink,
+    LinkLimits,
+    LinkTiming,
     clock_of,
     futures_of,
 )
+from petrobot.services.comm.calls.pending import NEVER
 from petrobot.services.comm.protocol.messages import (
     Bye,
     Call,
@@ -38,27 +38,28 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
 )
 from petrobot.services.comm.protocol.security import UNPROVEN, Keys
-from petrobot.services.comm.protocol.wire import ProtocolError, Side, State
+from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
 
 OnNotices = Callable[[float, list[Notice]], None]
 NOT_TRUSTED = (
-    "perhaps our certificate is not trusted there, or has ended: it takes TLS 1.3 "
-    "and certificates of its own cell alone"
+    "perhaps our certificate is not trusted there, or has expired: the node only accepts TLS 1.3 "
+    "and certificates of its own cell"
 )
 _FOR_GOOD = frozenset(("version", "key_needed", "wrong_node"))
-"""Faults of the opening that trying again does not mend. With a key they are found in a proven
-WELCOME alone."""
+"""Faults of the opening that another attempt does not cure. With a key, they are found only in a
+proven WELCOME."""
 _EXPIRED = 10
 """X509_V_ERR_CERT_HAS_EXPIRED (openssl-verification-options)."""
 _NUMBERS = itertools.count(1)
-"""Of calls: of all clients of this process, which may have one name and boot among them."""
+"""Numbers of calls, shared by all clients of this process because two of them may have the same
+name and boot."""
 _OUTCOMES = frozenset((Outcome,))
 _NO_ARGUMENTS: Mapping[str, Any] = {}
 AT_ONCE = 32
-"""Calls that share one write: the peer takes them in while the next ones are made."""
+"""Calls that share one write: the peer works on them while the next ones are made."""
 
 
-class _ClientLink(Link):
+class _ClientLink(AsyncLink):
     """One connection to the peer."""
 
     def __init__(self, client: Client) -> None:
@@ -108,8 +109,10 @@ class _ClientLink(Link):
 
 
 class Client:
-    """Keeps a caller connected to its peer. `on_notices(now, notices)` gets what the caller has to
-    tell, in the loop, but for the ends of calls made by `call`.
+    """Keeps a caller connected to its peer.
+
+    `on_notices(now, notices)` receives the caller's notices in the event loop; the results of calls
+    made by `call` are not among them.
     """
 
     def __init__(
@@ -121,27 +124,29 @@ class Client:
         on_notices: OnNotices | None = None,
         key: Keys | None = None,
         tls: ssl.SSLContext | None = None,
-        timing: Timing | None = None,
-        limits: Limits | None = None,
+        timing: LinkTiming | None = None,
+        limits: LinkLimits | None = None,
     ) -> None:
-        """`key`: the shared key, or all that are accepted. `tls`: mutual TLS; the other end must
-        show the certificate of the caller's peer. With any of them, and without, the other end must
-        go by the name of the caller's peer."""
+        """`key`: the shared key, or all accepted keys. `tls`: mutual TLS; the other end must then
+        show the peer's certificate.
+
+        In any case the other end must have the name of the caller's peer.
+        """
         self.host = host
         self.port = port
         self.caller = caller
         self.loop = self._loop = asyncio.get_running_loop()
         self.now = clock_of(self.loop)
-        """The clock that the caller lives by: monotonic, of the loop (s)."""
+        """The caller's clock: monotonic, that of the loop (s)."""
         self.key = key
         self.tls = tls
         self.trouble = ""
-        """Why the last attempt to connect came to nothing; empty if it did not."""
+        """Why the last attempt to connect failed; empty if it succeeded."""
         self.answered = False
-        """Whether somebody answered the last attempt, be it by a refusal: then nobody needs to be
+        """Whether a process answered the last attempt, even by a refusal: then none needs to be
         launched there."""
-        self.timing = timing or Timing()
-        self.limits = limits or Limits()
+        self.timing = timing or LinkTiming()
+        self.limits = limits or LinkLimits()
         self.buffer = bytearray(READ_BUFFER)
         self._on_notices = on_notices
         self._link: _ClientLink | None = None
@@ -159,7 +164,7 @@ class Client:
         self._task = self._loop.create_task(self._connect_for_ever())
 
     async def connected(self, timeout: float) -> bool:
-        """Whether the peer has welcomed us, waiting for it at most `timeout` seconds."""
+        """Wait at most `timeout` seconds for the peer's WELCOME; return whether it came."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 await self._up.wait()
@@ -167,8 +172,8 @@ class Client:
 
     @property
     def certificate_ends(self) -> float | None:
-        """When the certificate ends that the peer showed (s since 1970); None while not connected,
-        and without TLS."""
+        """Return when the peer's certificate expires (s since 1970); None without TLS and while not
+        connected."""
         certificate = None if self._link is None else self._link.certificate()
         return (
             None
@@ -177,13 +182,13 @@ class Client:
         )
 
     async def close(self, text: str = "the caller stops") -> None:
-        """Say good-bye; calls under way end as lost."""
+        """Say BYE and disconnect; pending calls end as lost."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
         link = self._link
         if link is not None:
-            link.end(text, Bye(text) if link.connection.state is State.OPEN else None)
+            link.end(text, Bye(text) if link.connection.state is ConnectionState.OPEN else None)
             await link.finished.wait()
         if self._timer is not None:
             self._timer.cancel()
@@ -202,8 +207,8 @@ class Client:
         parent: str = "",
         seed: int = 0,
     ) -> Outcome:
-        """Call a service: its outcome, which is acknowledged when it comes. Cancelling the task
-        cancels the call."""
+        """Call a service and return its outcome, which is acknowledged on arrival. Cancelling the
+        task cancels the call."""
         id_ = f"{self._prefix}{next(_NUMBERS)}"
         now = self.now()
         future: asyncio.Future[Outcome] = self._future()
@@ -223,12 +228,12 @@ class Client:
             raise
 
     def give_up(self, id_: str) -> None:
-        """Nobody waits for this call any more."""
+        """Cancel a call whose result is not wanted any more."""
         self.caller.cancel(self.now(), id_, "its caller gave up")
         self.flush()
 
     def _flush_in_a_moment(self) -> None:
-        """What is called in this turn of the loop shares a write."""
+        """Send later in this turn of the loop, so that all calls made in it share one write."""
         if not self._flushing:
             self._flushing = True
             self._loop.call_soon(self._flush_soon)
@@ -238,7 +243,8 @@ class Client:
         self.flush()
 
     def flush(self, now: float | None = None) -> None:
-        """Send the caller's messages and tell its notices; call it after each use of the caller."""
+        """Send the caller's messages and deliver its notices. Call it after each use of the
+        caller."""
         now = self.now() if now is None else now
         caller = self.caller
         messages = caller.messages(now)
@@ -283,7 +289,7 @@ class Client:
                 await link.finished.wait()
                 if link.welcome:
                     pause = first
-            # A little chance, so that many clients do not come back in one moment.
+            # A random part of the pause, so that many clients do not reconnect at the same moment.
             await asyncio.sleep(pause * random.uniform(0.5, 1.0))
             pause = min(2.0 * pause, longest)
 
@@ -310,8 +316,8 @@ class Client:
         return link
 
     def took_outcomes(self, now: float, outcomes: list[Outcome]) -> None:
-        """Calls have ended. Their owners go on in this turn of the loop: what they call now shares
-        a write."""
+        """Handle results. Their owners continue in this turn of the loop; the calls that they make
+        now share one write."""
         caller = self.caller
         caller.take_outcomes(now, outcomes)
         if caller.has_news:
@@ -320,15 +326,15 @@ class Client:
             self._flush_in_a_moment()
 
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
-        """A link was welcomed."""
+        """The peer welcomed a connection."""
         self._link = link
         self._up.set()
         self.caller.link_up(now, welcome)
 
     def gone(self, now: float, link: _ClientLink) -> None:
-        """A link is over."""
+        """A connection has ended."""
         if self.tls is not None and not link.welcome and link.refusal is None:
-            # in TLS 1.3 a client is let in before its certificate is looked at
+            # In TLS 1.3 the client's handshake ends before the server has checked its certificate.
             link.reason += f"; {NOT_TRUSTED}"
         self.trouble = link.reason
         if self._link is link:
@@ -341,20 +347,20 @@ class Client:
         self.flush(now)
 
     def _said(self, fault: Exception) -> str:
-        """Why there is no connection, in words."""
+        """Return why there is no connection, in words."""
         if isinstance(fault, ssl.SSLCertVerificationError):
             if fault.verify_code == _EXPIRED:
                 peer = self.caller.peer
-                text = f"the certificate of {peer}, or its authority's, has ended"
-                return f"{text}; make it anew with `petrobot keys --tls` and copy it to {peer}"
-            return f"its certificate is not that of {self.caller.peer}: {fault.verify_message}"
+                text = f"the certificate of {peer}, or that of its authority, has expired"
+                return f"{text}; make a new one with `petrobot keys --tls` and copy it to {peer}"
+            return f"expected the certificate of {self.caller.peer}: {fault.verify_message}"
         said = str(getattr(fault, "strerror", "") or fault) or "no answer"
         if (
             isinstance(fault, OSError)
             and fault.errno
             and not isinstance(fault, ssl.SSLError | socket.gaierror)
         ):
-            said = os.strerror(fault.errno).lower()  # asyncio's own words are the address once more
+            said = os.strerror(fault.errno).lower()  # asyncio's text only repeats the address
         return (
             f"{said}; {NOT_TRUSTED}"
             if self.tls is not None and isinstance(fault, ConnectionError)

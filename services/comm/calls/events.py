@@ -1,37 +1,45 @@
-"""Events on their way: at the node latched ones are numbered and kept until they are safe, at the
-caller taken once."""
+"""Events between node and caller: a node numbers latched events and keeps them until they are
+stored; a caller accepts each once.
+
+Also the format of deferred verdicts, which are sent as latched events.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any, Final
 
+from petrobot.services.comm.protocol.codec import NAME_LENGTH
 from petrobot.services.comm.protocol.messages import Event, EventAck
 
 KEPT = 1_000
-"""Latched events of one source that are kept; then the oldest gives way."""
+"""How many latched events of one source are kept; then the oldest is dropped."""
 
 
 @dataclass(slots=True)
 class _Kept:
     event: Event
     owner: str
-    """Caller whose run raised it; empty for an event of the outside world, which goes to whoever
-    asked for it."""
+    """Caller whose run raised it; empty for an event of the outside world, which goes to its
+    subscribers."""
     safe: set[str] = field(default_factory=set)
+    """Callers that have acknowledged it."""
 
 
 @dataclass(slots=True)
 class _Listener:
     names: frozenset[str]
     durable: bool
-    """Comes back after a lost link and finds what came meanwhile (a coordinator)."""
+    """The caller (a coordinator) keeps its subscription while its connection is lost, and receives
+    the events of that time later."""
     up: bool = True
 
 
 class EventBoard:
-    """Who wants which events, and which latched ones somebody still waits for."""
+    """Subscriptions of the callers, and the latched events that a caller has not acknowledged
+    yet."""
 
     def __init__(self) -> None:
         self._listeners: dict[str, _Listener] = {}
@@ -40,24 +48,25 @@ class EventBoard:
         self._runs: set[str] = set()
         """Runs that have raised latched events."""
         self.lost = 0
-        """Latched events that gave way to newer ones before anybody had them."""
+        """Latched events that were dropped for newer ones before any caller had acknowledged
+        them."""
 
     def subscribe(self, peer: str, names: Iterable[str], durable: bool) -> list[Event]:
-        """From now on `peer` gets these events. Gives the kept ones that it has not said to be
-        safe, oldest first."""
+        """Send these events to `peer` from now on. Return the kept ones that it has not
+        acknowledged, oldest first."""
         self._listeners[peer] = _Listener(frozenset(names), durable)
         return self.waiting(peer)
 
     def waiting(self, peer: str) -> list[Event]:
-        """Kept events that this peer should have and has not said to be safe, by source, oldest
+        """Return the kept events for this peer that it has not acknowledged, by source, oldest
         first."""
         return [
             kept.event for kept in self._all() if peer not in kept.safe and self._wants(peer, kept)
         ]
 
     def raise_event(self, event: Event, latched: bool, owner: str) -> tuple[Event, list[str]]:
-        """The event as it goes out (numbered if latched) and to whom now. `owner` alone gets an
-        event of his run."""
+        """Return the event as it is sent (numbered if latched), and its receivers. An event of a
+        run goes to its `owner` only."""
         if latched:
             event = self._number(event, owner)
         if owner:
@@ -80,8 +89,8 @@ class EventBoard:
         return event
 
     def acknowledge(self, peer: str, source: str, number: int) -> None:
-        """The events of this source up to this number are safe with `peer`; what nobody else waits
-        for is forgotten."""
+        """`peer` has stored the events of this source up to this number; drop those that no other
+        caller waits for."""
         kept = self._kept.get(source)
         if kept is None:
             return
@@ -91,8 +100,8 @@ class EventBoard:
         self._kept[source] = deque(one for one in kept if self._awaited(one))
 
     def peer_down(self, peer: str, leaves: bool) -> None:
-        """The link of a peer is down; one that leaves in good order, or is not durable, is
-        forgotten."""
+        """A peer's connection is closed; its subscription is dropped if it `leaves` or is not
+        durable."""
         listener = self._listeners.get(peer)
         if listener is None:
             return
@@ -101,7 +110,7 @@ class EventBoard:
             del self._listeners[peer]
 
     def forget_run(self, run: str) -> None:
-        """A run is over and acknowledged: its events are gone with it."""
+        """A run is finished and acknowledged: drop its events."""
         if run not in self._runs:
             return
         self._runs.discard(run)
@@ -131,15 +140,15 @@ class EventBoard:
 
 
 class EventIntake:
-    """Events of one peer as its caller takes them: each number of a source once."""
+    """Receiving side: accepts each number of a source once."""
 
     def __init__(self) -> None:
         self._seen: dict[str, OrderedDict[int, None]] = {}
         self._unsafe: dict[str, set[int]] = {}
 
     def take(self, event: Event, safe: bool) -> tuple[bool, EventAck | None]:
-        """Whether this event is new, and what to acknowledge. `safe`: its owner needs no time to
-        make it so."""
+        """Return whether this event is new, and what to acknowledge now. `safe`: the owner needs no
+        time to store it."""
         if not event.number:
             return True, None
         seen = self._seen.setdefault(event.source, OrderedDict())
@@ -154,8 +163,8 @@ class EventIntake:
         return new, None if event.number in unsafe else EventAck(event.source, event.number)
 
     def acknowledge(self, event: Event) -> EventAck | None:
-        """This event of its source and those before it are safe now; gives what to tell the peer,
-        if anything."""
+        """The owner has stored this event and those of its source before it; return what to tell
+        the peer, if anything."""
         unsafe = self._unsafe.get(event.source, set())
         if event.number not in unsafe:
             return None
@@ -163,6 +172,71 @@ class EventIntake:
         return EventAck(event.source, event.number)
 
     def clear(self) -> None:
-        """The peer is another process: its numbers begin anew."""
+        """The peer is a new process, whose event numbers begin at 1 again."""
         self._seen.clear()
         self._unsafe.clear()
+
+
+# Deferred verdicts are sent as latched events, so that each is delivered once. The event's name
+# tells the mission run.
+#
+# The id of a run is the id of its call, `MISSION/PLACE#NUMBER`. The program that judges it, on any
+# node, raises the event `verdict:MISSION` with the data {run, status, cause, text}. The coordinator
+# of that mission run subscribes to this name and acknowledges the event when it has stored it.
+
+VERDICT_EVENTS: Final = "verdict:"
+"""Prefix of the names of these events."""
+STATUSES: Final = ("success", "failure", "error")
+
+
+@dataclass(frozen=True, slots=True)
+class RunVerdict:
+    """A later verdict on the outcome of a run."""
+
+    run: str
+    """Id of the run, as its own context gave it."""
+    status: str
+    cause: str = ""
+    text: str = ""
+
+    def to_data(self) -> dict[str, Any]:
+        """Return the verdict as the data of an event."""
+        return {"run": self.run, "status": self.status, "cause": self.cause, "text": self.text}
+
+    @classmethod
+    def of_data(cls, data: Mapping[str, Any]) -> RunVerdict:
+        """Read what `to_data` returned; cause and text may be missing. Raises ValueError that names
+        what is wrong."""
+        run, status, cause, text = (
+            data.get("run"),
+            data.get("status"),
+            data.get("cause", ""),
+            data.get("text", ""),
+        )
+        if not isinstance(run, str) or not run:
+            raise ValueError(
+                f"verdict: expected the id of a run (ctx.run of its own context), got {run!r}"
+            )
+        if status not in STATUSES:
+            raise ValueError(
+                f"verdict on {run}: expected status {', '.join(STATUSES)}, got {status!r}"
+            )
+        if not isinstance(cause, str) or not isinstance(text, str):
+            raise ValueError(
+                f"verdict on {run}: expected cause and text as str, got {cause!r} and {text!r}"
+            )
+        return cls(run, str(status), cause, text)
+
+
+def mission_of(run: str) -> str:
+    """Return the mission run that a run belongs to. Raises ValueError if this is not the id of a
+    run."""
+    mission, _, place = run.rpartition("/") if isinstance(run, str) else ("", "", "")
+    if not mission or not place.rpartition("#")[0] or len(run) > NAME_LENGTH:
+        raise ValueError(f"{run!r} is not the id of a run; pass ctx.run of the run's own context")
+    return mission
+
+
+def verdict_event(mission: str) -> str:
+    """Return the name of the event that carries verdicts on runs of this mission run."""
+    return VERDICT_EVENTS + mission

@@ -1,5 +1,7 @@
-"""One asyncio connection: bytes to a `Connection` and back, heartbeat, limits. Server and client
-build on it."""
+"""One asyncio connection: passes bytes to a `Connection` and back, with heartbeat and limits.
+
+`client.py` and `server.py` build on it.
+"""
 
 from __future__ import annotations
 
@@ -24,87 +26,88 @@ from petrobot.services.comm.protocol.messages import (
     Refuse,
 )
 from petrobot.services.comm.protocol.security import NONCE_BYTES, Keys
-from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side, State
+from petrobot.services.comm.protocol.wire import Connection, ConnectionState, ProtocolError, Side
 
 READ_BUFFER = 1 << 16
-"""Bytes read at once. What is in them is taken apart before another link is read: so many empty
-maps take some 25 ms."""
+"""Most bytes read at once. They are decoded before another connection is read; in the worst case
+(only empty maps) that takes about 25 ms."""
 HEARD = 4096
-"""Bytes of a frame that is not complete that count as a sign of life. Fewer do not: a frame that
-drips in, or whose length was changed on its way, must not hold up all that follows it for longer
+"""So many bytes of an incomplete frame count as a sign of life. Fewer do not: a frame that arrives
+byte by byte, or whose length was changed on its way, must not block the frames behind it for longer
 than silence would."""
 _HEARTBEATS = frozenset((Ping, Pong))
 _OWN = frozenset((Ping, Pong, Bye, Refuse))
-"""Kinds that a link deals with itself."""
+"""Kinds that the connection handles itself."""
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
-    """Of a link (s)."""
+class LinkTiming:
+    """Times of a connection (s)."""
 
     heartbeat: float = 0.25
-    """Silence after which PING is sent,"""
+    """After this silence PING is sent."""
     silence: float = 1.0
-    """and after which the other side counts as frozen or cut."""
+    """After this silence the other side counts as frozen or cut off."""
     handshake: float = 2.0
-    """From connection to WELCOME."""
+    """Longest time from connection to WELCOME."""
     user_timeout: float = 1.5
-    """TCP_USER_TIMEOUT: unacknowledged data for so long breaks the connection."""
+    """TCP_USER_TIMEOUT: unacknowledged data for this long breaks the connection."""
     backoff: tuple[float, float] = (0.05, 1.0)
-    """First and longest pause between attempts to connect."""
+    """Shortest and longest pause between attempts to connect."""
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """Of a server and its links."""
+class LinkLimits:
+    """Limits of a server and its connections."""
 
     connections: int = 256
     opening: int = 64
-    """Connections that have not shown who they are; above it the oldest of them gives way."""
+    """Most connections that have not shown who they are; above it the oldest of them is closed."""
     handshakes: float = 20.0
-    """Handshakes of one address that may fail a second, on average,"""
+    """Failed handshakes per second that one address may cause on average."""
     handshakes_at_once: int = 100
-    """and at once; above it the address is cut off before it says a word."""
+    """Failed handshakes that one address may cause at once. Above it the address is cut off before
+    anything is read from it."""
     spare_loopback: bool = True
-    """Whether addresses of this host may fail as often as they like: one process must not lock out
-    all others here."""
+    """Whether addresses of this host are exempt from that: one process must not lock out all others
+    on the host."""
     messages: float = 200_000.0
-    """Messages that a caller may send a second, on average: above it no more is read from it for a
-    while,"""
+    """Messages per second that a caller may send on average. Above it reading from this caller
+    pauses for a while."""
     messages_at_once: int = 20_000
-    """and at once."""
+    """Messages that a caller may send at once."""
     buffer_high: int = 1 << 20
-    """Bytes waiting to be sent above which a link is slow: progress and pulses are dropped, no more
-    is read from it,"""
+    """Unsent bytes above which a connection is slow: progress and pulses are dropped, and nothing
+    more is read from it."""
     buffer_hard: int = 64 << 20
-    """and above which it is cut."""
+    """Unsent bytes above which a connection is cut."""
 
 
 class Beat(Enum):
-    """What a heart wants."""
+    """What a heartbeat requires now."""
 
     NOTHING = auto()
     PING = auto()
     LOST = auto()
 
 
-class Heart:
-    """Silence of the other side, as a machine without clock."""
+class Heartbeat:
+    """Watches the silence of the other side (sans-I/O)."""
 
     __slots__ = ("_due", "_timing", "heard")
 
-    def __init__(self, now: float, timing: Timing) -> None:
+    def __init__(self, now: float, timing: LinkTiming) -> None:
         self._timing = timing
         self.heard = now
-        """When something last came (s); set by whoever takes it in."""
+        """When something last arrived (s); set by the reader."""
         self._due = now + timing.heartbeat
 
     def advance(self, now: float) -> Beat:
-        """What to do at `now`; call it when `due`."""
+        """Return what to do at `now`. Call it when `due`."""
         late = now - self._due
         if late > self._timing.silence / 2:
-            # This process itself stood still: what the other side said meanwhile may still lie in
-            # the socket.
+            # This process itself stood still. What the other side sent meanwhile may still be in the
+            # socket, so give it one more heartbeat before it counts as lost.
             self.heard = max(self.heard, now - self._timing.silence + self._timing.heartbeat)
         silent = now - self.heard
         if silent >= self._timing.silence:
@@ -113,16 +116,17 @@ class Heart:
         return Beat.PING if silent >= self._timing.heartbeat else Beat.NOTHING
 
     def due(self) -> float:
-        """When to call `advance` next (s)."""
+        """Return when to call `advance` next (s)."""
         return self._due
 
 
-class Link(asyncio.BufferedProtocol):
-    """Base of both ends. Subclasses take messages in `took`, the end of the link in `over`.
+class AsyncLink(asyncio.BufferedProtocol):
+    """Base class of both ends. Subclasses handle messages in `took` and the end of the connection
+    in `over`.
 
-    `buffer` is what bytes are read into, shared by all links of an owner: they are taken out before
-    anything else is read. Reading into one buffer spares a fresh one of 256 KiB for each read,
-    which costs more than all else here.
+    All connections of an owner read into the same `buffer`: its content is taken out before
+    anything else is read. asyncio would otherwise allocate a buffer of 256 KiB for each read, which
+    costs more than all other work here.
     """
 
     def __init__(
@@ -130,8 +134,8 @@ class Link(asyncio.BufferedProtocol):
         side: Side,
         server: str,
         key: Keys | None,
-        timing: Timing,
-        limits: Limits,
+        timing: LinkTiming,
+        limits: LinkLimits,
         buffer: bytearray,
     ) -> None:
         nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
@@ -142,17 +146,17 @@ class Link(asyncio.BufferedProtocol):
         self.limits = limits
         self.slow = False
         self.reason = ""
-        """Why the link is over."""
+        """Why the connection ended."""
         self.silent = False
-        """Whether it is over because the other side was silent."""
+        """Whether it ended because the other side was silent."""
         self.frames: list[bytes] = []
-        """Made by the connection and not yet written: they have their places in the order, so they
-        go before all else."""
+        """Frames that the connection has made and that are not written yet. They already have their
+        numbers (the seal counts frames), so they must be written before all others."""
         self._view = memoryview(buffer)
         self._transport: asyncio.Transport | None = None
-        self._heart = Heart(0.0, timing)
+        self._heart = Heartbeat(0.0, timing)
         self._unheard = 0
-        """Bytes of a frame that is not complete, since something was last heard."""
+        """Bytes of an incomplete frame since the last sign of life."""
         self._timer: asyncio.TimerHandle | None = None
         self._pings = 0
         self._opening = True
@@ -160,20 +164,20 @@ class Link(asyncio.BufferedProtocol):
     # For subclasses.
 
     def made(self) -> None:
-        """The connection stands."""
+        """The connection is established."""
 
     def took(self, now: float, messages: list[Message]) -> None:
-        """Messages came."""
+        """Handle received messages."""
 
     def beaten(self, now: float, count: int) -> bool:
-        """So many heartbeats came; False: the link has been ended for it."""
+        """`count` heartbeats arrived. Return False if the connection was ended for it."""
         return True
 
     def over(self, now: float) -> None:
-        """The link is over, `reason` says why. Called once."""
+        """The connection has ended, `reason` says why. Called once."""
 
     def unsendable(self, message: Message, fault: ProtocolError) -> Message | None:
-        """No frame can carry this message; gives what is sent in its place."""
+        """No frame can carry this message; return what to send in its place, or None."""
         return None
 
     # What asyncio calls.
@@ -190,9 +194,9 @@ class Link(asyncio.BufferedProtocol):
         self.made()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        return (
-            self._view
-        )  # not the bytearray: under TLS asyncio slices it, and would read into a copy
+        # A memoryview, not the bytearray: under TLS asyncio slices it, and a slice of a bytearray is
+        # a copy.
+        return self._view
 
     def buffer_updated(self, nbytes: int) -> None:
         data = bytes(self._view[:nbytes])
@@ -218,7 +222,8 @@ class Link(asyncio.BufferedProtocol):
         self._sort(now, messages)
 
     def _sort(self, now: float, messages: list[Message]) -> None:
-        """Heartbeats stay here; an end ends the link after what came before it was taken."""
+        """Handle heartbeats here and pass the rest on. BYE or REFUSE ends the connection after the
+        messages before it were handled."""
         if not messages:
             return
         last = messages[-1]
@@ -258,17 +263,16 @@ class Link(asyncio.BufferedProtocol):
     # What the owner asks for.
 
     def opened(self) -> None:
-        """The handshake is over: the heart beats from now on."""
+        """The handshake is finished: start the heartbeat."""
         self._opening = False
         now = self.now()
-        self._heart = Heart(now, self.timing)
+        self._heart = Heartbeat(now, self.timing)
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.loop.call_at(self._heart.due(), self._beat)
 
     def send(self, messages: Sequence[Message]) -> None:
-        """Send messages in one write. One that no frame can carry is answered for by
-        `unsendable`."""
+        """Send messages in one write. `unsendable` replaces a message that no frame can carry."""
         if self.frames:
             self.write()
         transport = self._transport
@@ -286,7 +290,7 @@ class Link(asyncio.BufferedProtocol):
         self._transport.write(self._bytes(message))
 
     def write(self) -> None:
-        """Send the frames that wait, in one write."""
+        """Write the waiting frames at once."""
         frames, self.frames = self.frames, []
         transport = self._transport
         if transport is None or transport.is_closing():
@@ -297,7 +301,7 @@ class Link(asyncio.BufferedProtocol):
 
     def _bear(self, transport: asyncio.Transport) -> None:
         if transport.get_write_buffer_size() > self.limits.buffer_hard:
-            self.cut(f"it does not read: {self.limits.buffer_hard} bytes wait for it")
+            self.cut(f"it does not read: more than {self.limits.buffer_hard} bytes wait for it")
 
     def _all_bytes(self, messages: Sequence[Message]) -> bytes:
         if not self.slow and not self._opening:
@@ -313,15 +317,14 @@ class Link(asyncio.BufferedProtocol):
         try:
             return self.connection.send(message)
         except ProtocolError as fault:
-            if self.connection.state is not State.OPEN:
-                return (
-                    b""  # its last word came with what is being answered: nobody listens any more
-                )
+            if self.connection.state is not ConnectionState.OPEN:
+                # The peer's BYE came together with the message that is being answered.
+                return b""
             instead = self.unsendable(message, fault)
             return b"" if instead is None else self.connection.send(instead)
 
     def end(self, reason: str, last: Message | None = None) -> None:
-        """Say a last word (Bye, Refuse) and close once it is out."""
+        """Send a last message (Bye, Refuse) and close the connection once it is written."""
         transport = self._transport
         if transport is None:
             return
@@ -334,18 +337,18 @@ class Link(asyncio.BufferedProtocol):
         transport.close()
 
     def cut(self, reason: str) -> None:
-        """Close at once."""
+        """Close the connection at once."""
         self.reason = self.reason or reason
         if self._transport is not None:
             self._transport.abort()
 
     def certificate(self) -> dict[str, Any] | None:
-        """The other end's certificate, as `ssl.SSLSocket.getpeercert` gives it; None without
+        """Return the other end's certificate as `ssl.SSLSocket.getpeercert` does; None without
         TLS."""
         return None if self._transport is None else self._transport.get_extra_info("peercert")
 
     def ends(self) -> tuple[str, str]:
-        """Addresses of the other and of this end; empty where there are none."""
+        """Return the addresses of the other and of this end; empty where there are none."""
         if self._transport is None:
             return "", ""
         return _host(self._transport.get_extra_info("peername")), _host(
@@ -355,8 +358,8 @@ class Link(asyncio.BufferedProtocol):
     def _refuse(self, now: float, fault: ProtocolError) -> None:
         opening = self.connection.version == 0
         self._sort(now, list(fault.before))
-        # The connection is closed for its part already; a sealed one could only be answered with a
-        # seal.
+        # The state machine is closed already, so `refusal` makes the frame (with a seal, if the
+        # connection has one).
         self.reason = self.reason or str(fault)
         if self._transport is not None and not self._transport.is_closing():
             refusal = self.connection.refusal(Refuse(fault.code, fault.text[:500]))
@@ -365,10 +368,10 @@ class Link(asyncio.BufferedProtocol):
         self.faulted(opening, fault)
 
     def faulted(self, opening: bool, fault: ProtocolError) -> None:
-        """The other side broke the protocol (for subclasses that count)."""
+        """The other side broke the protocol (for subclasses that count this)."""
 
     def _handshake_over(self) -> None:
-        self.cut(f"no handshake in {self.timing.handshake:g} s")
+        self.cut(f"no handshake within {self.timing.handshake:g} s")
 
     def _beat(self) -> None:
         now = self.now()
@@ -384,13 +387,14 @@ class Link(asyncio.BufferedProtocol):
 
 
 def clock_of(loop: asyncio.AbstractEventLoop) -> Callable[[], float]:
-    """The clock of a loop: for asyncio's own the function that its `time` calls."""
+    """Return the clock of a loop; for asyncio's own loop the function that its `time` calls, which
+    saves a call."""
     return time.monotonic if type(loop).time is asyncio.BaseEventLoop.time else loop.time
 
 
 def futures_of(loop: asyncio.AbstractEventLoop) -> Callable[[], asyncio.Future[Any]]:
-    """What makes the futures of a loop: for asyncio's own the class that its `create_future`
-    calls."""
+    """Return a factory of the loop's futures; for asyncio's own loop the class itself, which saves
+    a call."""
     usual = getattr(type(loop), "create_future", None) is asyncio.BaseEventLoop.create_future
     return functools.partial(asyncio.Future, loop=loop) if usual else loop.create_future
 
@@ -399,7 +403,7 @@ def _host(address: object) -> str:
     return str(address[0]) if isinstance(address, tuple) and address else ""
 
 
-def _tune(sock: socket.socket, timing: Timing) -> None:
+def _tune(sock: socket.socket, timing: LinkTiming) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)

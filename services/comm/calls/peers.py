@@ -1,4 +1,5 @@
-"""Who calls a node: whom it welcomes, whose link is up, and who holds the lease of which device."""
+"""The callers of a node: which are welcome, which are connected, and which one holds the lease of
+each device."""
 
 from __future__ import annotations
 
@@ -6,19 +7,39 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from petrobot.services.comm.calls.orders import Offer
-from petrobot.services.comm.protocol.messages import Call, Hello, Refuse
+from petrobot.services.comm.protocol.messages import Call, Hello, Outcome, Refuse
 from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION, negotiate
+
+Inline = Callable[[float, Call], Outcome]
+"""A service answered at once, in the node's event loop: (now, call) to outcome. It must neither
+wait nor compute for long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """An action or service that this node offers."""
+
+    scope: str = "network"
+    """"network", or "local" for callers on this host only."""
+    device: str = ""
+    orphan_time: float | None = None
+    """How long a run stays active without its caller (s); None: without limit."""
+    deadline: float | None = None
+    """Deadline of a call that names none (s)."""
+    inline: Inline | None = None
+    roles: frozenset[str] = frozenset()
+    """Roles of the callers that may call it; empty: all."""
+
 
 COORDINATOR: Final = "coordinator"
 NODE: Final = "node"
 KNOWN: Final = 256
-"""Callers that are remembered after their link went down."""
+"""How many callers are remembered after their connection closed."""
 
 
 @dataclass(slots=True)
 class Peer:
-    """What is known of a caller."""
+    """What is known about one caller."""
 
     role: str
     boot: str
@@ -29,8 +50,10 @@ class Peer:
 
 
 class Peers:
-    """The callers of one node, by name; one process a name. `lease` is how long (s) one that is
-    away keeps its devices."""
+    """The callers of one node by name, one process per name.
+
+    `lease` is how long (s) an absent caller keeps its devices.
+    """
 
     def __init__(self, node: str, directory: str, any_directory: bool, lease: float) -> None:
         self._node = node
@@ -41,28 +64,28 @@ class Peers:
         self._leases: dict[str, str] = {}
 
     def get(self, name: str) -> Peer | None:
-        """What is known of this caller."""
+        """Return what is known about this caller."""
         return self._peers.get(name)
 
     def is_up(self, name: str) -> bool:
-        """Whether this caller's link is up."""
+        """Return whether this caller is connected."""
         peer = self._peers.get(name)
         return peer is not None and peer.up
 
     def refusal(self, name: str, hello: Hello) -> Refuse | None:
-        """Why this process is not welcome under this name; None if it is."""
+        """Return why this process is not welcome under this name; None if it is welcome."""
         if negotiate(hello.oldest_version, hello.newest_version) is None:
             spoken = f"{OLDEST_VERSION} to {NEWEST_VERSION}"
             asked = f"{hello.oldest_version} to {hello.newest_version}"
             return Refuse(
                 "version",
-                f"{self._node} speaks versions {spoken}, you {asked}: update the older side",
+                f"{self._node} speaks versions {spoken}, the caller {asked}: update the older side",
             )
         known = self._peers.get(name)
         if known is not None and hello.epoch < known.epoch:
             text = (
-                f"{name} has been here with epoch {known.epoch}, you come with "
-                f"{hello.epoch}: a newer one has taken over"
+                f"{name} was connected with epoch {known.epoch}, this process has epoch "
+                f"{hello.epoch}: a newer process has taken over"
             )
             return Refuse("old_epoch", text)
         if (
@@ -73,19 +96,25 @@ class Peers:
         ):
             return Refuse(
                 "name_taken",
-                f"another process is connected as {name}: stop it, or take another name",
+                f"another process is connected as {name}: stop it, or use another name",
             )
         mine, its = self._directory, hello.directory
         if mine and its and mine != its and not self._any_directory:
-            text = f"your services.toml ({its[:12]}) is not {self._node}'s ({mine[:12]})"
+            text = (
+                f"the caller's services.toml ({its[:12]}) differs from that of {self._node} "
+                f"({mine[:12]})"
+            )
             return Refuse(
                 "directory", f"{text}: copy the same file to each host and start its node again"
             )
         return None
 
     def come(self, name: str, hello: Hello, local: bool) -> str:
-        """A caller is welcome. Gives the name of the oldest of too many that are away, which is
-        forgotten; else empty."""
+        """Note that a caller is connected.
+
+        Return the name of the caller that is forgotten for it (the longest absent one, if there are
+        too many); else empty.
+        """
         self._peers.pop(name, None)
         self._peers[name] = Peer(hello.role, hello.boot, hello.epoch, local)
         if len(self._peers) > KNOWN:
@@ -96,7 +125,8 @@ class Peers:
         return ""
 
     def go(self, now: float, name: str, leaves: bool) -> bool:
-        """A caller's link is down; with `leaves` it gives up its leases. Says whether it was up."""
+        """Note that a caller's connection is closed; return whether it was connected. With `leaves`
+        it gives up its leases."""
         peer = self._peers.get(name)
         if peer is None or not peer.up:
             return False
@@ -110,31 +140,30 @@ class Peers:
     def refusal_of_call(
         self, now: float, name: str, call: Call, offer: Offer | None, in_use: Callable[[str], bool]
     ) -> tuple[str, str] | None:
-        """Why this call is not begun: cause and text; None if it is, and then the caller holds the
-        lease of its device.
+        """Return why this call must not begin: cause and text; None if it may begin.
 
-        `in_use(device)` says whether a run goes on that needs it.
+        In that case the caller then holds the lease of the call's device. `in_use(device)` tells
+        whether an active run needs it.
         """
         peer = self._peers.get(name)
         if peer is None or not peer.up:
-            return "not_welcome", f"{name} has not been welcomed by {self._node}"
+            return "not_welcome", f"{name} is not connected to {self._node}: send HELLO first"
         if offer is None:
             return (
                 "unknown_service",
-                f"{self._node} offers no {call.service}: services.toml places it elsewhere "
-                "or nowhere",
+                f"{self._node} does not offer {call.service}: see services.toml for its node",
             )
         if call.epoch < peer.epoch and peer.role == COORDINATOR:
             return (
                 "old_epoch",
-                f"{name} is at epoch {peer.epoch}, the call is of epoch {call.epoch}",
+                f"{name} is at epoch {peer.epoch}, but the call has the older epoch {call.epoch}",
             )
         if offer.scope == "local" and not peer.local:
-            return "local_only", f"{call.service} serves callers on the host of {self._node} alone"
+            return "local_only", f"{call.service} only serves callers on the host of {self._node}"
         if offer.roles and peer.role not in offer.roles:
             return (
                 "not_for_role",
-                f"{call.service} serves {' and '.join(sorted(offer.roles))}, not a {peer.role}",
+                f"{call.service} only serves {' and '.join(sorted(offer.roles))}, not a {peer.role}",
             )
         return self._lease(now, name, peer, offer.device, in_use) if offer.device else None
 
@@ -144,11 +173,11 @@ class Peers:
         if peer.role == NODE:
             return (
                 "device_needs_coordinator",
-                f"{device} takes orders from a coordinator alone, not from node {name}",
+                f"{device} only accepts orders from a coordinator, not from node {name}",
             )
         holder = self._leases.get(device, name)
         if holder != name and (self._is_near(now, holder) or in_use(device)):
-            return "device_leased", f"{device} takes orders from {holder}"
+            return "device_leased", f"{device} accepts orders from {holder} at the moment"
         self._leases[device] = name
         return None
 
@@ -157,6 +186,6 @@ class Peers:
         return peer is not None and (peer.up or now < peer.down_at + self._lease_time)
 
     def is_away(self, now: float, name: str, seconds: float) -> bool:
-        """Whether this caller has been away for so long."""
+        """Return whether this caller has been away for this long (s)."""
         peer = self._peers.get(name)
         return peer is None or (not peer.up and now >= peer.down_at + seconds)

@@ -1,4 +1,4 @@
-"""The listening end: a `Callee` on asyncio.
+"""Listening side: a `Callee` on asyncio.
 
     server = Server(callee, on_orders=node.take)
     await server.start("127.0.0.1", 7001)
@@ -6,7 +6,7 @@
     callee.finish(server.now(), id, "success", values)
     server.flush()
 
-Services answered on the spot (`Offer.inline`) never leave the loop; everything else comes to
+Inline services (`Offer.inline`) are answered inside the loop; all other calls become orders for
 `on_orders`.
 """
 
@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections import OrderedDict
 from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import Final
 
 from petrobot.services.comm.calls.callee import Callee, Order
-from petrobot.services.comm.calls.connection_limits import Bucket, Knocks
-from petrobot.services.comm.calls.link import READ_BUFFER, Limits, Link, Timing
+from petrobot.services.comm.calls.link import READ_BUFFER, AsyncLink, LinkLimits, LinkTiming
 from petrobot.services.comm.protocol.messages import (
     Answer,
     Bye,
@@ -30,24 +31,79 @@ from petrobot.services.comm.protocol.messages import (
     Refuse,
 )
 from petrobot.services.comm.protocol.security import Keys, is_loopback, require_key
-from petrobot.services.comm.protocol.wire import ProtocolError, Side, State
+from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
 from petrobot.services.comm.tls.credentials import may_speak_as, name_on
 from petrobot.services.comm.tls.expiry import DAY, look_again
 from petrobot.services.comm.tls.listener import Admission, TlsListener
 
+# Limits of a listening end (sans-I/O): failed handshakes per address, messages per caller.
+
+KNOWN: Final = 1_024
+"""How many addresses are remembered with their failures; then the one whose last failure is oldest
+is forgotten."""
+
+
+class TokenBucket:
+    """A token bucket: `rate` per second on average, at most `burst` at once."""
+
+    __slots__ = ("_at", "_burst", "_level", "_rate")
+
+    def __init__(self, rate: float, burst: float, now: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._level, self._at = burst, now
+
+    def level(self, now: float) -> float:
+        """Return how many tokens are left; below 0 they are owed."""
+        self._level = min(self._burst, self._level + (now - self._at) * self._rate)
+        self._at = now
+        return self._level
+
+    def take(self, now: float, amount: float) -> float:
+        """Take tokens; return the seconds until they are no longer owed (0: there were enough)."""
+        self._level = self.level(now) - amount
+        return max(0.0, -self._level / self._rate)
+
+
+class FailedHandshakes:
+    """Failed handshakes by address: an address that only connects, or guesses keys, is ignored for
+    a while.
+
+    A caller with the right key fails none, so its own address never makes it wait. `rate` per
+    second and `burst` at once are allowed.
+    """
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
+
+    def admits(self, now: float, address: str) -> bool:
+        """Return whether this address may try a handshake."""
+        bucket = self._buckets.get(address)
+        return bucket is None or bucket.level(now) >= 1.0
+
+    def failed(self, now: float, address: str) -> None:
+        """Count a failed handshake of this address."""
+        bucket = self._buckets.pop(address, None) or TokenBucket(self._rate, self._burst, now)
+        self._buckets[address] = bucket
+        if bucket.level(now) >= 1.0:
+            bucket.take(now, 1.0)
+        if len(self._buckets) > KNOWN:
+            self._buckets.popitem(last=False)
+
+
 OnOrders = Callable[[float, list[Order]], None]
 AT_ONCE = 16
-"""Answers that share one write: the caller takes them in while the next ones are made."""
+"""Answers that share one write: the caller reads them while the next ones are made."""
 BACKLOG = 128
-"""Connections that may wait to be accepted, and"""
+"""Connections that may wait to be accepted."""
 ACCEPTED = 16
-"""how many are accepted in one turn of the loop: a crowd at the door must not keep those inside
-waiting."""
+"""Connections accepted in one turn of the loop: many new connections must not delay the callers
+that are already connected."""
 COUNTED = 256
-"""Messages of a caller after which its rate is looked at."""
+"""The rate of a caller is checked after this many messages."""
 
 
-class _ServerLink(Link):
+class _ServerLink(AsyncLink):
     """A caller's connection."""
 
     def __init__(self, server: Server) -> None:
@@ -60,7 +116,7 @@ class _ServerLink(Link):
         self.address = ""
         limits = server.limits
         self._taken = 0
-        self._budget = Bucket(limits.messages, limits.messages_at_once, self.now())
+        self._budget = TokenBucket(limits.messages, limits.messages_at_once, self.now())
 
     def made(self) -> None:
         self.address, _ = self.ends()
@@ -78,8 +134,8 @@ class _ServerLink(Link):
                 and peer
                 and (answer := callee.answer_inline(now, peer, message)) is not None
             ):
-                # The shortest way for what is answered on the spot; the caller reads while its
-                # answer is being kept here.
+                # Fast path for inline services: the answer is written before it is stored, so that
+                # the caller reads it while this process stores it.
                 answer, frame = self._framed(answer)
                 self.frames.append(frame)
                 if len(self.frames) >= at_once:
@@ -98,16 +154,13 @@ class _ServerLink(Link):
             self._server.arm()
 
     def _framed(self, answer: Outcome) -> tuple[Outcome, bytes]:
-        """A result and its frame; where no frame can carry it, what is answered in its place, which
-        is then what is kept."""
+        """Return a result and its frame; if no frame can carry it, an ERROR result in its place."""
         try:
             return answer, self.connection.send(answer)
         except ProtocolError as fault:
-            if self.connection.state is not State.OPEN:
-                return (
-                    answer,
-                    b"",
-                )  # its last word came with the call: it may ask again when it is back
+            if self.connection.state is not ConnectionState.OPEN:
+                # The caller's BYE came with the call. The stored result is there when it is back.
+                return answer, b""
             answer = _bad_result(answer, fault)
             return answer, self.connection.send(answer)
 
@@ -116,8 +169,8 @@ class _ServerLink(Link):
         return self._taken < COUNTED or self._in_time(now)
 
     def _in_time(self, now: float) -> bool:
-        """Read no more for a while from one that sends faster than it may; False: it is too much,
-        and it must go."""
+        """Pause reading from a caller that sends too fast. Return False if it was far too fast and
+        is disconnected."""
         wait = self._budget.take(now, self._taken)
         self._taken = 0
         if wait <= 0.0 or self._transport is None:
@@ -127,7 +180,7 @@ class _ServerLink(Link):
             limits = self.limits
             text = (
                 f"at most {limits.messages_at_once} messages at once and "
-                f"{limits.messages:g} a second: send fewer"
+                f"{limits.messages:g} per second: send fewer"
             )
             self.end(f"too_fast: {text}", Refuse("too_fast", text))
             return False
@@ -136,12 +189,12 @@ class _ServerLink(Link):
         return True
 
     def _go_on(self) -> None:
-        self._heart.heard = self.now()  # it was we who did not listen
+        self._heart.heard = self.now()  # the silence was ours: reading was paused
         if self._transport is not None and not self.slow:
             self._transport.resume_reading()
 
     def certified(self) -> str | None:
-        """The name on the caller's certificate; None without TLS."""
+        """Return the name on the caller's certificate; None without TLS."""
         if self._server.tls is None or self._transport is None:
             return None
         return name_on(self.certificate())
@@ -150,7 +203,7 @@ class _ServerLink(Link):
         certified = self.certified()
         if certified is not None and not may_speak_as(certified, hello.role, hello.name):
             text = (
-                f"the certificate of {certified or 'nobody'} does not let you speak as "
+                f"the certificate of {certified or 'no name'} does not allow the caller to act as "
                 f"{hello.role} {hello.name}"
             )
             self._server.count("certificate")
@@ -189,7 +242,7 @@ def _bad_result(outcome: Outcome, fault: ProtocolError) -> Outcome:
 
 
 class Server:
-    """Serves a callee on one address. `on_orders(now, orders)` gets what the node has to do, in the
+    """Serves a callee at one address. `on_orders(now, orders)` receives the callee's orders, in the
     loop."""
 
     def __init__(
@@ -199,15 +252,15 @@ class Server:
         on_orders: OnOrders | None = None,
         key: Keys | None = None,
         tls: ssl.SSLContext | None = None,
-        timing: Timing | None = None,
-        limits: Limits | None = None,
+        timing: LinkTiming | None = None,
+        limits: LinkLimits | None = None,
     ) -> None:
-        """`tls`: mutual TLS; each caller speaks under the name on its certificate."""
+        """`tls`: mutual TLS; each caller must use the name on its certificate."""
         self.callee = callee
         self.key = key
         self.tls = tls
-        self.timing = timing or Timing()
-        self.limits = limits or Limits()
+        self.timing = timing or LinkTiming()
+        self.limits = limits or LinkLimits()
         self.faults: dict[str, int] = {}
         """How often callers broke the protocol, by code."""
         self.buffer = bytearray(READ_BUFFER)
@@ -216,19 +269,19 @@ class Server:
         self._opening: dict[_ServerLink, None] = {}
         self._all: set[_ServerLink] = set()
         self._server: asyncio.Server | TlsListener | None = None
-        self._knocks = Knocks(self.limits.handshakes, self.limits.handshakes_at_once)
+        self._knocks = FailedHandshakes(self.limits.handshakes, self.limits.handshakes_at_once)
         self._timer: asyncio.TimerHandle | None = None
         self._daily: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def now(self) -> float:
-        """The clock that the callee lives by: monotonic, of the loop (s)."""
+        """Return the time on the callee's clock: monotonic, that of the loop (s)."""
         assert self._loop is not None, "the server has not been started"
         return self._loop.time()
 
     async def start(self, host: str, port: int) -> None:
         """Listen. Raises KeyNeededError if other hosts could connect and there is no key, OSError
-        if it cannot be done."""
+        if the address cannot be used."""
         require_key(self.callee.name, host, self.key or self.tls is not None)
         self._loop = asyncio.get_running_loop()
         if self.tls is None:
@@ -237,9 +290,9 @@ class Server:
             )
             for sock in server.sockets:
                 with sock.dup() as own:
-                    own.listen(
-                        BACKLOG
-                    )  # asyncio takes as many in one turn as it lets wait: of that we want less
+                    # asyncio accepts `backlog` connections per turn of the loop and passes the same
+                    # number to listen(). We want few per turn but a long queue.
+                    own.listen(BACKLOG)
             self._server = server
         else:
             listener = TlsListener(host, port, self.tls, self.timing.handshake, self.limits.opening)
@@ -249,22 +302,22 @@ class Server:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where it listens."""
+        """Return the address at which it listens."""
         assert self._server is not None, "the server has not been started"
         host, port = self._server.sockets[0].getsockname()[:2]
         return str(host), int(port)
 
     @property
     def connected(self) -> tuple[str, ...]:
-        """Names of the callers that are welcome and here."""
+        """Return the names of the connected callers."""
         return tuple(self._links)
 
     async def close(self, text: str = "the node stops") -> None:
-        """Say good-bye to all callers and listen no more."""
+        """Say BYE to all callers and stop listening."""
         if self._server is not None:
             self._server.close()
         for link in list(self._all):
-            if link.connection.state is State.OPEN:
+            if link.connection.state is ConnectionState.OPEN:
                 link.end(text, Bye(text))
             else:
                 link.cut(text)
@@ -278,7 +331,8 @@ class Server:
             await asyncio.sleep(0)
 
     def flush(self, now: float | None = None) -> None:
-        """Hand out the callee's orders and messages; call it after each report to the callee."""
+        """Deliver the callee's orders and send its messages. Call it after each report to the
+        callee."""
         now = self.now() if now is None else now
         callee = self.callee
         if self._on_orders is not None:
@@ -304,7 +358,7 @@ class Server:
             link.send(messages)
 
     def arm(self) -> None:
-        """Have the callee's `advance` called when it is due."""
+        """Set the timer for the callee's next `advance`."""
         if self._timer is not None and self._timer.when() <= self.callee.soonest:
             return
         due = self.callee.due()
@@ -322,16 +376,16 @@ class Server:
         self.flush(now)
 
     def _look_at_certificates(self) -> None:
-        """A node may run for years: look each day whether its certificates end."""
+        """Check once a day whether a certificate expires soon: a node may run for years."""
         assert self._loop is not None
         look_again(datetime.now(UTC))
         self._daily = self._loop.call_later(DAY, self._look_at_certificates)
 
-    # What links report.
+    # Reports of connections.
 
     def came(self, link: _ServerLink) -> None:
-        """A connection stands. Above the limits the oldest one that has not shown who it is gives
-        way, else the new one."""
+        """A connection is established. Above the limits the oldest connection without WELCOME is
+        closed, which may be this one."""
         if self.tls is None and not self.admits(link.address):
             link.cut("too many handshakes of its address have failed")
             self.count("knocks")
@@ -340,12 +394,12 @@ class Server:
         self._opening[link] = None
         if len(self._opening) > self.limits.opening or len(self._all) > self.limits.connections:
             oldest = next(iter(self._opening))
-            self._opening.pop(oldest)  # now: it is told of its end in a later turn of the loop only
+            self._opening.pop(oldest)  # now, because `gone` follows in a later turn of the loop
             self.failed(oldest.address)
             oldest.cut("too many connections")
 
     def welcomed(self, link: _ServerLink) -> None:
-        """A caller has been welcomed; an older connection of its name is cut."""
+        """A caller was welcomed; an older connection of its name is closed."""
         self._opening.pop(link, None)
         older = self._links.get(link.peer)
         self._links[link.peer] = link
@@ -353,20 +407,20 @@ class Server:
             older.cut("a newer connection of its name took its place")
 
     def count(self, fault: str) -> None:
-        """Count what a caller did wrong."""
+        """Count a fault of a caller."""
         self.faults[fault] = self.faults.get(fault, 0) + 1
 
     def admits(self, address: str) -> bool:
-        """Whether a connection of this address is listened to."""
+        """Return whether connections of this address are accepted."""
         spared = self.limits.spare_loopback and is_loopback(address)
         return spared or self._knocks.admits(self.now(), address)
 
     def failed(self, address: str) -> None:
-        """A connection of this address ended before it was welcome."""
+        """A connection of this address ended before it was welcomed."""
         self._knocks.failed(self.now(), address)
 
     def gone(self, link: _ServerLink, now: float) -> None:
-        """A connection is over."""
+        """A connection has ended."""
         if link in self._opening:
             self.failed(link.address)
         self._all.discard(link)

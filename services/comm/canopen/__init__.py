@@ -1,1 +1,1 @@
-"""CAN and CANopen: the simulated bus, frames, a master, and the drives' profile CiA 402."""
+"""CAN and CANopen: the simulated bus, frames, a master, and the drive profile CiA 402."""

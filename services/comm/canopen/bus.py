@@ -1,4 +1,4 @@
-"""A CAN bus as drivers and simulated drives see it: frames out, frames in, nothing blocks."""
+"""A CAN bus as drivers and simulated drives see it: send frames, receive frames, never block."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class Frame(NamedTuple):
 
 
 class CanBus(Protocol):
-    """One port on a bus; a port does not hear itself."""
+    """One port on a bus. A port does not receive its own frames."""
 
     def send(self, frame: Frame) -> None:
         """Put a frame on the bus. Raises ConnectionError when the bus is gone."""
 
     def receive(self) -> Sequence[Frame]:
-        """All frames that arrived since the last call, oldest first. Raises ConnectionError when
-        the bus is gone."""
+        """Return all frames that arrived since the last call, oldest first. Raises ConnectionError
+        when the bus is gone."""
 
     def close(self) -> None:
         """Leave the bus."""

@@ -1,5 +1,4 @@
-"""CAN over a byte stream: its framing, and the python-can interface `petrobot_stream` that speaks
-it.
+"""CAN over a byte stream: its framing, and the python-can interface `petrobot_stream` for it.
 
     bus = can.Bus(interface="petrobot_stream", channel="tcp://127.0.0.1:7303")      # or "unix:///run/cell/can"
 
@@ -8,8 +7,8 @@ Framing, both directions. First each end sends the six bytes `PBCAN\\x02`. Then 
     u8   DLC, 0 to 8
     DLC bytes of data (none in a remote frame)
     u32  CRC-32 of all that (IEEE 802.3, as zlib's), big-endian: a real bus has a CRC of its own
-A hub (`can_hub`) passes each frame on to all ports but the one it came from, in order of arrival. A
-port that sends other things, or does not read while more than 256 KiB wait for it, is dropped.
+A hub (`hub.py`) passes each frame on to all ports except the one that sent it, in order of arrival.
+A port that sends anything else, or does not read while more than 256 KiB wait for it, is dropped.
 Classic CAN only.
 """
 
@@ -43,26 +42,28 @@ _GONE: Final = (errno.ECONNRESET, errno.EPIPE, errno.ENOTCONN, errno.EBADF)
 
 
 class StreamFormatError(ConnectionError):
-    """The other end does not speak this framing."""
+    """The other end does not use this framing."""
 
 
 def encode(word: int, data: bytes, dlc: int | None = None) -> bytes:
-    """One frame on the stream; `word` is the identifier with its flag bits, `dlc` differs from the
-    data in remote frames."""
+    """Encode one frame. `word` is the identifier with its flag bits; `dlc` differs from the data's
+    length in remote frames."""
     frame = _HEAD.pack(word, len(data) if dlc is None else dlc) + data
     return frame + check(frame)
 
 
 class Splitter:
-    """Cuts a byte stream into frames: (word, DLC, data). Raises StreamFormatError on a wrong
-    greeting, DLC, identifier or check."""
+    """Cuts a byte stream into frames: (word, DLC, data).
+
+    Raises StreamFormatError on a wrong greeting, DLC, identifier or checksum.
+    """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._greeted = False
 
     def feed(self, data: bytes) -> list[tuple[int, int, bytes]]:
-        """Take bytes, give the frames that they complete."""
+        """Add bytes; return the frames that they complete."""
         buffer = self._buffer
         buffer += data
         if not self._greeted and not self._greet():
@@ -75,7 +76,7 @@ class Splitter:
             if len(buffer) < end + CHECK_BYTES:
                 break
             if buffer[end : end + CHECK_BYTES] != check(bytes(buffer[at:end])):
-                raise StreamFormatError("a frame was changed on its way")
+                raise StreamFormatError("wrong CRC: a frame was changed on its way")
             frames.append((word, dlc, bytes(buffer[at + _HEAD.size : end])))
             at = end + CHECK_BYTES
         del buffer[:at]
@@ -96,25 +97,25 @@ class Splitter:
     @staticmethod
     def _check(word: int, dlc: int) -> None:
         if dlc > 8:
-            raise StreamFormatError(f"DLC {dlc}: classic CAN has at most 8")
+            raise StreamFormatError(f"expected a DLC of at most 8 (classic CAN), got {dlc}")
         if not word & EXTENDED and word & ID_MASK > 0x7FF:
             raise StreamFormatError(f"identifier {word & ID_MASK:#x} does not fit 11 bits")
 
 
 def parse_channel(channel: str, allow_remote: bool = False) -> tuple[socket.AddressFamily, Any]:
-    """Socket family and address of `tcp://host:port` or `unix:///path`.
+    """Return socket family and address of `tcp://host:port` or `unix:///path`.
 
-    Raises ValueError for anything else, and for a host that is not this one unless `allow_remote`
-    says so: the stream has neither secrecy nor authentication.
+    Raises ValueError for anything else, and for another host unless `allow_remote`: the stream is
+    neither encrypted nor authenticated.
     """
     parts = urlsplit(channel)
     if parts.scheme == "unix" and parts.path and not parts.netloc:
         return socket.AF_UNIX, parts.path
     if parts.scheme != "tcp" or not parts.hostname or parts.port is None:
-        raise ValueError(f"channel {channel!r}: write tcp://127.0.0.1:7303 or unix:///path")
+        raise ValueError(f"channel {channel!r}: expected tcp://127.0.0.1:7303 or unix:///path")
     if not allow_remote and not _is_loopback(parts.hostname):
         raise ValueError(
-            f"channel {channel!r} leaves this host, and the stream is not protected: say "
+            f"channel {channel!r} leaves this host, and the stream is not protected: set "
             "allow_remote=True to allow it"
         )
     return (socket.AF_INET6 if ":" in parts.hostname else socket.AF_INET), (
@@ -129,7 +130,7 @@ def _is_loopback(host: str) -> bool:
     return host == "localhost"
 
 
-class Line:
+class FrameSocket:
     """A connected non-blocking socket that carries frames."""
 
     def __init__(self, sock: socket.socket) -> None:
@@ -144,12 +145,12 @@ class Line:
 
     @property
     def pending(self) -> bool:
-        """Whether bytes wait to be sent."""
+        """Return whether bytes wait to be sent."""
         return bool(self._waiting)
 
     def write(self, data: bytes) -> None:
-        """Send, or keep what the kernel does not take. Raises ConnectionError if the other end is
-        gone or does not read."""
+        """Send, and keep what the kernel does not accept. Raises ConnectionError if the other end
+        is gone or does not read."""
         with self._lock:
             self._waiting += data
             self._flush()
@@ -157,7 +158,7 @@ class Line:
             raise ConnectionError("the other end of the CAN stream does not read")
 
     def flush(self) -> None:
-        """Send what waits, as far as the kernel takes it."""
+        """Send the waiting bytes, as far as the kernel accepts them."""
         with self._lock:
             self._flush()
 
@@ -172,7 +173,8 @@ class Line:
             del self._waiting[:sent]
 
     def read(self) -> list[tuple[int, int, bytes]]:
-        """Frames that have come. Raises ConnectionError when the other end is gone."""
+        """Return the frames that have arrived. Raises ConnectionError when the other end is
+        gone."""
         frames: list[tuple[int, int, bytes]] = []
         while True:
             try:
@@ -183,26 +185,26 @@ class Line:
                 raise ConnectionError(f"the CAN stream is gone: {reason}") from reason
             if not data:
                 if frames:
-                    return frames  # what came before the end counts; the end shows at the next read
+                    return frames  # these are still valid; the next read raises
                 raise ConnectionError("the CAN stream was closed by its other end")
             frames += self._splitter.feed(data)
             if len(data) < 65536:
                 return frames
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the socket."""
         self.sock.close()
 
 
-def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> Line:
-    """A line to the hub of a channel; raises ConnectionError if there is none, ValueError for a bad
-    channel."""
+def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> FrameSocket:
+    """Connect to the hub of a channel. Raises ConnectionError if there is none, ValueError for a
+    bad channel."""
     family, address = parse_channel(channel, allow_remote)
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
         sock.settimeout(timeout)
         sock.connect(address)
-        return Line(sock)
+        return FrameSocket(sock)
     except OSError as reason:
         sock.close()
         raise ConnectionError(
@@ -211,7 +213,7 @@ def connect(channel: str, timeout: float = 5.0, allow_remote: bool = False) -> L
 
 
 class StreamBus(can.BusABC):
-    """python-can bus on a hub's channel; see the head of this module."""
+    """python-can bus on a hub's channel; see the docstring of this module."""
 
     def __init__(
         self,
@@ -222,8 +224,10 @@ class StreamBus(can.BusABC):
         receive_own_messages: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Connect. `bitrate` and other settings of a real bus are taken and have no effect. Raises
-        CanInitializationError."""
+        """Connect. `bitrate` and other settings of a real bus are accepted and ignored.
+
+        Raises CanInitializationError.
+        """
         if kwargs.pop("fd", False):
             raise can.CanInitializationError("petrobot_stream carries classic CAN only, not CAN FD")
         try:
@@ -238,8 +242,8 @@ class StreamBus(can.BusABC):
         super().__init__(channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a classic frame; waits up to `timeout` seconds for room (None: does not wait).
-        Raises CanOperationError."""
+        """Send a classic frame; wait up to `timeout` seconds for room (None: do not wait). Raises
+        CanOperationError."""
         if msg.is_fd:
             raise can.CanOperationError("petrobot_stream carries classic CAN only, not CAN FD")
         word = msg.arbitration_id | (EXTENDED if msg.is_extended_id else 0)
@@ -256,7 +260,7 @@ class StreamBus(can.BusABC):
             )
 
     def fileno(self) -> int:
-        """For select, and python-can's asyncio notifier."""
+        """Return the file number of the socket, for select and python-can's asyncio notifier."""
         return self._line.sock.fileno()
 
     def shutdown(self) -> None:
@@ -269,7 +273,7 @@ class StreamBus(can.BusABC):
             select.select([], [self._line.sock], [], left)
             self._line.flush()
         if self._line.pending:
-            raise ConnectionError("the CAN stream had no room in time")
+            raise ConnectionError("the other end of the CAN stream did not read in time")
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if not self._waiting:

@@ -1,8 +1,8 @@
-"""CANopen on classic CAN (CiA 301): identifiers, frames in and out of bytes, and the client of
-expedited SDO transfers.
+"""CANopen on classic CAN (CiA 301): identifiers, encoding of frames, and a client of expedited SDO
+transfers.
 
-Pure: times are passed in, frames come back. The subset is NMT, heartbeat, expedited SDO, SYNC, PDO
-mapping and EMCY, which is what drives and a digital-input node need. Byte order is little-endian
+Pure: times are passed in, frames are returned. The subset is NMT, heartbeat, expedited SDO, SYNC,
+PDO mapping and EMCY: what drives and a node with digital inputs need. Byte order is little-endian
 everywhere (CiA 301, section 7.1.4).
 """
 
@@ -17,6 +17,8 @@ from typing import Final, NamedTuple
 
 from petrobot.services.comm.canopen.bus import Frame
 
+# The predefined connection set (CiA 301, section 7.3.3): an identifier is the base of the service
+# plus the node id.
 NMT_ID: Final = 0x000
 SYNC_ID: Final = 0x080
 EMCY_BASE: Final = 0x080
@@ -30,7 +32,7 @@ NODES: Final = range(1, 128)
 
 
 class NmtCommand(IntEnum):
-    """What the NMT master may order (CiA 301, table 31)."""
+    """Commands of the NMT master (CiA 301, table 31)."""
 
     START = 0x01
     STOP = 0x02
@@ -40,7 +42,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """States as a heartbeat shows them; BOOT_UP is sent once."""
+    """States as a heartbeat reports them; BOOT_UP is sent once."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04
@@ -48,8 +50,8 @@ class NmtState(IntEnum):
     PREOPERATIONAL = 0x7F
 
 
-class Type(IntEnum):
-    """Static data types and their codes in EDS files (CiA 301, table 44)."""
+class DataType(IntEnum):
+    """Static data types with their codes in EDS files (CiA 301, table 44)."""
 
     BOOLEAN = 0x01
     INTEGER8 = 0x02
@@ -60,38 +62,41 @@ class Type(IntEnum):
     UNSIGNED32 = 0x07
 
     def pack(self, value: int) -> bytes:
-        """Little-endian bytes; raises ValueError if the value does not fit."""
+        """Return the little-endian bytes; raises ValueError if the value does not fit."""
         try:
             return _STRUCT[self].pack(value)
         except struct.error as reason:
             raise ValueError(f"{value} does not fit {self.name}") from reason
 
     def unpack(self, data: bytes) -> int:
-        """The number in exactly as many bytes as the type has; raises ValueError otherwise."""
+        """Return the number; raises ValueError unless there are exactly as many bytes as the type
+        has."""
         try:
             (value,) = _STRUCT[self].unpack(data)
         except struct.error as reason:
-            raise ValueError(f"{len(data)} bytes are no {self.name}") from reason
+            raise ValueError(
+                f"expected {self.size} bytes for {self.name}, got {len(data)}"
+            ) from reason
         return int(value)
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Return the size in bytes."""
         return _STRUCT[self].size
 
 
 _STRUCT: Final = {
-    Type.BOOLEAN: struct.Struct("<?"),
-    Type.INTEGER8: struct.Struct("<b"),
-    Type.INTEGER16: struct.Struct("<h"),
-    Type.INTEGER32: struct.Struct("<i"),
-    Type.UNSIGNED8: struct.Struct("<B"),
-    Type.UNSIGNED16: struct.Struct("<H"),
-    Type.UNSIGNED32: struct.Struct("<I"),
+    DataType.BOOLEAN: struct.Struct("<?"),
+    DataType.INTEGER8: struct.Struct("<b"),
+    DataType.INTEGER16: struct.Struct("<h"),
+    DataType.INTEGER32: struct.Struct("<i"),
+    DataType.UNSIGNED8: struct.Struct("<B"),
+    DataType.UNSIGNED16: struct.Struct("<H"),
+    DataType.UNSIGNED32: struct.Struct("<I"),
 }
 
 
-class Abort(IntEnum):
+class AbortCode(IntEnum):
     """SDO abort codes (CiA 301, table 22)."""
 
     TOGGLE = 0x05030000
@@ -117,12 +122,12 @@ class Abort(IntEnum):
 
 
 class SdoAbortError(Exception):
-    """An SDO transfer was refused; `code` is a CiA 301 abort code."""
+    """An SDO transfer was refused; `code` is an abort code of CiA 301."""
 
     def __init__(self, code: int, index: int = 0, sub: int = 0) -> None:
         name = (
-            Abort(code).name.lower().replace("_", " ")
-            if code in Abort._value2member_map_
+            AbortCode(code).name.lower().replace("_", " ")
+            if code in AbortCode._value2member_map_
             else "unknown"
         )
         super().__init__(f"SDO abort {code:#010x} ({name}) at {index:#06x}:{sub}")
@@ -132,7 +137,7 @@ class SdoAbortError(Exception):
 
 
 class Emergency(NamedTuple):
-    """An EMCY message: error code, error register (1001h) and five bytes of the maker's."""
+    """An EMCY message: error code, error register (1001h) and five manufacturer-specific bytes."""
 
     node: int
     code: int
@@ -141,7 +146,7 @@ class Emergency(NamedTuple):
 
 
 def nmt(command: NmtCommand, node: int = 0) -> Frame:
-    """Order one node, or all (0), to change its NMT state."""
+    """Return the NMT command to one node, or to all (0)."""
     return Frame(NMT_ID, bytes((command, node)))
 
 
@@ -149,28 +154,30 @@ SYNC: Final = Frame(SYNC_ID, b"")
 
 
 def heartbeat(node: int, state: NmtState) -> Frame:
-    """The heartbeat, or with BOOT_UP the boot-up message, of a node."""
+    """Return the heartbeat of a node; with BOOT_UP its boot-up message."""
     return Frame(HEARTBEAT_BASE + node, bytes((state,)))
 
 
 def emergency(node: int, code: int, register: int, detail: bytes = b"") -> Frame:
-    """An EMCY message; code 0 says that the error is gone."""
+    """Return an EMCY message; code 0 says that the error is gone."""
     return Frame(EMCY_BASE + node, struct.pack("<HB", code, register) + detail[:5].ljust(5, b"\0"))
 
 
 def parse_emergency(frame: Frame) -> Emergency:
-    """What an EMCY frame says; raises ValueError if it is none."""
+    """Decode an EMCY frame; raises ValueError if it is not one."""
     node = frame.id - EMCY_BASE
     if node not in NODES or len(frame.data) != 8:
         raise ValueError(
-            f"frame {frame.id:#05x} with {len(frame.data)} bytes is no emergency message"
+            f"frame {frame.id:#05x} with {len(frame.data)} bytes is not an emergency message"
         )
     code, register = struct.unpack_from("<HB", frame.data)
     return Emergency(node, code, register, frame.data[3:])
 
 
+# Command byte (CiA 301, section 7.2.4.3.3): 001 in the top bits (initiate download), then the
+# number of unused bytes, e = 1 (expedited), s = 1 (size indicated).
 def sdo_write_request(node: int, index: int, sub: int, data: bytes) -> Frame:
-    """Initiate an expedited download of 1 to 4 bytes."""
+    """Return the request of an expedited download of 1 to 4 bytes."""
     if not 1 <= len(data) <= 4:
         raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
     command = 0x23 | (4 - len(data)) << 2
@@ -180,17 +187,17 @@ def sdo_write_request(node: int, index: int, sub: int, data: bytes) -> Frame:
 
 
 def sdo_read_request(node: int, index: int, sub: int) -> Frame:
-    """Initiate an upload."""
+    """Return the request of an upload."""
     return Frame(SDO_REQUEST_BASE + node, struct.pack("<BHBI", 0x40, index, sub, 0))
 
 
 def sdo_write_reply(node: int, index: int, sub: int) -> Frame:
-    """The server's confirmation of a download."""
+    """Return the server's confirmation of a download."""
     return Frame(SDO_REPLY_BASE + node, struct.pack("<BHBI", 0x60, index, sub, 0))
 
 
 def sdo_read_reply(node: int, index: int, sub: int, data: bytes) -> Frame:
-    """The server's answer to an upload, 1 to 4 bytes."""
+    """Return the server's answer to an upload, 1 to 4 bytes."""
     if not 1 <= len(data) <= 4:
         raise ValueError(f"an expedited transfer carries 1 to 4 bytes, not {len(data)}")
     command = 0x43 | (4 - len(data)) << 2
@@ -200,14 +207,13 @@ def sdo_read_reply(node: int, index: int, sub: int, data: bytes) -> Frame:
 
 
 def sdo_abort(cob_id: int, index: int, sub: int, code: int) -> Frame:
-    """End a transfer; `cob_id` is that of the end that aborts."""
+    """Return the frame that ends a transfer; `cob_id` is that of the end that aborts."""
     return Frame(cob_id, struct.pack("<BHBI", 0x80, index, sub, code))
 
 
 @dataclass(frozen=True, slots=True)
 class SdoMessage:
-    """An SDO frame taken apart; `data` holds the bytes of an expedited transfer or the abort
-    code."""
+    """A decoded SDO frame; `data` holds the bytes of an expedited transfer, or the abort code."""
 
     command: int
     index: int
@@ -216,10 +222,13 @@ class SdoMessage:
 
 
 def parse_sdo(frame: Frame) -> SdoMessage:
-    """Take an SDO frame apart; raises ValueError if it has not 8 bytes, SdoAbortError(COMMAND) if
-    it is no expedited transfer."""
+    """Decode an SDO frame.
+
+    Raises ValueError if it does not have 8 bytes, SdoAbortError(COMMAND) if it is not an expedited
+    transfer.
+    """
     if len(frame.data) != 8:
-        raise ValueError(f"SDO frame {frame.id:#05x} with {len(frame.data)} bytes: must be 8")
+        raise ValueError(f"SDO frame {frame.id:#05x}: expected 8 bytes, got {len(frame.data)}")
     command, index, sub = struct.unpack_from("<BHB", frame.data)
     kind = command & 0xE0
     if command in (0x40, 0x60) or command == 0x80:
@@ -227,7 +236,7 @@ def parse_sdo(frame: Frame) -> SdoMessage:
     if kind in (0x20, 0x40) and command & 0x02:
         size = 4 - (command >> 2 & 0x03) if command & 0x01 else 4
         return SdoMessage(kind, index, sub, frame.data[4 : 4 + size])
-    raise SdoAbortError(Abort.COMMAND, index, sub)
+    raise SdoAbortError(AbortCode.COMMAND, index, sub)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,16 +245,16 @@ class Mapped:
 
     index: int
     sub: int
-    type: Type
+    type: DataType
 
     @property
     def entry(self) -> int:
-        """As objects 1600h and 1A00h hold it: index, sub-index, bits."""
+        """Return the object as 1600h and 1A00h hold it: index, sub-index, number of bits."""
         return self.index << 16 | self.sub << 8 | self.type.size * 8
 
 
 def pdo_struct(mapping: Iterable[Mapped]) -> struct.Struct:
-    """How to pack a PDO of these objects; raises ValueError beyond 8 bytes."""
+    """Return the layout of a PDO of these objects; raises ValueError beyond 8 bytes."""
     layout = struct.Struct("<" + "".join(_STRUCT[mapped.type].format[1:] for mapped in mapping))
     if layout.size > 8:
         raise ValueError(f"a PDO holds 8 bytes, these objects need {layout.size}")
@@ -254,11 +263,11 @@ def pdo_struct(mapping: Iterable[Mapped]) -> struct.Struct:
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """One SDO transfer to do: a write of `value` if it is given, else a read."""
+    """One SDO transfer: a write of `value`, or a read if it is None."""
 
     index: int
     sub: int
-    type: Type
+    type: DataType
     value: int | None = None
 
 
@@ -269,12 +278,14 @@ PDO_OFF: Final = 1 << 31
 def map_pdo(
     parameters: int, mapping: int, cob_id: int, transmission: int, objects: Sequence[Mapped]
 ) -> list[Transfer]:
-    """The writes that map and switch on a PDO, in the order that CiA 301 section 7.5.2.36 asks for.
+    """Return the writes that map and enable a PDO, in the order that CiA 301, section 7.5.2.36,
+    requires.
 
-    `parameters` and `mapping` are the indices of its two records (1400h and 1600h, or 1800h and
-    1A00h).
+    First the PDO is switched off, then its mapping is cleared, written and enabled, then the PDO is
+    switched on again. `parameters` and `mapping` are the indices of its two records (1400h and
+    1600h, or 1800h and 1A00h).
     """
-    u8, u32 = Type.UNSIGNED8, Type.UNSIGNED32
+    u8, u32 = DataType.UNSIGNED8, DataType.UNSIGNED32
     return [
         Transfer(parameters, 1, u32, cob_id | PDO_OFF),
         Transfer(parameters, 2, u8, transmission),
@@ -286,11 +297,10 @@ def map_pdo(
 
 
 class SdoClient:
-    """A client of one node's SDO server: does transfers one after another, gives up after `timeout`
-    seconds each.
+    """Client of one node's SDO server: does transfers one after another, each with a timeout (s).
 
-    `results` holds what was read, by (index, sub-index); `failure` says why a transfer failed,
-    which ends the row.
+    `results` holds the values that were read, by (index, sub-index). `failure` says why a transfer
+    failed; the remaining ones are then dropped.
     """
 
     def __init__(self, node: int, timeout: float = 0.5) -> None:
@@ -304,16 +314,16 @@ class SdoClient:
 
     @property
     def busy(self) -> bool:
-        """Whether transfers remain."""
+        """Return whether transfers remain."""
         return bool(self._queue)
 
     def begin(self, transfers: Iterable[Transfer]) -> None:
-        """Forget what was, and do these."""
+        """Drop earlier transfers and begin these."""
         self.results, self.failure, self._asked = {}, "", False
         self._queue = deque(transfers)
 
     def advance(self, now: float) -> list[Frame]:
-        """The request that is due, if any."""
+        """Return the request that is due, if any."""
         if not self._queue:
             return []
         transfer = self._queue[0]
@@ -325,7 +335,10 @@ class SdoClient:
                 )
                 return [
                     sdo_abort(
-                        SDO_REQUEST_BASE + self.node, transfer.index, transfer.sub, Abort.TIMEOUT
+                        SDO_REQUEST_BASE + self.node,
+                        transfer.index,
+                        transfer.sub,
+                        AbortCode.TIMEOUT,
                     )
                 ]
             return []
@@ -339,7 +352,7 @@ class SdoClient:
         ]
 
     def receive(self, frame: Frame) -> None:
-        """Take a frame of the server; what was not asked for is ignored."""
+        """Handle a frame of the server; answers that were not requested are ignored."""
         if not (self._queue and self._asked) or frame.id != SDO_REPLY_BASE + self.node:
             return
         transfer = self._queue[0]
@@ -355,7 +368,7 @@ class SdoClient:
         if reply.command == 0x80:
             raise SdoAbortError(int.from_bytes(reply.data, "little"), reply.index, reply.sub)
         if reply.command != (0x40 if transfer.value is None else 0x60):
-            raise SdoAbortError(Abort.COMMAND, reply.index, reply.sub)
+            raise SdoAbortError(AbortCode.COMMAND, reply.index, reply.sub)
         if transfer.value is None:
             self.results[transfer.index, transfer.sub] = transfer.type.unpack(reply.data)
         self._queue.popleft()

@@ -1,5 +1,5 @@
-"""CiA 402 servo drives: state machine, words, objects, units and error codes, as master and drives
-must agree on them.
+"""CiA 402 servo drives: state machine, words, objects, units and error codes, shared by master and
+simulated drives.
 
 Pure tables and functions (CiA 402-2 and 402-3). Positions are in micro-radians at the joint (the
 drives' position factor), speeds in micro-radians per second, so an INTEGER32 holds 2,147 rad.
@@ -10,24 +10,24 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Final
 
-from petrobot.services.comm.canopen.cia301 import Mapped, Type
+from petrobot.services.comm.canopen.cia301 import DataType, Mapped
 
 UNITS: Final = 1e6
-"""Position units in a radian and speed units in a radian per second."""
+"""Position units per radian, and speed units per radian per second."""
 
 
 def to_units(radians: float) -> int:
-    """Radians (or rad/s) as the drives count them."""
+    """Convert radians (or rad/s) to the drives' units."""
     return round(radians * UNITS)
 
 
 def from_units(units: int) -> float:
-    """What the drives count as radians (or rad/s)."""
+    """Convert the drives' units to radians (or rad/s)."""
     return units / UNITS
 
 
-class State(Enum):
-    """The power drive system's states; the value is (mask, pattern) of the statusword's low byte
+class DriveState(Enum):
+    """States of the power drive system; the value is (mask, pattern) of the statusword's low byte
     (CiA 402-2, table 31)."""
 
     def __init__(self, mask: int, word: int) -> None:
@@ -45,7 +45,7 @@ class State(Enum):
 
 
 class StatusBit(IntEnum):
-    """Statusword bits outside the state pattern; 12 and 13 as in cyclic synchronous position mode,
+    """Statusword bits outside the state pattern. 12 and 13 as in cyclic synchronous position mode;
     12 also as in velocity mode."""
 
     VOLTAGE_ENABLED = 1 << 4
@@ -57,7 +57,7 @@ class StatusBit(IntEnum):
     FOLLOWING_ERROR = 1 << 13
 
 
-class Command(Enum):
+class DriveCommand(Enum):
     """Commands; the value is (mask, pattern) of the controlword (CiA 402-2, table 29). FAULT_RESET
     acts on its rising edge."""
 
@@ -73,7 +73,7 @@ class Command(Enum):
         """A controlword that gives this command."""
 
 
-class Mode(IntEnum):
+class OperationMode(IntEnum):
     """Modes of operation (6060h)."""
 
     NONE = 0
@@ -82,18 +82,18 @@ class Mode(IntEnum):
 
     @property
     def bit(self) -> int:
-        """Its bit in object 6502h, supported drive modes (modes 1 and up)."""
+        """Return its bit in object 6502h, supported drive modes (modes 1 and up)."""
         return 1 << (self.value - 1)
 
 
-SUPPORTED_MODES: Final = Mode.CYCLIC_SYNCHRONOUS_POSITION.bit
-"""Object 6502h of a drive that knows cyclic synchronous position alone."""
+SUPPORTED_MODES: Final = OperationMode.CYCLIC_SYNCHRONOUS_POSITION.bit
+"""Object 6502h of a drive that supports only cyclic synchronous position mode."""
 
 DEVICE_TYPE: Final = 0x0002_0192
 """Object 1000h of a servo drive (profile 402)."""
 
 
-class Fault(IntEnum):
+class DriveFault(IntEnum):
     """Error codes of EMCY and 603Fh (CiA 301 table 26, CiA 402-2 annex)."""
 
     NONE = 0x0000
@@ -109,27 +109,29 @@ class Fault(IntEnum):
 
 
 FAULT_TEXT: Final = {
-    Fault.NONE: "no error",
-    Fault.OVERCURRENT: "over-current at the motor",
-    Fault.UNDERVOLTAGE: "no power at the drive: the arm-power chain is open",
-    Fault.OVERHEATED: "drive too hot",
-    Fault.ENCODER: "encoder fault",
-    Fault.CAN_PASSIVE: "too many bus errors",
-    Fault.HEARTBEAT: "the master's heartbeat was lost",
-    Fault.BUS_OFF_RECOVERED: "the bus was off",
-    Fault.SYNC_LOST: "SYNC was lost",
-    Fault.FOLLOWING_ERROR: "following error too large",
+    DriveFault.NONE: "no error",
+    DriveFault.OVERCURRENT: "over-current at the motor",
+    DriveFault.UNDERVOLTAGE: "no power at the drive: the arm-power chain is open",
+    DriveFault.OVERHEATED: "drive too hot",
+    DriveFault.ENCODER: "encoder fault",
+    DriveFault.CAN_PASSIVE: "too many bus errors",
+    DriveFault.HEARTBEAT: "the master's heartbeat was lost",
+    DriveFault.BUS_OFF_RECOVERED: "the bus was off",
+    DriveFault.SYNC_LOST: "SYNC was lost",
+    DriveFault.FOLLOWING_ERROR: "following error too large",
 }
 
 
 def fault_text(code: int) -> str:
-    """An error code in words."""
+    """Return an error code in words."""
     return (
-        FAULT_TEXT[Fault(code)] if code in Fault._value2member_map_ else f"error code {code:#06x}"
+        FAULT_TEXT[DriveFault(code)]
+        if code in DriveFault._value2member_map_
+        else f"error code {code:#06x}"
     )
 
 
-class Object(IntEnum):
+class ObjectIndex(IntEnum):
     """Indices of the objects in use."""
 
     DEVICE_TYPE = 0x1000
@@ -165,96 +167,117 @@ class Object(IntEnum):
 
 
 RECEIVED: Final = (
-    Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
-    Mapped(Object.TARGET_POSITION, 0, Type.INTEGER32),
+    Mapped(ObjectIndex.CONTROLWORD, 0, DataType.UNSIGNED16),
+    Mapped(ObjectIndex.TARGET_POSITION, 0, DataType.INTEGER32),
 )
 """Objects of the RPDO that the master sends each drive in each cycle, in cyclic synchronous
 position mode."""
 
 VELOCITY_RECEIVED: Final = (
-    Mapped(Object.CONTROLWORD, 0, Type.UNSIGNED16),
-    Mapped(Object.TARGET_VELOCITY, 0, Type.INTEGER32),
+    Mapped(ObjectIndex.CONTROLWORD, 0, DataType.UNSIGNED16),
+    Mapped(ObjectIndex.TARGET_VELOCITY, 0, DataType.INTEGER32),
 )
 """The same in cyclic synchronous velocity mode."""
 
 SENT: Final = (
-    Mapped(Object.STATUSWORD, 0, Type.UNSIGNED16),
-    Mapped(Object.POSITION, 0, Type.INTEGER32),
-    Mapped(Object.TORQUE, 0, Type.INTEGER16),
+    Mapped(ObjectIndex.STATUSWORD, 0, DataType.UNSIGNED16),
+    Mapped(ObjectIndex.POSITION, 0, DataType.INTEGER32),
+    Mapped(ObjectIndex.TORQUE, 0, DataType.INTEGER16),
 )
-"""Objects of the TPDO that each drive sends on SYNC, in either mode."""
+"""Objects of the TPDO that each drive sends after SYNC, in either mode."""
 
 
-def _state(statusword: int) -> State | None:
-    for state in State:
+def _state(statusword: int) -> DriveState | None:
+    for state in DriveState:
         mask, pattern = state.value
         if statusword & mask == pattern:
             return state
     return None
 
 
-def _command(controlword: int) -> Command | None:
-    for command in reversed(Command):
+# No two patterns overlap, so the order of the commands does not matter.
+def _command(controlword: int) -> DriveCommand | None:
+    for command in DriveCommand:
         mask, pattern = command.value
         if controlword & mask == pattern:
             return command
     return None
 
 
+# Both words are decoded every cycle, so the answer is looked up by the low byte.
 _STATES: Final = tuple(_state(low) for low in range(256))
 _COMMANDS: Final = tuple(_command(low) for low in range(256))
 
 
-def state_of(statusword: int) -> State:
-    """The state that a statusword shows; raises ValueError for a pattern that is none."""
+def state_of(statusword: int) -> DriveState:
+    """Return the state that a statusword shows; raises ValueError for a pattern that is not a
+    state."""
     state = _STATES[statusword & 0xFF]
     if state is None:
-        raise ValueError(f"statusword {statusword:#06x} shows no state of CiA 402")
+        raise ValueError(f"statusword {statusword:#06x} is not a state of CiA 402")
     return state
 
 
-def command_of(controlword: int) -> Command | None:
-    """The command that a controlword gives (FAULT_RESET only by its bit; the edge is for the drive
-    to see)."""
+def command_of(controlword: int) -> DriveCommand | None:
+    """Return the command that a controlword gives. For FAULT_RESET only the bit is checked; the
+    drive itself detects the edge."""
     return _COMMANDS[controlword & 0xFF]
 
 
 TRANSITIONS: Final = {
-    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,  # 2
-    (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): State.SWITCHED_ON,  # 3
-    (State.READY_TO_SWITCH_ON, Command.ENABLE_OPERATION): State.SWITCHED_ON,  # 3, then 4 of itself
-    (State.SWITCHED_ON, Command.ENABLE_OPERATION): State.OPERATION_ENABLED,  # 4
-    (State.OPERATION_ENABLED, Command.SWITCH_ON): State.SWITCHED_ON,  # 5, "disable operation"
-    (State.SWITCHED_ON, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,  # 6
-    (State.READY_TO_SWITCH_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 7
-    (State.READY_TO_SWITCH_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,  # 7
-    (State.OPERATION_ENABLED, Command.SHUTDOWN): State.READY_TO_SWITCH_ON,  # 8
-    (State.OPERATION_ENABLED, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 9
-    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 10
-    (State.SWITCHED_ON, Command.QUICK_STOP): State.SWITCH_ON_DISABLED,  # 10
-    (State.OPERATION_ENABLED, Command.QUICK_STOP): State.QUICK_STOP_ACTIVE,  # 11
-    (State.QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): State.SWITCH_ON_DISABLED,  # 12
-    (State.FAULT, Command.FAULT_RESET): State.SWITCH_ON_DISABLED,  # 15
+    (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 2
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.SWITCH_ON): DriveState.SWITCHED_ON,  # 3
     (
-        State.QUICK_STOP_ACTIVE,
-        Command.ENABLE_OPERATION,
-    ): State.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
+        DriveState.READY_TO_SWITCH_ON,
+        DriveCommand.ENABLE_OPERATION,
+    ): DriveState.SWITCHED_ON,  # 3, then 4 of itself
+    (DriveState.SWITCHED_ON, DriveCommand.ENABLE_OPERATION): DriveState.OPERATION_ENABLED,  # 4
+    (
+        DriveState.OPERATION_ENABLED,
+        DriveCommand.SWITCH_ON,
+    ): DriveState.SWITCHED_ON,  # 5, "disable operation"
+    (DriveState.SWITCHED_ON, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 6
+    (
+        DriveState.READY_TO_SWITCH_ON,
+        DriveCommand.DISABLE_VOLTAGE,
+    ): DriveState.SWITCH_ON_DISABLED,  # 7
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,  # 7
+    (DriveState.OPERATION_ENABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 8
+    (
+        DriveState.OPERATION_ENABLED,
+        DriveCommand.DISABLE_VOLTAGE,
+    ): DriveState.SWITCH_ON_DISABLED,  # 9
+    (DriveState.SWITCHED_ON, DriveCommand.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,  # 10
+    (DriveState.SWITCHED_ON, DriveCommand.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,  # 10
+    (DriveState.OPERATION_ENABLED, DriveCommand.QUICK_STOP): DriveState.QUICK_STOP_ACTIVE,  # 11
+    (
+        DriveState.QUICK_STOP_ACTIVE,
+        DriveCommand.DISABLE_VOLTAGE,
+    ): DriveState.SWITCH_ON_DISABLED,  # 12
+    (DriveState.FAULT, DriveCommand.FAULT_RESET): DriveState.SWITCH_ON_DISABLED,  # 15
+    (
+        DriveState.QUICK_STOP_ACTIVE,
+        DriveCommand.ENABLE_OPERATION,
+    ): DriveState.OPERATION_ENABLED,  # 16, options 5 to 8 of 605Ah
 }
-"""The transitions that commands cause, with their numbers in CiA 402-2 figure 9. Any other command
-changes nothing. 0, 1 (power on), 13 (fault) and 14 (fault reaction over) happen of themselves."""
+"""Transitions caused by commands, with their numbers in CiA 402-2, figure 9; any other command
+changes nothing.
+
+0, 1 (power on), 13 (fault) and 14 (end of the fault reaction) happen without a command.
+"""
 
 ENABLING: Final = {
-    State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
-    State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
-    State.SWITCHED_ON: Command.ENABLE_OPERATION,
-    State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
-    State.QUICK_STOP_ACTIVE: Command.DISABLE_VOLTAGE,
-    State.FAULT: Command.FAULT_RESET,
+    DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
+    DriveState.READY_TO_SWITCH_ON: DriveCommand.SWITCH_ON,
+    DriveState.SWITCHED_ON: DriveCommand.ENABLE_OPERATION,
+    DriveState.OPERATION_ENABLED: DriveCommand.ENABLE_OPERATION,
+    DriveState.QUICK_STOP_ACTIVE: DriveCommand.DISABLE_VOLTAGE,
+    DriveState.FAULT: DriveCommand.FAULT_RESET,
 }
-"""Which command leads from a state towards OPERATION_ENABLED. FAULT_RESET needs a word without its
-bit before."""
+"""The command that leads from a state towards OPERATION_ENABLED. FAULT_RESET must follow a word
+without its bit."""
 
 
-def after(state: State, command: Command) -> State:
-    """The state after a command."""
+def after(state: DriveState, command: DriveCommand) -> DriveState:
+    """Return the state after a command."""
     return TRANSITIONS.get((state, command), state)

@@ -17,24 +17,24 @@ from petrobot.services.comm.canopen.byte_stream import (
     ERROR,
     EXTENDED,
     REMOTE,
-    Line,
+    FrameSocket,
     encode,
     parse_channel,
 )
 
 PORTS: Final = 64
-"""Ports that other processes may have at a time: a bus has few, and `select` cannot wait for more
-than a thousand."""
+"""Most ports of other processes at a time: a bus has few, and `select` cannot wait for more than a
+thousand."""
 _UNSEEN: Final = EXTENDED | REMOTE | ERROR
 """Flags of frames that a `CanBus` does not carry."""
 
 
-class Hub:
-    """The bus itself: relays between any number of ports on a channel, and gives ports within this
-    process.
+class CanHub:
+    """The bus: relays frames between any number of ports on a channel, and provides ports within
+    this process.
 
-    A machine of non-blocking sockets: `poll` does what is due, so it runs in a thread or in its
-    owner's loop (watch `fileno`s with `poll(timeout)`, which waits by itself).
+    It consists of non-blocking sockets; `poll` does what is due. So it runs in a thread
+    (`poll(timeout)` waits by itself) or in its owner's loop.
     """
 
     def __init__(self, channel: str = "tcp://127.0.0.1:0", allow_remote: bool = False) -> None:
@@ -48,13 +48,13 @@ class Hub:
         self._listener.listen()
         self._listener.setblocking(False)
         self._family = family
-        self._lines: dict[int, Line] = {}
+        self._lines: dict[int, FrameSocket] = {}
         self._locals: list[LocalPort] = []
         self.dropped: list[str] = []
 
     @property
     def channel(self) -> str:
-        """Where to connect, with the port that the system chose if it was 0."""
+        """Return the address to connect to, with the port that the system chose if it was 0."""
         name = self._listener.getsockname()
         if self._family == socket.AF_UNIX:
             return f"unix://{name}"
@@ -63,11 +63,11 @@ class Hub:
 
     @property
     def ports(self) -> int:
-        """How many ports are connected, those in this process not counted."""
+        """Return how many ports of other processes are connected."""
         return len(self._lines)
 
     def port(self) -> LocalPort:
-        """A port for the owner of this hub."""
+        """Return a new port for the owner of this hub."""
         port = LocalPort(self)
         self._locals.append(port)
         return port
@@ -79,7 +79,7 @@ class Hub:
         writable = [number for number, line in self._lines.items() if line.pending]
         ready, flushable, _ = select.select(readable, writable, [], timeout)
         for number in flushable:
-            self._attempt(number, Line.flush)
+            self._attempt(number, FrameSocket.flush)
         for number in ready:
             if number == self._listener.fileno():
                 self._accept()
@@ -87,7 +87,7 @@ class Hub:
                 self._attempt(number, self._relay)
 
     def close(self) -> None:
-        """Hang up on all."""
+        """Disconnect all ports."""
         name = self._listener.getsockname()
         self._listener.close()
         for line in self._lines.values():
@@ -97,13 +97,13 @@ class Hub:
             Path(name).unlink(missing_ok=True)
 
     def send_from(self, port: LocalPort, frame: Frame) -> None:
-        """Pass a local port's frame on to all others."""
+        """Pass the frame of a local port on to all others."""
         self._spread(
             encode(frame.id, frame.data), (frame.id, len(frame.data), frame.data), None, port
         )
 
     def leave(self, port: LocalPort) -> None:
-        """Forget a local port."""
+        """Remove a local port."""
         if port in self._locals:
             self._locals.remove(port)
 
@@ -116,11 +116,11 @@ class Hub:
                 sock.close()
                 return
             try:
-                self._lines[sock.fileno()] = Line(sock)
+                self._lines[sock.fileno()] = FrameSocket(sock)
             except ConnectionError:
                 sock.close()
 
-    def _relay(self, line: Line) -> None:
+    def _relay(self, line: FrameSocket) -> None:
         source = line.sock.fileno()
         for word, dlc, data in line.read():
             self._spread(encode(word, data, dlc), (word, dlc, data), source, None)
@@ -136,8 +136,8 @@ class Hub:
                 if other is not port:
                     other.waiting.append(Frame(word, data))
 
-    def _attempt(self, number: int, what: Callable[[Line], None]) -> None:
-        """Do something with a line; drop it if that fails."""
+    def _attempt(self, number: int, what: Callable[[FrameSocket], None]) -> None:
+        """Do something with a connection; drop it if that fails."""
         line = self._lines.get(number)
         if line is None:
             return
@@ -151,7 +151,7 @@ class Hub:
 
 
 def _remove_dead_socket(path: str) -> None:
-    """Remove a Unix socket that nobody listens on; raises OSError if somebody does."""
+    """Remove a Unix socket without a listener; raises OSError if a process listens on it."""
     if not Path(path).is_socket():
         return
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
@@ -160,14 +160,14 @@ def _remove_dead_socket(path: str) -> None:
         except OSError:
             Path(path).unlink(missing_ok=True)
             return
-    raise OSError(errno.EADDRINUSE, f"a CAN hub listens on {path} already")
+    raise OSError(errno.EADDRINUSE, f"another CAN hub already listens on {path}")
 
 
 class LocalPort(CanBus):
     """A port of a hub in the same process (`CanBus`)."""
 
-    def __init__(self, hub: Hub) -> None:
-        self._hub: Hub | None = hub
+    def __init__(self, hub: CanHub) -> None:
+        self._hub: CanHub | None = hub
         self.waiting: deque[Frame] = deque()
 
     def send(self, frame: Frame) -> None:
@@ -177,7 +177,7 @@ class LocalPort(CanBus):
         self._hub.send_from(self, frame)
 
     def receive(self) -> Sequence[Frame]:
-        """Frames that the hub has polled."""
+        """Return the frames that the hub has polled."""
         frames = tuple(self.waiting)
         self.waiting.clear()
         return frames

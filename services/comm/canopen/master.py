@@ -1,9 +1,9 @@
-"""A CANopen master of CiA 402 drives, whatever machine they move: configures, starts, enables and
-supervises, cycle by cycle.
+"""A CANopen master of CiA 402 drives for any machine: configures, starts, enables and supervises
+them, cycle by cycle.
 
-A machine: frames in, frames out, times passed in. What a drive is set to and what is sent to it in
-a cycle, its `DriveLink` knows; nodes that are no drives (inputs, sensors) are `Companion`s. CiA 301
-(NMT, heartbeat, SDO, SYNC, EMCY) and CiA 402-2.
+Sans-I/O: frames in, frames out, times passed in. How a drive is configured and what is sent to it
+in a cycle is defined by its `DriveInterface`. Nodes that are not drives (inputs, sensors) are
+`Companion`s. Uses CiA 301 (NMT, heartbeat, SDO, SYNC, EMCY) and CiA 402-2.
 """
 
 from __future__ import annotations
@@ -16,54 +16,59 @@ from typing import Final, Generic, Protocol, TypeVar
 from petrobot.services.comm.canopen import cia301 as canopen
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import (
+    DataType,
     Mapped,
     NmtCommand,
     NmtState,
     SdoClient,
     Transfer,
-    Type,
 )
 from petrobot.services.comm.canopen.cia402 import (
     DEVICE_TYPE,
     ENABLING,
     SENT,
-    Command,
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveCommand,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     fault_text,
 )
 
 MASTER_NODE: Final = 0x7F
 """Node id under which the master sends its own heartbeat."""
 HEARTBEAT_MS: Final = 50
-"""Period of everybody's heartbeat."""
+"""Period of every node's heartbeat (ms)."""
 RETRY: Final = 1.0
-"""s before a failed configuration is tried again."""
+"""Pause before a failed configuration is tried again (s)."""
 SETTLE: Final = 0.05
-"""s that nodes are given after a reset of their communication."""
+"""Time that nodes get after a reset of their communication (s)."""
 
-_U8, _U16, _U32, _I8 = Type.UNSIGNED8, Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER8
-_MOVING: Final = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
+_U8, _U16, _U32, _I8 = (
+    DataType.UNSIGNED8,
+    DataType.UNSIGNED16,
+    DataType.UNSIGNED32,
+    DataType.INTEGER8,
+)
+_MOVING: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
-class Phase(Enum):
+class MasterPhase(Enum):
     """What the master is doing."""
 
     CONFIGURING = "configuring"
-    """SDO transfers are under way, or are waiting to be tried again."""
+    """SDO transfers are active, or wait for the next attempt."""
     STARTING = "starting"
-    """Nodes are ordered into OPERATIONAL; not all have sent process data yet."""
+    """Nodes were ordered into OPERATIONAL; not all have sent process data yet."""
     RUNNING = "running"
     """All drives answer each SYNC."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """Something that needs a reset.
+    """A fault that needs a reset.
 
-    `cause` is a short code (`drive_fault`, `power`, `bus`), `axis` the drive's number from 0 on or
+    `cause` is a short code (`drive_fault`, `power`, `bus`), `axis` the drive's number from 0 or
     None, `code` an EMCY error code or 0.
     """
 
@@ -74,26 +79,28 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
-class Manner:
-    """How strict a master is: chosen by its cycle and by what a drive may do alone meanwhile."""
+class Supervision:
+    """How strict a master is; depends on its cycle and on what a drive may do on its own
+    meanwhile."""
 
     silent_cycles: int
-    """Cycles without a drive's TPDO after which it counts as lost."""
+    """A drive counts as lost after so many cycles without its TPDO."""
     patience: float
-    """s without a heartbeat after which a node counts as lost."""
+    """A node counts as lost after so long without a heartbeat (s)."""
     old_emergencies: bool = False
-    """Whether an EMCY that comes during a reset is passed over: a fault that stays will show."""
+    """Whether an EMCY that arrives during a reset is ignored: a fault that persists shows in the
+    status anyway."""
 
 
-class DriveLink(Protocol):
-    """What the master needs of one drive's link; see `Power`, `usual_transfers`, `pdo_transfers`
-    and `unfit` to make one."""
+class DriveInterface(Protocol):
+    """What the master needs of one drive. `Power`, `usual_transfers`, `pdo_transfers` and `unfit`
+    help to implement it."""
 
     node: int
     sdo: SdoClient
-    state: State
+    state: DriveState
     limited: bool
-    """Whether the drive cuts its set points because they are faster than it goes."""
+    """Whether the drive clips its set points because they exceed its speed."""
     silent: int
     """Cycles since its last TPDO."""
     spoken: bool
@@ -101,27 +108,27 @@ class DriveLink(Protocol):
     error_code: int
 
     def transfers(self, cycle: float) -> list[Transfer]:
-        """Its configuration for a bus cycle of so many seconds, and what is read from it."""
+        """Return the configuration for a bus cycle (s), including the objects to read."""
 
     def wrong(self) -> str:
-        """What makes the device at this node unfit, in words; empty if nothing. Asked when the
-        transfers are done."""
+        """Return why the device at this node is unfit, in words; empty if it is fit. Called after
+        the transfers."""
 
     def take(self, data: bytes) -> bool:
-        """Its TPDO; says whether its status is another one. Raises ValueError for bytes that are
-        none."""
+        """Handle its TPDO; return whether its status changed. Raises ValueError for bytes that are
+        not its TPDO."""
 
     def frame(self, target: float, wanted: bool, resetting: bool) -> Frame:
-        """Its RPDO of this cycle."""
+        """Return its RPDO of this cycle."""
 
 
-Link = TypeVar("Link", bound=DriveLink)
+Link = TypeVar("Link", bound=DriveInterface)
 
 
 @dataclass(frozen=True)
 class Companion:
-    """A node on the bus that is no drive: its id, configuration, and what becomes of the data of
-    its TPDO."""
+    """A node on the bus that is not a drive: id, configuration, and a function for the data of its
+    TPDO."""
 
     node: int
     transfers: Sequence[Transfer]
@@ -131,101 +138,115 @@ class Companion:
 
 
 class Power:
-    """Which controlword leads a drive to where its master wants it (CiA 402-2, figure 9)."""
+    """Chooses the controlword that leads a drive to the state its master wants (CiA 402-2, figure
+    9)."""
 
     __slots__ = ("_reset_cycles", "_stop_cycles", "_wait", "stopping")
 
     def __init__(self, reset_cycles: int, stop_cycles: int) -> None:
-        """`reset_cycles`: cycles between two fault resets; `stop_cycles`: cycles that a drive is
-        given to stop quickly and stand before its power is taken away and its brake holds."""
+        """`reset_cycles`: cycles between two fault resets. `stop_cycles`: cycles that a drive gets
+        to stop quickly before its power is switched off and its brake holds."""
         self._reset_cycles, self._stop_cycles = reset_cycles, stop_cycles
         self._wait = 0
         self.stopping = 0
-        """Cycles since the drive was last wanted."""
+        """Cycles since the drive should last be enabled."""
 
-    def word(self, state: State, wanted: bool, resetting: bool) -> int:
-        """The controlword of this cycle; `resetting`: whether faults may be reset."""
+    def word(self, state: DriveState, wanted: bool, resetting: bool) -> int:
+        """Return the controlword of this cycle; `resetting`: whether faults may be reset."""
         self.stopping = 0 if wanted else self.stopping + 1
         return self._command(state, wanted, resetting).word
 
-    def _command(self, state: State, wanted: bool, resetting: bool) -> Command:
+    def _command(self, state: DriveState, wanted: bool, resetting: bool) -> DriveCommand:
         if not wanted:
             brakes = state in _MOVING and self.stopping <= self._stop_cycles
-            return Command.QUICK_STOP if brakes else Command.DISABLE_VOLTAGE
-        if state is State.FAULT:
+            return DriveCommand.QUICK_STOP if brakes else DriveCommand.DISABLE_VOLTAGE
+        if state is DriveState.FAULT:
+            # A reset acts on the rising edge of its bit, so the bit is set in one cycle and cleared
+            # in the others.
             self._wait = (self._wait + 1) % self._reset_cycles
-            return Command.FAULT_RESET if resetting and self._wait == 1 else Command.DISABLE_VOLTAGE
-        return ENABLING.get(state, Command.DISABLE_VOLTAGE)
+            return (
+                DriveCommand.FAULT_RESET
+                if resetting and self._wait == 1
+                else DriveCommand.DISABLE_VOLTAGE
+            )
+        return ENABLING.get(state, DriveCommand.DISABLE_VOLTAGE)
 
 
-def usual_transfers(cycle: float, mode: Mode, patience: float) -> list[Transfer]:
-    """Identity, heartbeats both ways (`patience` s), the bus cycle (s) and the mode of
-    operation."""
+def usual_transfers(cycle: float, mode: OperationMode, patience: float) -> list[Transfer]:
+    """Return the transfers that every drive needs: identity, heartbeats both ways (`patience`, s),
+    bus cycle (s), mode of operation."""
     beat = MASTER_NODE << 16 | round(patience * 1e3)
     return [
-        Transfer(Object.DEVICE_TYPE, 0, _U32),
-        Transfer(Object.SUPPORTED_MODES, 0, _U32),
-        Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
-        Transfer(Object.CONSUMER_HEARTBEAT, 1, _U32, beat),
-        Transfer(Object.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
-        Transfer(Object.MODE, 0, _I8, mode),
+        Transfer(ObjectIndex.DEVICE_TYPE, 0, _U32),
+        Transfer(ObjectIndex.SUPPORTED_MODES, 0, _U32),
+        Transfer(ObjectIndex.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+        Transfer(ObjectIndex.CONSUMER_HEARTBEAT, 1, _U32, beat),
+        Transfer(ObjectIndex.SYNC_PERIOD, 0, _U32, round(cycle * 1e6)),
+        Transfer(ObjectIndex.MODE, 0, _I8, mode),
     ]
 
 
 def pdo_transfers(node: int, received: Sequence[Mapped]) -> list[Transfer]:
-    """One RPDO of these objects and the TPDO that every drive sends, both by SYNC."""
+    """Return the transfers for one RPDO of these objects and for the TPDO that every drive sends,
+    both synchronous."""
     return [
         *canopen.map_pdo(
-            Object.RPDO1, Object.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received
+            ObjectIndex.RPDO1, ObjectIndex.RPDO1_MAPPING, canopen.RPDO1_BASE + node, 1, received
         ),
-        *canopen.map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 1, SENT),
+        *canopen.map_pdo(
+            ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 1, SENT
+        ),
     ]
 
 
 def companion_transfers(node: int, timer_ms: int, objects: Sequence[Mapped]) -> list[Transfer]:
-    """Heartbeat, and a TPDO of these objects when they change and every `timer_ms`."""
+    """Return the transfers for the heartbeat, and for a TPDO of these objects that is sent on
+    change and every `timer_ms`."""
     return [
-        Transfer(Object.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
-        Transfer(Object.TPDO1, 5, _U16, timer_ms),
+        Transfer(ObjectIndex.PRODUCER_HEARTBEAT, 0, _U16, HEARTBEAT_MS),
+        Transfer(ObjectIndex.TPDO1, 5, _U16, timer_ms),
         *canopen.map_pdo(
-            Object.TPDO1, Object.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects
+            ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, canopen.TPDO1_BASE + node, 255, objects
         ),
     ]
 
 
-def unfit(node: int, read: Mapping[tuple[int, int], int], mode: Mode) -> str:
-    """What makes a device with these objects no drive for a mode, in words; empty if nothing."""
-    device, modes = read[Object.DEVICE_TYPE, 0], read[Object.SUPPORTED_MODES, 0]
+def unfit(node: int, read: Mapping[tuple[int, int], int], mode: OperationMode) -> str:
+    """Return why a device with these objects cannot be used as a drive in this mode; empty if it
+    can."""
+    device, modes = read[ObjectIndex.DEVICE_TYPE, 0], read[ObjectIndex.SUPPORTED_MODES, 0]
     if device != DEVICE_TYPE:
-        return f"node {node} is no servo drive (object 1000h is {device:#010x}): check the node ids"
+        return (
+            f"node {node} is not a servo drive (object 1000h is {device:#010x}): check the node ids"
+        )
     if not modes & mode.bit:
-        return f"node {node} does not know {mode.name.lower().replace('_', ' ')}"
+        return f"node {node} does not support {mode.name.lower().replace('_', ' ')} mode"
     return ""
 
 
 class CanopenMaster(Generic[Link]):
-    """Master of drives, known by their links and names, and of companions."""
+    """Master of drives (by name) and of companions."""
 
     def __init__(
         self,
         drives: Mapping[str, Link],
         companions: Sequence[Companion],
         cycle: float,
-        manner: Manner,
+        manner: Supervision,
         *,
         enable: bool = False,
     ) -> None:
-        """`cycle` in s; with `enable` the drives are enabled as soon as they are there for the
+        """`cycle` in s. With `enable` the drives are enabled as soon as they are configured for the
         first time."""
         self.cycle = cycle
         self.drives: Sequence[Link] = tuple(drives.values())
         self.names = tuple(drives)
         self.wanted = False
-        """Whether the drives are to be enabled."""
-        self.phase = Phase.CONFIGURING
+        """Whether the drives should be enabled."""
+        self.phase = MasterPhase.CONFIGURING
         self.troubles: list[Trouble] = []
         self.limited = False
-        """Whether a drive cuts its set points because they are faster than it goes."""
+        """Whether a drive clips its set points because they exceed its speed."""
         self._manner = manner
         self._companions = {each.node: each for each in companions}
         self._sdos = {each.node: SdoClient(each.node) for each in companions}
@@ -243,17 +264,17 @@ class CanopenMaster(Generic[Link]):
 
     @property
     def enabled(self) -> bool:
-        """Whether all drives follow set points."""
-        return self._all_enabled and self.phase is Phase.RUNNING
+        """Return whether all drives follow set points."""
+        return self._all_enabled and self.phase is MasterPhase.RUNNING
 
     def alive(self, node: int) -> bool:
-        """Whether a node's heartbeat has been heard of late."""
+        """Return whether a node's heartbeat arrived recently."""
         return self._now - self._heard[node] <= self._manner.patience
 
     def reset(self, now: float) -> None:
-        """Forget troubles, reset faults and enable again; configure again if the bus was the
+        """Clear troubles, reset faults and enable again; configure again if the bus was the
         trouble."""
-        again = self.phase is not Phase.RUNNING or any(
+        again = self.phase is not MasterPhase.RUNNING or any(
             trouble.cause == "bus" for trouble in self.troubles
         )
         self.troubles.clear()
@@ -261,29 +282,29 @@ class CanopenMaster(Generic[Link]):
         for drive in self.drives:
             drive.error_code = 0
         if again:
-            self.phase, self._begin_at = Phase.CONFIGURING, now
+            self.phase, self._begin_at = MasterPhase.CONFIGURING, now
 
     def give_up(self, why: str, cause: str, code: int) -> None:
-        """The machine itself has its drives stopped quickly, with the next cycle."""
+        """Stop the drives quickly with the next cycle, because the machine itself has a fault."""
         self._report(Trouble(cause, None, code, why))
         self._enable_first = False
 
     def bus_lost(self, now: float, why: str) -> None:
-        """The bus itself is gone: nothing is enabled any more; configure again when it is back."""
+        """The bus is gone: disable all drives, and configure them again when it is back."""
         self._report(Trouble("bus", None, 0, why))
-        self.phase, self._begin_at = Phase.CONFIGURING, now + RETRY
+        self.phase, self._begin_at = MasterPhase.CONFIGURING, now + RETRY
 
-    # Frames in
+    # Received frames
 
     def receive(self, now: float, frame: Frame) -> None:
-        """A frame off the bus; what cannot be understood is ignored."""
+        """Handle a frame from the bus; frames that cannot be decoded are ignored."""
         drive = self._by_tpdo.get(frame.id)
         if drive is not None:
             try:
                 if drive.take(frame.data):
                     self._look_at_drives()
             except ValueError:
-                return  # not ours: silence will show
+                return  # not this TPDO; a drive that sends nothing else counts as silent
         elif frame.id in self._others_by_tpdo:
             self._others_by_tpdo[frame.id].take(frame.data)
         elif frame.id > canopen.HEARTBEAT_BASE:
@@ -296,7 +317,9 @@ class CanopenMaster(Generic[Link]):
 
     def _look_at_drives(self) -> None:
         """A drive's status has changed."""
-        self._all_enabled = all(drive.state is State.OPERATION_ENABLED for drive in self.drives)
+        self._all_enabled = all(
+            drive.state is DriveState.OPERATION_ENABLED for drive in self.drives
+        )
         self.limited = any(drive.limited for drive in self.drives)
 
     def _beat(self, now: float, frame: Frame) -> None:
@@ -304,7 +327,7 @@ class CanopenMaster(Generic[Link]):
         if node not in self._heard or len(frame.data) != 1:
             return
         self._heard[node] = now
-        restarted = frame.data[0] == NmtState.BOOT_UP and self.phase is not Phase.CONFIGURING
+        restarted = frame.data[0] == NmtState.BOOT_UP and self.phase is not MasterPhase.CONFIGURING
         if restarted and self._needed(node):
             self._report(Trouble("bus", self._axis.get(node), 0, f"node {node} has restarted"))
 
@@ -317,23 +340,25 @@ class CanopenMaster(Generic[Link]):
         if axis is None:
             return
         self.drives[axis].error_code = message.code
-        passed_over = self.phase is Phase.CONFIGURING or (
+        passed_over = self.phase is MasterPhase.CONFIGURING or (
             self._manner.old_emergencies and self._resetting
         )
-        if message.code and not passed_over:  # before, it may be old; a fault that stays will show
+        # An emergency during configuration or a reset may be old. A fault that persists shows in the
+        # statusword.
+        if message.code and not passed_over:
             self._fault(axis, message.code)
 
-    # Frames out
+    # Frames to send
 
     def advance(self, now: float, targets: Sequence[float]) -> list[Frame]:
-        """Frames of one cycle: configuration, or set points (one a drive) and SYNC; heartbeat when
-        due."""
+        """Return the frames of one cycle: configuration, or set points (one per drive) and SYNC; a
+        heartbeat when due."""
         self._now = now
         frames: list[Frame] = []
         if now >= self._beat_due:
             self._beat_due = now + HEARTBEAT_MS / 1e3
             frames.append(canopen.heartbeat(MASTER_NODE, NmtState.OPERATIONAL))
-        if self.phase is Phase.CONFIGURING:
+        if self.phase is MasterPhase.CONFIGURING:
             return frames + self._configure(now)
         self._supervise(now)
         wanted, resetting = self.wanted, self._resetting
@@ -365,7 +390,7 @@ class CanopenMaster(Generic[Link]):
         return self._start(now)
 
     def _start(self, now: float) -> list[Frame]:
-        """All transfers are over: start the nodes, or say what failed and try again later."""
+        """All transfers are done: start the nodes, or report what failed and try again later."""
         wrong = [
             client.failure
             for client in self._clients()
@@ -378,11 +403,10 @@ class CanopenMaster(Generic[Link]):
             return []
         if self._enable_first:
             self._enable_first, self.wanted = False, True
-            self._resetting = (
-                True  # the drives may have gone into a fault when their last master went away
-            )
+            # The drives may have gone into a fault when their last master disappeared.
+            self._resetting = True
             self.troubles.clear()
-        self.phase = Phase.STARTING
+        self.phase = MasterPhase.STARTING
         for drive in self.drives:
             drive.silent, drive.spoken = 0, False
         self._heard = dict.fromkeys(self._heard, now)
@@ -395,14 +419,14 @@ class CanopenMaster(Generic[Link]):
         return companion is None or companion.needed
 
     def _supervise(self, now: float) -> None:
-        """Silence, lost heartbeats, and the end of starting and of a reset."""
+        """Check for silence and lost heartbeats, and for the end of starting and of a reset."""
         lost = self._manner.silent_cycles + 1
         for axis, drive in enumerate(self.drives):
             drive.silent += 1
             if drive.silent == lost:
                 self._report(Trouble("bus", axis, 0, f"{self.names[axis]}: the drive is silent"))
             if (
-                drive.state is State.FAULT
+                drive.state is DriveState.FAULT
                 and not self._resetting
                 and drive.spoken
                 and drive.silent <= 1
@@ -414,18 +438,18 @@ class CanopenMaster(Generic[Link]):
                 self._report(
                     Trouble("bus", self._axis.get(node), 0, f"node {node} sends no heartbeat")
                 )
-        if self.phase is Phase.STARTING and all(drive.spoken for drive in self.drives):
-            self.phase = Phase.RUNNING
+        if self.phase is MasterPhase.STARTING and all(drive.spoken for drive in self.drives):
+            self.phase = MasterPhase.RUNNING
         if self._resetting and self.enabled:
             self._resetting = False
 
     def _fault(self, axis: int, code: int) -> None:
-        cause = "power" if code == Fault.UNDERVOLTAGE else "drive_fault"
+        cause = "power" if code == DriveFault.UNDERVOLTAGE else "drive_fault"
         what = fault_text(code) if code else "drive in fault"
         self._report(Trouble(cause, axis, code, f"{self.names[axis]}: {what}"))
 
     def _report(self, trouble: Trouble) -> None:
-        """Keep it until a reset (the same one once), and let no drive move on."""
+        """Keep a trouble until a reset (each one once), and disable all drives."""
         self.wanted = False
         known = {(each.axis, each.cause, each.code) for each in self.troubles}
         if (trouble.axis, trouble.cause, trouble.code) not in known:

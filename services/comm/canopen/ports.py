@@ -1,5 +1,5 @@
-"""Ports on a CAN bus as drivers and simulated drives use them, over the project's stream or any
-python-can interface."""
+"""Ports on a CAN bus for drivers and simulated drives, over the project's stream or any python-can
+interface."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from petrobot.services.comm.canopen.byte_stream import ERROR, EXTENDED, REMOTE, 
 
 
 class StreamPort(CanBus):
-    """A driver's port on a channel, without python-can's messages in between (`CanBus`)."""
+    """A driver's port on a channel, without the overhead of python-can's messages (`CanBus`)."""
 
     def __init__(self, channel: str, timeout: float = 5.0, allow_remote: bool = False) -> None:
         self._line = connect(channel, timeout, allow_remote)
@@ -23,7 +23,7 @@ class StreamPort(CanBus):
         self._line.write(encode(frame.id, frame.data))
 
     def receive(self) -> Sequence[Frame]:
-        """Standard data frames that have come."""
+        """Return the standard data frames that have arrived."""
         if self._line.pending:
             self._line.flush()
         return [
@@ -50,10 +50,10 @@ class PythonCanBus(CanBus):
                 can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False)
             )
         except (can.CanError, OSError) as reason:
-            raise ConnectionError(f"the CAN bus does not take frames: {reason}") from reason
+            raise ConnectionError(f"the CAN bus does not accept frames: {reason}") from reason
 
     def receive(self) -> Sequence[Frame]:
-        """Frames that have come."""
+        """Return the standard data frames that have arrived."""
         frames = []
         try:
             while (message := self._bus.recv(timeout=0.0)) is not None:
@@ -71,7 +71,8 @@ class PythonCanBus(CanBus):
 
 
 def open_can(config: Mapping[str, Any]) -> CanBus:
-    """The bus of a device: `interface` and `channel` as for python-can, other keys passed on to it.
+    """Open the bus of a device: `interface` and `channel` as for python-can; other keys are passed
+    on to it.
 
     `petrobot_stream` is opened directly; socketcan and all others through python-can. Raises
     ConnectionError or ValueError.

@@ -1,4 +1,4 @@
-"""Where everything is: the location file services.toml as immutable data, read by every host and by
+"""The location file services.toml as immutable data: where everything is. Read by every host and by
 the coordinator."""
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ _log = logging.getLogger(__name__)
 COORDINATOR = directory_file.COORDINATOR
 COORDINATOR_PORT = directory_file.COORDINATOR_PORT
 SHIPPED = Path(__file__).parents[3]
-"""Where petrobot's own files are, so that a copied services.toml still finds the shipped
-numbers."""
+"""Folder with petrobot's own files, so that a copied services.toml still finds the shipped
+parameter files."""
 MEMORY = "memory"
 MEMORY_CALLS = ("memory.get", "memory.put", "memory.compare_and_set", "memory.list")
-"""What the node that has the global memory offers."""
+"""Services of the node that has the global memory."""
 
 
 class DirectoryError(Exception):
-    """services.toml is refused, or it does not know a name; `faults` holds one line for each fault,
-    with its remedy."""
+    """services.toml is invalid, or a name is not in it. `faults` has one line per fault, with its
+    remedy."""
 
     def __init__(self, faults: tuple[str, ...]) -> None:
         super().__init__("\n".join(faults))
@@ -38,20 +38,22 @@ class DirectoryError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class NodeEntry:
-    """A node: one process (with its workers) at one address."""
+    """A node: one process, with its workers, at one address."""
 
     name: str
     host: str
     port: int
     sim: str = ""
-    """Import path of what makes the simulated laboratory's party, `function(directory, name)`;
-    empty for a real node."""
+    """Import path of the function that makes the simulated laboratory's party, `function(directory,
+    name)`; empty for a real node."""
     worker_memory_mb: int = 4096
-    """Limit of the address space of each worker process (MiB). Address space, not memory in use:
-    numpy, opencv and scipy together reserve about 0.6 GiB on a small host; some libraries reserve
-    more for each core."""
+    """Limit of the address space of each worker process (MiB).
+
+    Address space is not memory in use: numpy, opencv and scipy together reserve about 0.6 GiB on a
+    small host, and some libraries reserve more for each core.
+    """
     workers: int = 32
-    """Most worker processes for actions without a device: as many runs of such actions at a
+    """Most worker processes for actions without a device, so as many runs of such actions at a
     time."""
 
 
@@ -68,7 +70,8 @@ class DeviceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ActionEntry:
-    """A primitive action: the primitive task that it translates, its place and its limits (s)."""
+    """A primitive action: the primitive task that it implements, its node or device, and its limits
+    (s)."""
 
     name: str
     run: str
@@ -78,22 +81,22 @@ class ActionEntry:
     device: str = ""
     """Empty for an action that needs none."""
     args: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments that every call gets unless it says otherwise."""
+    """Arguments of every call, unless the call overrides them."""
     deadline: float | None = None
     orphan_time: float | None = None
-    """How long a run outlives its coordinator's connection; None: without limit."""
+    """How long a run stays active without its coordinator's connection; None: without limit."""
     on_resume: str = "rejoin"
-    """What a resumed coordinator does with it: rejoin, error or ask."""
+    """What a resumed coordinator does with an active run: rejoin, error or ask."""
     compute_time: float = 0.0
-    """Simulated time of computing in lock step: the result is so much later."""
+    """Simulated computing time in lock step: the result is delayed by it."""
     at_once: bool = False
-    """Starts also while an earlier run of its device is still stopping (such as hold)."""
+    """Start even while an earlier run of its device is still stopping (for example hold)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """A general-purpose service. `run` is empty for the global memory and for what a simulated node
-    answers itself."""
+    """A general-purpose service. `run` is empty for the global memory and for services that a
+    simulated node answers itself."""
 
     name: str
     node: str
@@ -104,7 +107,7 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class StreamEntry:
-    """A set-point stream: the device that receives it and the period at which it is sent (s)."""
+    """A set-point stream: the device that receives it, and the period at which it is sent (s)."""
 
     name: str
     to: str
@@ -122,11 +125,11 @@ class TimerEntry:
 
 @dataclass(frozen=True, slots=True)
 class Directory:
-    """All of services.toml. The mappings keep the order of the file."""
+    """The content of services.toml. The mappings keep the order of the file."""
 
     source: Path
     hash: str
-    """SHA-256 of the file's data (comments and spacing left out), in the handshake of every
+    """SHA-256 of the file's data (without comments and spacing), compared in the handshake of every
     connection."""
     nodes: Mapping[str, NodeEntry]
     devices: Mapping[str, DeviceEntry]
@@ -138,12 +141,12 @@ class Directory:
     """Lock-step delays (s) by channel or "source/target" (endpoint names)."""
     keys: Mapping[str, str]
     coordinator: NodeEntry
-    """Where the coordinator listens (in lock step)."""
+    """Address at which the coordinator listens (in lock step)."""
     parameters: Mapping[str, str]
-    """Files of numbers that the cell's programs share, by name; relative to this file."""
+    """Parameter files that the cell's programs share, by name; paths relative to this file."""
 
     def where(self, name: str) -> str:
-        """The node of an action, service, device, stream's receiver or timer. Raises
+        """Return the node of an action, service, device, stream's receiver or timer. Raises
         DirectoryError."""
         if name in self.streams:
             return self.devices[self.streams[name].to].node
@@ -157,7 +160,7 @@ class Directory:
         )
 
     def party(self, endpoint: str) -> str:
-        """Lock step: the party that an endpoint lives in; a name that stands in no table is a party
+        """Lock step: return the party of an endpoint; a name that is not in the file is a party
         itself."""
         try:
             return endpoint if endpoint in self.nodes else self.where(endpoint)
@@ -165,7 +168,7 @@ class Directory:
             return endpoint
 
     def offers(self, node: str) -> tuple[str, ...]:
-        """Names of all actions and services that a node answers to."""
+        """Return the names of all actions and services that a node offers."""
         actions = [a.name for a in self.actions.values() if a.node == node]
         for service in self.services.values():
             if service.node == node:
@@ -173,42 +176,44 @@ class Directory:
         return tuple(actions)
 
     def alternatives(self, task: str) -> tuple[str, ...]:
-        """The primitive actions that translate a primitive task, in the order of the file."""
+        """Return the primitive actions that implement a primitive task, in the order of the
+        file."""
         return tuple(a.name for a in self.actions.values() if a.task == task)
 
     def address(self, node: str) -> tuple[str, int]:
-        """Host and port of a node or of the coordinator."""
+        """Return host and port of a node or of the coordinator."""
         entry = self.coordinator if node == COORDINATOR else self.nodes[node]
         return entry.host, entry.port
 
     def members(self) -> dict[str, tuple[str, int]]:
-        """Addresses of all members of a lock-step cell: its nodes and the coordinator."""
+        """Return the addresses of all members of a lock-step cell: its nodes and the
+        coordinator."""
         return {name: self.address(name) for name in (*self.nodes, COORDINATOR)}
 
     def same_host(self, node: str, party: str) -> bool:
-        """Whether a party lives on a node's host; one that is no node (a coordinator in lock step)
-        does."""
+        """Return whether a party is on a node's host. A party that is not a node (a coordinator in
+        lock step) counts as on it."""
         return party not in self.nodes or self.nodes[party].host == self.nodes[node].host
 
     def laboratory(self) -> str:
-        """The simulated node, empty when there is none."""
+        """Return the simulated node, empty when there is none."""
         return next((n.name for n in self.nodes.values() if n.sim), "")
 
     def local(self, service: str) -> bool:
-        """Whether only callers of the same host may call it."""
+        """Return whether only callers of the same host may call this service."""
         key = MEMORY if service in MEMORY_CALLS else service
         return key in self.services and self.services[key].local
 
     def file(self, path: str) -> Path:
-        """A path written in services.toml, taken relative to it; what is not there but comes with
-        petrobot is taken from there."""
+        """Return a path from services.toml, relative to it. A file that is missing there but comes
+        with petrobot is taken from petrobot."""
         beside = self.source.parent / path
         shipped = SHIPPED / path
         return shipped if not beside.exists() and shipped.exists() else beside
 
     def delays(self) -> dict[str, int]:
-        """Lock-step delays of the links in whole ticks, rounded up, as `services.comm.cell.Delays`
-        takes them."""
+        """Return the lock-step delays of the links in whole ticks, rounded up, as for
+        `lockstep.cell.Delays`."""
         return {
             name: max(1, math.ceil(seconds / TICK - 1e-6)) for name, seconds in self.links.items()
         }
@@ -222,8 +227,10 @@ def load(path: str | Path) -> Directory:
 
 
 def read_text(source: Path) -> str:
-    """The text of a location file. Raises DirectoryError with the line that is no UTF-8, OSError
-    when it cannot be read."""
+    """Return the text of a location file.
+
+    Raises DirectoryError with the line that is not UTF-8, OSError when it cannot be read.
+    """
     try:
         return source.read_text(encoding="utf-8")
     except UnicodeDecodeError as fault:
@@ -297,8 +304,8 @@ def _seconds(value: float | None) -> float | None:
 
 
 def verify_imports(directory: Directory, node: str) -> tuple[str, ...]:
-    """Faults of the import paths that a node of this host must load: one line each, empty when all
-    are there."""
+    """Import what a node of this host must load; return one line per fault, empty when all imports
+    succeed."""
     places = [
         (f"devices.{d.name}.driver", d.driver)
         for d in directory.devices.values()
@@ -329,22 +336,24 @@ MOVED = {
     "sim.track_laboratory": "sim.track.laboratory",
     "sim.track_plan": "sim.track.plan",
 }
-"""What location files written before petrobot was one package name, and where it is now."""
+"""Modules in location files that were written before petrobot was one package, and where they are
+now."""
 
 
 @cache
 def module_name(name: str) -> str:
     """Return the name by which a module of a location file or task file is imported.
 
-    It is the name itself. Only what was shipped as `services`, `sim` or `coordinator` before
-    petrobot was one package is found under its present name, unless the user has such a package.
+    It is the name itself, with one exception: modules that were shipped as `services`, `sim` or
+    `coordinator` before petrobot was one package are found under their present name, unless the
+    user has such a package.
     """
     top = name.partition(".")[0]
     if top not in ("coordinator", "services", "sim"):
         return name
     try:
         spec = importlib.util.find_spec(top)
-    except ValueError:  # a stand-in in sys.modules without a spec: the user's
+    except ValueError:  # a module in sys.modules without a spec: the user has put it there
         return name
     own = spec.origin if spec is not None else None
     if spec is not None and (own is None or not Path(own).samefile(SHIPPED / top / "__init__.py")):
@@ -354,8 +363,8 @@ def module_name(name: str) -> str:
 
 
 def resolve(path: str) -> Any:
-    """The object at an import path "module:name". Raises ImportError that says what is missing and
-    what to do."""
+    """Return the object at an import path "module:name". Raises ImportError with what is missing
+    and what to do."""
     written, _, attribute = path.partition(":")
     try:
         module = importlib.import_module(module_name(written))
@@ -366,7 +375,7 @@ def resolve(path: str) -> Any:
         ) from fault
     except Exception as fault:
         raise ImportError(
-            f"importing {written!r} raises {type(fault).__name__}: {fault}; mend the module"
+            f"importing {written!r} raises {type(fault).__name__}: {fault}; correct the module"
         ) from fault
     found = getattr(module, attribute, None)
     if not callable(found):

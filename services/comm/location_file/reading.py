@@ -1,4 +1,4 @@
-"""Reads the text of services.toml and names every fault in it, with line, key and remedy."""
+"""Read the text of services.toml, and report every fault in it with line, key and remedy."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ SCHEMA = 1
 Tables = dict[str, dict[str, Any]]
 
 
-class Key(NamedTuple):
-    """What one key of a table may hold: a sentence for people, and the check."""
+class KeySpec(NamedTuple):
+    """What one key of a table may hold: a description for people, and the check."""
 
     wants: str
     fits: Callable[[Any], bool]
@@ -24,7 +24,7 @@ class Key(NamedTuple):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A hint that names the nearest known name, else all of them when there are few."""
+    """Return a hint with the nearest known name, or with all names when there are few."""
     names = list(dict.fromkeys(known))
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     if close:
@@ -45,12 +45,13 @@ def _text(value: Any) -> bool:
     return isinstance(value, str) and bool(value)
 
 
-def _one_of(*choices: str) -> Key:
-    return Key("one of " + ", ".join(f'"{c}"' for c in choices), lambda v: v in choices)
+def _one_of(*choices: str) -> KeySpec:
+    return KeySpec("one of " + ", ".join(f'"{c}"' for c in choices), lambda v: v in choices)
 
 
 def _host(value: Any) -> bool:
-    """A name, an IPv4 or an IPv6 address: what looks like an address is one."""
+    """Return whether this is a name, an IPv4 or an IPv6 address. What looks like an address must be
+    one."""
     if not isinstance(value, str) or not _HOST_NAME.fullmatch(value):
         return isinstance(value, str) and _is_address(value)
     return not value.rpartition(".")[2].isdigit() or _is_address(value)
@@ -67,45 +68,45 @@ def _is_address(text: str) -> bool:
 _HOST_NAME = re.compile(
     r"[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?(\.[A-Za-z0-9_]([A-Za-z0-9_-]*[A-Za-z0-9_])?)*\.?"
 )
-"""Letters, digits and hyphens in labels (RFC 1123); underscores, which many local networks have,
+"""Letters, digits and hyphens in labels (RFC 1123), and underscores, which many local networks use
 too."""
 _IMPORT_PATH = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 _NAME = re.compile(r"[A-Za-z_][\w-]*")
 LONGEST_NAME = 200
-"""Characters of a name: with what is put before or behind it (`memory:`, `stream:`) it still is one
-in any message."""
+"""Characters of a name. With a prefix or suffix (`memory:`, `stream:`) it still fits a name of a
+message (255)."""
 
 
-def _path_key(what: str, *, required: bool = False) -> Key:
-    return Key(
+def _path_key(what: str, *, required: bool = False) -> KeySpec:
+    return KeySpec(
         f'an import path "module:{what}"',
         lambda v: isinstance(v, str) and bool(_IMPORT_PATH.fullmatch(v)),
         required,
     )
 
 
-def _name_key(what: str, *, required: bool = False) -> Key:
-    return Key(f"the name of {what}", _text, required)
+def _name_key(what: str, *, required: bool = False) -> KeySpec:
+    return KeySpec(f"the name of {what}", _text, required)
 
 
-_POSITIVE = Key("a number of seconds above 0", lambda v: _number(v) and v > 0)
-_NOT_NEGATIVE = Key("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
+_POSITIVE = KeySpec("a number of seconds above 0", lambda v: _number(v) and v > 0)
+_NOT_NEGATIVE = KeySpec("a number of seconds, 0 or more", lambda v: _number(v) and v >= 0)
 _PERIOD = _POSITIVE._replace(required=True)
 
-SHAPES: Mapping[str, Mapping[str, Key]] = {
+SHAPES: Mapping[str, Mapping[str, KeySpec]] = {
     "nodes": {
-        "host": Key('a host name or address such as "127.0.0.1", without a port', _host, True),
-        "port": Key(
+        "host": KeySpec('a host name or address such as "127.0.0.1", without a port', _host, True),
+        "port": KeySpec(
             "a port from 1 to 65535",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and 0 < v < 65536,
             True,
         ),
         "sim": _path_key("function"),
-        "worker_memory_mb": Key(
+        "worker_memory_mb": KeySpec(
             "a whole number of MiB above 0",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
         ),
-        "workers": Key(
+        "workers": KeySpec(
             "a whole number of processes above 0",
             lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0,
         ),
@@ -115,8 +116,8 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
         "run": _path_key("function", required=True),
         "task": _name_key("the primitive task that the action translates", required=True),
         "device": _name_key("a device"),
-        "node": Key("the name of one node", _text),
-        "args": Key("a table of arguments", lambda v: isinstance(v, dict)),
+        "node": KeySpec("the name of one node", _text),
+        "args": KeySpec("a table of arguments", lambda v: isinstance(v, dict)),
         "deadline": _POSITIVE,
         "orphan_time": _NOT_NEGATIVE,
         "on_resume": _one_of("rejoin", "error", "ask"),
@@ -132,19 +133,19 @@ SHAPES: Mapping[str, Mapping[str, Key]] = {
     "timers": {"node": _name_key("a node", required=True), "period": _PERIOD},
 }
 OPEN = ("devices",)
-"""Tables whose entries have keys of their own beside the known ones."""
-FLAT: Mapping[str, Key] = {
-    "links": Key(
+"""Tables whose entries may have further keys of their own."""
+FLAT: Mapping[str, KeySpec] = {
+    "links": KeySpec(
         "a delay in seconds, 0.004 (one tick) or more", lambda v: _number(v) and v >= 0.004
     ),
-    "keys": Key("the path of a file or folder, relative to this one", _text),
-    "parameters": Key("the path of a file, relative to this one", _text),
+    "keys": KeySpec("the path of a file or folder, relative to this one", _text),
+    "parameters": KeySpec("the path of a file, relative to this one", _text),
 }
 CHANNELS = ("call", "can", "image", "stream", "control")
 KEYS = ("file", "certificates", "also")
 COORDINATOR = "coordinator"
 COORDINATOR_PORT = 7299
-"""Where the coordinator listens unless `[coordinator]` says otherwise."""
+"""Port of the coordinator unless `[coordinator]` sets another."""
 TOP = ("schema", COORDINATOR, *SHAPES, *FLAT)
 
 
@@ -157,13 +158,16 @@ class Faults:
         self.lines: list[str] = []
 
     def add(self, key: str, fault: str) -> None:
-        """Note a fault of a key given as "table.name.key"."""
+        """Add a fault of a key, given as "table.name.key"."""
         line = self._line(key.split("."))
         place = f"{self._source}:{line}" if line else self._source
         self.lines.append(f"{place}: {key}: {fault}")
 
     def _line(self, path: list[str]) -> int:
-        """Line of the key, else of the first header of the table that it belongs to, else 0."""
+        """Return the line of the key; else of the header of its table; else 0.
+
+        tomllib reports no positions, so the line is searched in the text.
+        """
         table, wanted, header, first = path[:-1], ".".join(path), "", 0
         for number, raw in enumerate(self._lines, 1):
             line = raw.strip()
@@ -181,8 +185,8 @@ class Faults:
 
 
 def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
-    """Tables of the file, the hash of its data, and all faults (then the tables are not to be
-    used)."""
+    """Return the tables of the file, the hash of its data, and all faults. With faults the tables
+    must not be used."""
     faults = Faults(text, source)
     try:
         data = tomllib.loads(text)
@@ -228,8 +232,11 @@ def read(text: str, source: str, memory: str) -> tuple[Tables, str, list[str]]:
 
 
 def _digest(data: Mapping[str, Any]) -> str:
-    """Hash of the file's data but for `keys`: while keys are replaced, hosts name different ones,
-    and a key that does not fit is refused as such."""
+    """Return the hash of the file's data without `keys`.
+
+    While keys are being replaced, hosts name different ones; a wrong key is refused in the
+    handshake anyway.
+    """
     told = {name: table for name, table in data.items() if name != "keys"}
     return hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode()).hexdigest()
 
@@ -261,7 +268,7 @@ def _check_top(data: Mapping[str, Any], faults: Faults) -> None:
 
 
 def _coordinator(data: Mapping[str, Any], faults: Faults) -> dict[str, Any]:
-    """Where the coordinator listens: host and port, both with a default."""
+    """Return host and port of the coordinator, as far as they are given."""
     given = data.get(COORDINATOR, {})
     if not isinstance(given, dict):
         faults.add(COORDINATOR, f"is not a table; write [{COORDINATOR}] above its keys")
@@ -273,7 +280,7 @@ def _coordinator(data: Mapping[str, Any], faults: Faults) -> dict[str, Any]:
 
 
 def _entries(
-    table: str, shape: Mapping[str, Key], entries: Mapping[str, Any], faults: Faults
+    table: str, shape: Mapping[str, KeySpec], entries: Mapping[str, Any], faults: Faults
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, entry in entries.items():
         here = f"{table}.{name}"
@@ -293,7 +300,7 @@ def _entries(
 
 
 def _check_key(
-    here: str, key: str, value: Any, shape: Mapping[str, Key], open_: bool, faults: Faults
+    here: str, key: str, value: Any, shape: Mapping[str, KeySpec], open_: bool, faults: Faults
 ) -> None:
     if key in shape:
         if not shape[key].fits(value):
@@ -340,7 +347,7 @@ def _check_addresses(
     taken: dict[tuple[str, int], str] = {}
     for name, entry in nodes.items():
         if name == COORDINATOR:
-            faults.add(f"nodes.{name}", "the coordinator is no node; rename the node")
+            faults.add(f"nodes.{name}", "this name belongs to the coordinator; rename the node")
         address = (entry["host"], entry["port"])
         if address in taken:
             where = f"{address[0]}:{address[1]}"
@@ -379,7 +386,8 @@ def _check_action(here: str, entry: Mapping[str, Any], tables: Tables, faults: F
 
 
 def _check_names(tables: Tables, faults: Faults) -> None:
-    """Endpoints share one name space: messages are addressed by name, wherever it is."""
+    """Check that all names differ: messages are addressed by endpoint name alone, so all tables
+    share one name space."""
     owner: dict[str, str] = {}
     for table in SHAPES:
         for name in tables[table]:

@@ -1,1 +1,1 @@
-"""Lock step: parties that advance together, tick by tick, in one process or in many."""
+"""Lock step: parties that advance together, tick by tick, in one process or in several."""

@@ -1,10 +1,11 @@
-"""Lock step in one process: several parties, tick by tick, every envelope in the one order that any
-placement gives.
+"""Lock step in one process: several parties advance tick by tick; the order of envelopes is the
+same for any distribution over processes.
 
-At tick k each party takes the envelopes due at k, ordered by (tick sent, source, sequence), then
-advances to k * TICK; what it sends is due after the delay of its link, one tick at least. So
-parties never see each other within a tick, and neither their order nor the process they live in
-shows. Bodies are passed on as they would arrive from another process.
+At tick k each party receives the envelopes due at k, ordered by (tick sent, source, sequence), then
+advances to k * TICK. What it sends is due after the delay of its link, at least one tick. So a
+party never sees what another party does within the same tick, and neither the order of the parties
+nor their processes can influence the result. Bodies are converted to what would arrive from another
+process.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ _Due = tuple[int, str, int, Envelope]
 
 
 class CellError(Exception):
-    """A lock-step cell cannot go on; the text names the party and what to do."""
+    """A lock-step cell cannot continue; the text names the party and what to do."""
 
 
 class Delays:
     """Delays of the links in ticks, by `"source/target"` (endpoint names) or by channel; the former
-    goes first.
+    has priority.
 
-    Whatever is not named takes one tick. Raises CellError for a delay below one.
+    Links without an entry take one tick. Raises CellError for a delay below one tick.
     """
 
     def __init__(self, table: Mapping[str, int] | None = None) -> None:
@@ -50,11 +51,12 @@ class Delays:
         for name, ticks in self._table.items():
             if type(ticks) is not int or ticks < 1:
                 raise CellError(
-                    f"link {name}: a delay of {ticks!r}; give a whole number of ticks, at least 1"
+                    f"link {name}: expected a delay of a whole number of ticks, at least 1, "
+                    f"got {ticks!r}"
                 )
 
     def ticks(self, envelope: Envelope) -> int:
-        """Ticks that this envelope is on its way."""
+        """Return how many ticks this envelope takes."""
         if not self._table:
             return 1
         way = envelope[1:4]
@@ -66,11 +68,14 @@ class Delays:
         return ticks
 
 
+# The order of the tests is by frequency: CAN frames and tuples of numbers are sent every tick and
+# must not be copied.
 def as_received(channel: str, body: Any) -> Any:
-    """The body as it arrives in another process: messages checked and in plain data, arrays as
-    tuples, images read-only (those that their sender has locked are passed on as they are).
+    """Return the body as it would arrive in another process.
 
-    Raises NotPlainError or ProtocolError for what no envelope carries.
+    Messages are checked and converted to plain data, arrays become tuples, images become read-only
+    copies (an image that its sender has locked is passed on as it is). Raises NotPlainError or
+    ProtocolError for what an envelope cannot carry.
     """
     kind = type(body)
     if kind is tuple:
@@ -94,15 +99,15 @@ def as_received(channel: str, body: Any) -> Any:
 
 
 def _frozen(array: NDArray[Any]) -> bool:
-    """Whether an array is already what would arrive: nobody can write to it, as its maker has
-    locked memory of its own."""
+    """Return whether an array is already what would arrive: it owns its memory and is read-only, so
+    no party can change it."""
     flags = array.flags
     locked = not flags.writeable and flags.owndata and flags.c_contiguous
     return locked and array.dtype in _DTYPES and array.ndim <= _MOST_DIMENSIONS
 
 
-class Half:
-    """The parties that live in this process, their inboxes, and the numbers of what they send."""
+class LocalParties:
+    """The parties of this process, their inboxes, and the sequence numbers of what they send."""
 
     def __init__(
         self, parties: Iterable[Party], delays: Delays, everybody: Iterable[str] = ()
@@ -110,7 +115,7 @@ class Half:
         self._parties: dict[str, Party] = {}
         for party in sorted(parties, key=lambda one: one.name):
             if party.name in self._parties:
-                raise CellError(f"two parties are named {party.name}; give each a name of its own")
+                raise CellError(f"two parties are named {party.name}; rename one of them")
             self._parties[party.name] = party
         self._names = frozenset(everybody) | frozenset(self._parties)
         self._delays = delays
@@ -119,14 +124,15 @@ class Half:
         self._owners: dict[str, str] = {}
 
     def replace(self, party: Party) -> None:
-        """Another party takes a name over. Raises CellError if there is none of its name."""
+        """Replace a party by a new one of the same name. Raises CellError if there is none of that
+        name."""
         if party.name not in self._parties:
-            raise CellError(f"no party is named {party.name}; there are {sorted(self._parties)}")
+            raise CellError(f"no party is named {party.name}; known: {sorted(self._parties)}")
         self._parties[party.name] = party
 
     def step(self, tick: int) -> list[Posted]:
-        """Run one tick. Gives the envelopes for parties that do not live here, in the order they
-        were sent."""
+        """Run one tick. Return the envelopes for parties of other processes, in the order they were
+        sent."""
         now = tick * TICK
         outside: list[Posted] = []
         for name, party in self._parties.items():
@@ -146,7 +152,7 @@ class Half:
         return outside
 
     def deliver(self, sent: int, posted: Posted) -> None:
-        """Put an envelope that was sent at this tick into its party's inbox."""
+        """Put an envelope that was sent at tick `sent` into the inbox of its party."""
         due, sequence, envelope = posted
         inbox = self._inboxes[envelope.party]
         one = sent, envelope.source, sequence, envelope
@@ -156,12 +162,16 @@ class Half:
             inbox[due] = [one]
 
     def own(self, source: str, party: str) -> None:
-        """Note which party an endpoint lives in. Raises CellError if two parties send under one
-        name."""
+        """Record the party of an endpoint. Raises CellError if two parties send under one endpoint
+        name.
+
+        Sequence numbers are counted per endpoint name; two senders under one name would have no
+        defined order.
+        """
         owner = self._owners.setdefault(source, party)
         if owner != party:
             raise CellError(
-                f"{owner} and {party} both send as {source}; an endpoint lives in one party"
+                f"{owner} and {party} both send as {source}; an endpoint belongs to one party"
             )
 
     def _post(self, tick: int, sender: str, envelope: Envelope) -> Posted:
@@ -170,13 +180,13 @@ class Half:
             self.own(source, sender)
         if party not in self._names:
             raise CellError(
-                f"{source} sends to the party {party}, which is not in the cell: "
+                f"{source} sends to the party {party}, which is not in the cell; known: "
                 f"{sorted(self._names)}"
             )
         try:
             body = as_received(channel, sent)
         except Exception as fault:
-            text = f"{source} sends {target} on {channel} what no envelope carries: {fault}"
+            text = f"{source} sends data to {target} on {channel} that cannot be sent: {fault}"
             raise CellError(text) from fault
         if body is not sent:
             envelope = Envelope(party, source, target, channel, body)
@@ -185,17 +195,17 @@ class Half:
         return Posted(tick + self._delays.ticks(envelope), sequence, envelope)
 
 
-class Cell:
+class LockStepCell:
     """A whole cell in one process."""
 
     def __init__(self, parties: Sequence[Party], delays: Delays | None = None) -> None:
-        self._half = Half(parties, delays or Delays())
+        self._half = LocalParties(parties, delays or Delays())
         self.tick = 0
         """The next tick to run."""
 
     @property
     def now(self) -> float:
-        """Simulated time of the next tick (s)."""
+        """Return the simulated time of the next tick (s)."""
         return self.tick * TICK
 
     def step(self) -> None:
@@ -204,12 +214,12 @@ class Cell:
         self.tick += 1
 
     def replace(self, party: Party) -> None:
-        """Another party takes a name over, as a process that was started again does; what is on its
-        way still arrives."""
+        """Replace a party, as a restarted process does; envelopes on their way still arrive."""
         self._half.replace(party)
 
     def run(self, until: Callable[[], bool], max_ticks: int) -> bool:
-        """Run ticks until `until()` holds after one, at most `max_ticks`. Says whether it held."""
+        """Run ticks until `until()` holds after one, at most `max_ticks`. Return whether it
+        held."""
         for _ in range(max_ticks):
             self.step()
             if until():

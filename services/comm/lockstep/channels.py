@@ -1,7 +1,7 @@
-"""What lies in a lock-step cell's envelopes besides protocol messages: frames, images, set points
-and controls.
+"""Bodies of envelopes that are not protocol messages: CAN frames, images, set points and controls.
 
-A node and the laboratory exchange them instead of a bus, a camera's socket and a stream's socket:
+In lock step a node and the laboratory exchange them instead of a bus, a camera's socket and a
+stream's socket:
 
 - "can": all frames that one port sent in a tick, from a device to the laboratory and back, as a
   tuple of `Frame`;
@@ -28,16 +28,16 @@ _FRAMES = frozenset((Frame,))
 
 
 class ImagesWanted(NamedTuple):
-    """A device wants images at `rate` (1/s; 0: none); `generation` counts its wishes: images of an
-    earlier one are dropped."""
+    """A device wants images at `rate` (1/s; 0: none). `generation` counts its requests: images of
+    an earlier request are dropped."""
 
     rate: float
     generation: int
 
 
 class SetPointBody(NamedTuple):
-    """A set point on its way: the stream, its values, how long its sender has stood by them (s) and
-    the stream's period (s)."""
+    """A set point on its way: stream, values, age of the values at the sender (s), period of the
+    stream (s)."""
 
     stream: str
     values: tuple[float, ...]
@@ -46,12 +46,12 @@ class SetPointBody(NamedTuple):
 
 
 def can_body(frames: Iterable[Frame]) -> tuple[Frame, ...]:
-    """Body of a "can" envelope."""
+    """Return the body of a "can" envelope."""
     return tuple(frames)
 
 
 def read_can(body: Any) -> tuple[Frame, ...]:
-    """Frames of a "can" envelope, also of one that holds a single frame."""
+    """Return the frames of a "can" envelope, also of one that holds a single frame."""
     if isinstance(body, Frame):
         return (body,)
     if _FRAMES.issuperset(map(type, body)):
@@ -60,12 +60,12 @@ def read_can(body: Any) -> tuple[Frame, ...]:
 
 
 def images_wanted(rate: float, generation: int) -> Mapping[str, Any]:
-    """Body of a "control" envelope to the laboratory."""
+    """Return the body of a "control" envelope to the laboratory."""
     return {"images": float(rate), "generation": generation}
 
 
 def read_images_wanted(body: Mapping[str, Any]) -> ImagesWanted | None:
-    """The wish in a "control" envelope, None when it is about something else."""
+    """Return the request in a "control" envelope, None if it is about something else."""
     if "images" not in body:
         return None
     return ImagesWanted(float(body["images"]), int(body["generation"]))
@@ -74,25 +74,28 @@ def read_images_wanted(body: Mapping[str, Any]) -> ImagesWanted | None:
 def image_body(
     pixels: NDArray[np.uint8], age: float, sequence: int, generation: int
 ) -> Mapping[str, Any]:
-    """Body of an "image" envelope: grey levels (height, width), age in seconds since mid-exposure
-    when it is sent."""
+    """Return the body of an "image" envelope.
+
+    `pixels` are grey levels (height, width); `age` is the time since mid-exposure when it is sent
+    (s).
+    """
     return {"pixels": pixels, "age": float(age), "sequence": sequence, "generation": generation}
 
 
 def read_image(body: Mapping[str, Any], now: float) -> tuple[Image, int]:
-    """The image of an "image" envelope on the receiver's clock, and the generation of the wish that
-    it answers."""
+    """Return the image of an "image" envelope, with its time on the receiver's clock, and the
+    generation of the request that it answers."""
     return Image(body["pixels"], now - body["age"], body["sequence"]), body["generation"]
 
 
 def set_point_body(
     stream: str, values: Sequence[float], held: float, period: float
 ) -> tuple[Any, ...]:
-    """Body of a "stream" envelope."""
+    """Return the body of a "stream" envelope."""
     return (stream, tuple(float(v) for v in values), float(held), float(period))
 
 
 def read_set_point(body: Sequence[Any]) -> SetPointBody:
-    """The set point in a "stream" envelope."""
+    """Return the set point of a "stream" envelope."""
     stream, values, held, period = body
     return SetPointBody(stream, tuple(values), held, period)

@@ -1,18 +1,19 @@
-"""Lock step across processes: a full mesh of TCP connections, one Tick message a peer and tick.
+"""Lock step across processes: a full mesh of TCP connections, one Tick message per peer and tick.
 
-A member runs the parties that live in its process. Its Tick of number k carries all that it sent a
-peer at k and says that nothing of k follows; a member runs tick k + 1 as soon as it has the Tick k
-of every peer. So sends overlap with the others' work, and nobody waits for an answer. A peer that
-is silent for `patience` seconds of wall time is lost.
+A member runs the parties of its process. Its Tick number k to a peer carries all envelopes that it
+sent to that peer at tick k and also marks the end of tick k. A member runs tick k + 1 as soon as it
+has the Tick k of every peer. So sending overlaps with computing, and there is no central process to
+wait for. A peer that is silent for `patience` seconds of wall time is lost.
 
-The cell ends when one member says Bye instead of its Tick k: everybody has then run the ticks up to
-k, no more, as in one process.
+The cell ends when a member sends Bye instead of its Tick k. Every member has then run exactly the
+ticks up to k, as in one process.
 
-A member in `returning` may be lost and come back as another process (a coordinator that is
-resumed): the others wait for it where they stand. They may differ by a tick, since it can have been
-killed between two of its Ticks. Each tells the new process the last Tick that it has sent; that one
-gives the missing marks, empty, and goes on behind the newest. What was on its way to the dead
-process is lost, as with any broken connection: the node protocol says it again.
+A member in `returning` may be lost and come back as a new process (a coordinator that is resumed);
+the others wait for it. They may be one tick apart, because the old process can have been killed
+between two of its Ticks. Each of them sends the new process the number of the last Tick that it
+sent to the old one. The new process begins behind the highest of these numbers, and sends the
+missing Ticks empty. Envelopes on their way to the dead process are lost, as with any broken
+connection; the node protocol repeats what matters.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
-from petrobot.services.comm.calls.listening import cannot_listen
 from petrobot.services.comm.location_file import COORDINATOR
-from petrobot.services.comm.lockstep.cell import Cell, CellError, Delays, Half
+from petrobot.services.comm.location_file.host_checks import cannot_listen
+from petrobot.services.comm.lockstep.cell import CellError, Delays, LocalParties, LockStepCell
 from petrobot.services.comm.lockstep.party import Party, Posted
 from petrobot.services.comm.protocol.messages import Bye, Hello, Message, Refuse, Tick, Welcome
 from petrobot.services.comm.protocol.security import NONCE_BYTES, UNPROVEN, Keys, require_key
@@ -40,14 +41,11 @@ from petrobot.services.comm.protocol.wire import (
     Side,
 )
 
-__all__ = ["Cell", "CellError", "Delays", "Member", "PartyLostError", "TickLink"]
-
-
-# The connection of two members of a lock-step cell: Ticks out, Ticks in, in order.
+__all__ = ["CellError", "Delays", "LockStepCell", "Member", "PartyLostError", "TickLink"]
 
 
 class PartyLostError(CellError):
-    """A member of the cell is gone; `member` says which."""
+    """A member of the cell is lost; `member` is its name."""
 
     def __init__(self, member: str, text: str) -> None:
         super().__init__(f"{member}: {text}")
@@ -57,9 +55,9 @@ class PartyLostError(CellError):
 class TickLink:
     """The connection to one peer. Never blocks.
 
-    `before` is the broken connection that this one takes the place of: its Ticks still count, and
-    what the peer repeats of them is left out. A member that `joins` a cell that goes on takes any
-    Tick as the first.
+    `before` is the broken connection that this one replaces: its Ticks still count, and Ticks that
+    the peer repeats are dropped. A member that `joins` an active cell accepts any Tick as the
+    first.
     """
 
     def __init__(
@@ -76,18 +74,18 @@ class TickLink:
         self.peer = peer
         self.sock = sock
         self.ended: str | None = None
-        """Text of the peer's Bye: who ended the cell and why."""
+        """Text of the peer's Bye: which member ended the cell, and why."""
         self._connection = connection
         self._unsent = bytearray()
         self._ticks: deque[Tick] = deque(before._ticks if before is not None else ())
         self.newest: int | None = before.newest if before is not None else None if joins else -1
-        """Number of the newest Tick that came."""
+        """Number of the newest Tick that arrived."""
         self._repeats = before is not None
         self._take(early)
 
     @property
     def unsent(self) -> bool:
-        """Whether bytes still wait for room in the socket."""
+        """Return whether bytes still wait for room in the socket."""
         return bool(self._unsent)
 
     def rest(self) -> bytes:
@@ -97,24 +95,25 @@ class TickLink:
         return rest
 
     def has(self, number: int) -> bool:
-        """Whether the peer's Tick of this number is in."""
+        """Return whether the peer's Tick of this number has arrived."""
         return self.newest is not None and self.newest >= number
 
     def pop(self, number: int) -> Tick:
-        """The Tick of this number; older ones are left out."""
+        """Take out the Tick of this number; older ones are dropped."""
         while (tick := self._ticks.popleft()).number < number:
             pass
         return tick
 
     def send(self, message: Message) -> None:
-        """Send a message, or as much of it as fits now; one that has ended is sent nothing more."""
+        """Send a message, or as much of it as fits now. A peer that said Bye is sent nothing
+        more."""
         if self.ended is not None:
             return
         self._unsent += self._connection.send(message)
         self.flush()
 
     def flush(self) -> None:
-        """Send what still waits. Raises PartyLostError if the peer is gone."""
+        """Send the bytes that still wait. Raises PartyLostError if the peer is gone."""
         try:
             while self._unsent:
                 del self._unsent[: self.sock.send(self._unsent)]
@@ -124,7 +123,7 @@ class TickLink:
             raise PartyLostError(self.peer, f"its connection broke: {fault.strerror}") from None
 
     def read(self) -> None:
-        """Take in what has arrived. Raises PartyLostError if the peer is gone, failed or broke the
+        """Read what has arrived. Raises PartyLostError if the peer is gone, has failed or broke the
         protocol."""
         try:
             data = self.sock.recv(_CHUNK)
@@ -134,7 +133,7 @@ class TickLink:
             raise PartyLostError(self.peer, f"its connection broke: {fault.strerror}") from None
         if not data:
             if self.ended is None:
-                raise PartyLostError(self.peer, "its process ended without a word")
+                raise PartyLostError(self.peer, "its process ended without a BYE message")
             return
         try:
             self._take(self._connection.receive_data(data))
@@ -149,7 +148,8 @@ class TickLink:
                     continue
                 if self.newest is not None and message.number != self.newest + 1:
                     raise PartyLostError(
-                        self.peer, f"tick {message.number} came after tick {self.newest}"
+                        self.peer,
+                        f"expected tick {self.newest + 1}, got tick {message.number}",
                     )
                 self.newest = message.number
                 self._ticks.append(message)
@@ -159,25 +159,25 @@ class TickLink:
                 raise PartyLostError(self.peer, message.text)
             else:
                 raise PartyLostError(
-                    self.peer, f"a {type(message).__name__} has no place in lock step"
+                    self.peer, f"a {type(message).__name__} is not allowed in lock step"
                 )
 
 
 def family(host: str) -> socket.AddressFamily:
-    """Of an address written as a number."""
+    """Return the socket family of a numeric address."""
     return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def tune(sock: socket.socket) -> None:
-    """Send at once what is to be sent."""
+    """Turn off Nagle's algorithm, so that a Tick is sent at once."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 
 def handshake(
     sock: socket.socket, connection: Connection, hello: Hello | None, deadline: float
 ) -> list[Message]:
-    """Blocking: say HELLO if this side begins, go on until the other side has said something for
-    the owner."""
+    """Blocking: send HELLO if this side begins, and answer the handshake until a message for the
+    owner arrives."""
     if hello is not None:
         sock.sendall(connection.send(hello))
     while True:
@@ -194,20 +194,20 @@ def handshake(
 
 _CHUNK: Final = 1 << 18
 _RETRY: Final = 0.02
-"""Seconds between attempts to reach a member that does not listen yet."""
+"""Pause between attempts to reach a member that does not listen yet (s)."""
 _LINGER: Final = 1.0
-"""Seconds that an ended member waits for the others to have read its Bye."""
+"""How long a member waits at the end for the others to read its Bye (s)."""
 
 
 class Member:
-    """One process of a lock-step cell. `addresses` (host, port) name all members, this one too;
-    `name` is among them.
+    """One process of a lock-step cell. `addresses` (host, port) name all members, including this
+    one (`name`).
 
-    `hosts` says which member each party of the cell lives in; without it each member is one party
-    of its own name. `directory` (hash of services.toml) must be the same in all. `patience` is how
-    long a mark may be missing, `joining` how long members may take to come together (s of wall
-    time; importing takes some on a busy host). Members in `returning` may be away for `absence` (s
-    of wall time); one that comes back itself `rejoins`.
+    `hosts` names the member of each party; without it each member is one party of its own name.
+    `directory` (hash of services.toml) must be the same in all members. `patience` is how long a
+    Tick may be missing, `joining` how long the members may take to connect (s of wall time; imports
+    take long on a busy host). Members in `returning` may be away for `absence` (s of wall time); a
+    new process that replaces a lost one sets `rejoins`.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class Member:
         """The next tick to run."""
         self._addresses = addresses
         self._hosts = dict(hosts) if hosts is not None else {member: member for member in addresses}
-        self._half = Half(parties, delays or Delays(), self._hosts)
+        self._half = LocalParties(parties, delays or Delays(), self._hosts)
         self._directory = directory
         self._key = key
         self._patience = patience
@@ -244,13 +244,14 @@ class Member:
         self._rejoins = rejoins
         self._boot = secrets.token_hex(8)
 
-    # Coming together.
+    # Connecting.
 
     def open(self) -> None:
-        """Listen, reach the members sorted before this one, wait for those sorted after it.
+        """Listen, connect to the members sorted before this one, and wait for those sorted after
+        it.
 
-        Raises PartyLostError for one that does not come within `joining`, CellError for one that
-        does not fit.
+        Raises PartyLostError for a member that does not connect within `joining`, CellError for one
+        that does not fit.
         """
         before = sorted(peer for peer in self._addresses if peer < self.name)
         after = {peer for peer in self._addresses if peer > self.name}
@@ -291,8 +292,8 @@ class Member:
         return Connection(side, server, key=self._key, nonce=nonce)
 
     def _find_place(self, deadline: float) -> None:
-        """Join a cell that goes on: hear where everybody is, give the missing marks, go on behind
-        the newest."""
+        """Join an active cell: receive the last Tick number of every peer, send the missing Ticks
+        empty, and continue behind the newest."""
         while missing := [link for link in self._links.values() if link.newest is None]:
             self._wait(missing, deadline)
         last = {link.peer: link.newest for link in self._links.values() if link.newest is not None}
@@ -302,7 +303,7 @@ class Member:
                 link.send(Tick(number))
 
     def _readmit(self, peer: str) -> None:
-        """A member that may return is gone: wait for it, and tell it the last tick that was sent
+        """A member that may return is lost: wait for it, and send it the number of the last Tick
         from here."""
         lost = self._links.pop(peer)
         lost.sock.close()
@@ -317,7 +318,7 @@ class Member:
                 if link is not None:
                     link.send(Tick(self.tick - 1))
             except PartyLostError:
-                link = None  # it was gone again before it had come
+                link = None  # it was lost again during its handshake
                 if time.monotonic() + _RETRY >= deadline:
                     raise
                 time.sleep(_RETRY)
@@ -334,7 +335,7 @@ class Member:
             except OSError as fault:
                 if time.monotonic() + _RETRY >= deadline:
                     raise PartyLostError(
-                        peer, f"nobody answers on {host}:{port}: {fault}"
+                        peer, f"no process answers at {host}:{port}: {fault}"
                     ) from None
                 time.sleep(_RETRY)
         tune(sock)
@@ -346,7 +347,7 @@ class Member:
             early = handshake(sock, connection, hello, deadline)
         except (OSError, ProtocolError) as fault:
             sock.close()
-            raise PartyLostError(peer, f"no lock step with {host}:{port}: {fault}") from None
+            raise PartyLostError(peer, f"cannot connect to {host}:{port}: {fault}") from None
         answer = early[0]
         if isinstance(answer, Welcome):
             return TickLink(peer, sock, connection, early[1:], before=before, joins=self._rejoins)
@@ -363,13 +364,13 @@ class Member:
         deadline: float,
         before: TickLink | None = None,
     ) -> TickLink | None:
-        """The next member that connects; None if it was a stranger."""
+        """Return the connection of the next member that connects; None if it was not a member."""
         listener.settimeout(max(deadline - time.monotonic(), 0.001))
         try:
             sock, _ = listener.accept()
         except TimeoutError:
             raise PartyLostError(
-                min(after), f"it did not join the cell in {self._joining:g} s"
+                min(after), f"it did not join the cell within {self._joining:g} s"
             ) from None
         tune(sock)
         connection = self._connection(Side.SERVER, self.name)
@@ -402,15 +403,15 @@ class Member:
             )
         return None
 
-    # Going on together.
+    # Running.
 
     def run(self, until: Callable[[], bool] | None = None, max_ticks: int | None = None) -> str:
-        """Run ticks until `until()` holds after one, `max_ticks` are over, or another member ends
+        """Run ticks until `until()` holds after one, `max_ticks` were run, or another member ends
         the cell.
 
-        Gives why it ended: "until", "max_ticks", or "NAME: text" of the member that ended it.
-        Raises PartyLostError for a member that is gone or silent, and whatever a party of this
-        process raises; the others are told either way.
+        Return why it ended: "until", "max_ticks", or "NAME: text" of the member that ended it.
+        Raises PartyLostError for a member that is gone or silent, and any exception of a party of
+        this process; the other members are notified in each case.
         """
         try:
             why = self._run(until, max_ticks)
@@ -443,11 +444,11 @@ class Member:
                 link.send(Tick(number, tuple(envelopes)) if envelopes else Tick(number))
             except PartyLostError:
                 if peer not in self._returning:
-                    raise  # else it is missed, and waited for, when its own Tick is due
+                    raise  # a returning member is waited for when its own Tick is due
 
     def _gather(self, number: int) -> str | None:
-        """Wait for every peer's Tick of this number and deliver it; gives why the cell has ended,
-        if it has."""
+        """Wait for every peer's Tick of this number and deliver it. Return why the cell has ended,
+        None if it has not."""
         deadline = time.monotonic() + (self._absence if self._returning else self._patience)
         links = self._links.values()
         while True:
@@ -463,7 +464,7 @@ class Member:
         return None
 
     def _wait(self, missing: Sequence[TickLink], deadline: float) -> None:
-        """Block until a socket has something to read, or room for what is still to go out."""
+        """Block until a socket has something to read, or room for bytes that still wait."""
         poll = select.poll()
         by_number = {link.sock.fileno(): link for link in self._links.values()}
         for link in self._links.values():
@@ -476,7 +477,7 @@ class Member:
         if not ready:
             patience = self._absence if self._returning else self._patience
             raise PartyLostError(
-                missing[0].peer, f"no end of tick {self.tick - 1} for {patience:g} s: lost"
+                missing[0].peer, f"it did not finish tick {self.tick - 1} within {patience:g} s"
             )
         for number, what in ready:
             link = by_number[number]
@@ -496,16 +497,16 @@ class Member:
             if posted.due <= tick.number or self._hosts.get(envelope.party) != self.name:
                 raise PartyLostError(
                     peer,
-                    f"an envelope of {envelope.source} to {envelope.party} does not belong here",
+                    f"its envelope from {envelope.source} to {envelope.party} is late or misdirected",
                 )
             self._half.own(envelope.source, peer)
             self._half.deliver(tick.number, posted)
 
-    # Going apart.
+    # Leaving.
 
     def _leave(self, text: str) -> None:
-        """Say Bye to all, and wait until they have read it: closing at once could take it from
-        them."""
+        """Send Bye to all, and wait until they have read it: closing a socket at once could discard
+        it."""
         for link in self._links.values():
             with contextlib.suppress(PartyLostError, ProtocolError):
                 link.send(Bye(text))

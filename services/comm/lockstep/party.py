@@ -1,11 +1,11 @@
-"""A party of a lock-step cell: the coordinator, a node or the laboratory, as a machine without
-clock or sockets of its own.
+"""A party of a lock-step cell: the coordinator, a node or the laboratory, without clock or sockets
+of its own.
 
-Lock step goes in ticks of `TICK` seconds. At tick k each party first gets the envelopes due at k,
-ordered by (time, source, sequence), then `advance`s to the time k * TICK, and what it sent is
-collected. An envelope sent at tick k is due at k + its link's delay, at least one tick, also when
-both ends are in one process: so one and four processes give one and the same run, and so does
-moving an endpoint to another party.
+Lock step advances in ticks of `TICK` seconds. At tick k each party first receives the envelopes due
+at k, ordered by (tick sent, source, sequence), then advances to the time k * TICK; then what it
+sent is collected. An envelope sent at tick k is due at k plus the delay of its link, which is at
+least one tick, even if both ends are in one process. So one process and four processes produce the
+same run, and so does moving an endpoint to another party.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ TICK = 0.004
 
 
 class Envelope(NamedTuple):
-    """A message on its way. `source` and `target` are endpoint names (an action, a device, a
+    """A message between endpoints. `source` and `target` are endpoint names (an action, a device, a
     service or a party), not processes.
 
-    `channel` says what `body` is: "call" a message of the node protocol, "can" a `Frame`, "image"
-    an `Image` body, "stream" a set point, "control" anything of the cell's own (start of images,
-    ...). `party` is the receiving party.
+    `channel` says what `body` is: "call" a message of the node protocol, "can" frames, "image" an
+    image body, "stream" a set point, "control" a request of the cell itself (for example the start
+    of images). `party` is the receiving party.
     """
 
     party: str
@@ -34,7 +34,7 @@ class Envelope(NamedTuple):
 
 
 class Posted(NamedTuple):
-    """An envelope on its way: due at a tick, and the how-manieth of its source it is (from 0)."""
+    """An envelope on its way: due tick, and its sequence number within its source (from 0)."""
 
     due: int
     sequence: int
@@ -46,13 +46,13 @@ class Party(Protocol):
 
     @property
     def name(self) -> str:
-        """Unique in the cell."""
+        """Name of the party, unique in the cell."""
 
     def receive(self, now: float, envelope: Envelope) -> None:
-        """Take an envelope that is due."""
+        """Handle an envelope that is due."""
 
     def advance(self, now: float) -> None:
         """Do all that is due at `now` (s of simulated time)."""
 
     def drain(self) -> Sequence[Envelope]:
-        """What was sent since the last call, in order."""
+        """Return what was sent since the last call, in order."""

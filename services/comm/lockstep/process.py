@@ -1,5 +1,5 @@
-"""A process of its own for one party of a lock-step cell: what `python -m petrobot.services` and
-`python -m petrobot.sim` share."""
+"""Run one party of a lock-step cell in a process of its own; shared by `python -m
+petrobot.services` and `python -m petrobot.sim`."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from petrobot.services.comm.tls.credentials import shared_keys
 
 
 def cell_key(directory: Directory) -> Keys | None:
-    """What seals the ticks of a lock-step cell: the shared key, if there is one.
+    """Return the key that seals the ticks of a lock-step cell: the shared key, if there is one.
 
-    Ticks cross no TLS (docs/decisions/lock-step-doors.md): with certificates all members must be on
-    loopback. Raises KeyNeededError where they are not, KeyFileError for a key file that cannot be
-    used.
+    Ticks are not sent through TLS (docs/decisions/lock-step-doors.md): with certificates all
+    members must be on loopback. Raises KeyNeededError if they are not, KeyFileError for a key file
+    that cannot be used.
     """
     if "file" in directory.keys:
         return shared_keys(directory)
@@ -28,7 +28,7 @@ def cell_key(directory: Directory) -> Keys | None:
         for name, (host, _) in directory.members().items():
             if not is_loopback(host):
                 raise KeyNeededError(
-                    f"{directory.source}: lock step crosses no TLS, and {name} is at {host}: "
+                    f"{directory.source}: lock step does not use TLS, and {name} is at {host}: "
                     "for lock step over several hosts "
                     'write file = "cell.key" in place of certificates under [keys] '
                     "(`petrobot keys` makes it), or use one host"
@@ -37,19 +37,19 @@ def cell_key(directory: Directory) -> Keys | None:
 
 
 class Closable(Party, Protocol):
-    """A party that holds something to be given back."""
+    """A party that holds resources."""
 
     def close(self) -> None:
-        """Give back what it holds."""
+        """Release them."""
 
 
 def run_member(directory: Directory, name: str, party: Closable, awaited: float) -> None:
-    """Be the member `name` of a lock-step cell of one process a node, until one of them ends it or
-    SIGTERM comes.
+    """Run the member `name` of a lock-step cell with one process per node, until a member ends the
+    cell or SIGTERM arrives.
 
-    `awaited`: seconds (wall time) that a coordinator which died may take to come back; 0: it is not
-    waited for. Raises CellError when another member is lost, KeyFileError for a key file that
-    cannot be used.
+    `awaited`: how long (s of wall time) to wait for a coordinator that died to come back; 0: not at
+    all. Raises CellError when another member is lost, KeyFileError for a key file that cannot be
+    used.
     """
     key = cell_key(directory)
     member = Member(

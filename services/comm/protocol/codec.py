@@ -1,5 +1,14 @@
-"""Messages as bytes and back: a msgpack array `[kind, field, ...]` for each, every field checked on
-its way in."""
+"""Encode messages as bytes and decode them: each message is a msgpack array `[kind, field, ...]`.
+
+Every field is checked in both directions by the same rules, so a message that this side can encode
+is never refused by the other side.
+
+There are two code paths. `_Spec` describes every kind as a table built from the dataclass
+annotations. CALL and RESULT, which make up nearly all traffic, also have hand-written readers and
+writers (`READERS`, `WRITERS`) that produce the same bytes in a third of the time. A fast path only
+handles what is valid and ordinary; whatever it does not accept goes to the table, which finds the
+fault and words the error. So each rule is worded in one place, and tests compare the two paths.
+"""
 
 from __future__ import annotations
 
@@ -38,19 +47,21 @@ __all__ = [
 ]
 
 
-# The kinds that make up nearly all traffic, written and read without the codec's table: the same bytes, a third of the time.
-
 NAME_LENGTH: Final = 255
 """Longest name, id or code (characters)."""
 COUNT_END: Final = 2**63
-"""Counts are below it."""
+"""Counts are below this number, so that they fit a signed 64-bit integer in any language."""
 EXECUTED: Final = {str(one): one for one in Executed}
+"""The enum member by its text on the wire."""
 
 
 Reader = Callable[[list[Any], bool], Message | None]
 
 
+# Comparing `type(x) is str` for all fields in one chain is the fastest check that CPython offers;
+# isinstance would also accept subclasses, which msgpack never produces.
 def _call(fields: list[Any], short: bool) -> Message | None:
+    """Read a CALL of exactly nine fields. One with `again` has ten and goes to the table."""
     if len(fields) != 9:
         return None
     _, id_, service, arguments, deadline, epoch, boot, parent, seed = fields
@@ -69,6 +80,7 @@ def _call(fields: list[Any], short: bool) -> Message | None:
 
 
 def _outcome(fields: list[Any], short: bool) -> Message | None:
+    """Read a RESULT of exactly nine fields. One with `deferred` has ten and goes to the table."""
     if len(fields) != 9:
         return None
     _, id_, status, values, cause, text, executed, seconds, cpu_seconds = fields
@@ -87,11 +99,16 @@ def _outcome(fields: list[Any], short: bool) -> Message | None:
 
 
 READERS: Mapping[int, Reader] = {Call.KIND: _call, Outcome.KIND: _outcome}
-"""By kind: reads the array of a body; `short` says that it is shorter than the longest name. Raises
-NotPlainError."""
+"""Fast reader by kind: turns the array of a body into a message, or returns None if the table must
+look at it.
+
+`short` says that the whole body is shorter than the longest name; then no name in it needs to be
+measured. Raises NotPlainError.
+"""
 
 
 def _call_row(call: Any) -> tuple[Any, ...] | None:
+    """Return a CALL as the array that is its body; None if the table must look at it."""
     id_, service, deadline, epoch = call.id, call.service, call.deadline, call.epoch
     boot, parent, seed = call.boot, call.parent, call.seed
     if (
@@ -106,13 +123,13 @@ def _call_row(call: Any) -> tuple[Any, ...] | None:
         and 0 <= seed < COUNT_END
     ):
         row = (4, id_, service, call.arguments, deadline, epoch, boot, parent, seed)
-        return (
-            (*row, True) if call.again else row
-        )  # seldom: after a broken link or a restart of the caller
+        # `again` is true only after a broken link or a restart of the caller.
+        return (*row, True) if call.again else row
     return None
 
 
 def _outcome_row(end: Any) -> tuple[Any, ...] | None:
+    """Return a RESULT as the array that is its body; None if the table must look at it."""
     id_, status, cause, text, seconds, cpu = (
         end.id,
         end.status,
@@ -133,7 +150,7 @@ def _outcome_row(end: Any) -> tuple[Any, ...] | None:
         and 0.0 <= cpu < inf
     ):
         row = (7, id_, status, end.values, cause, text, end.executed, seconds, cpu)
-        return (*row, True) if end.deferred else row  # seldom
+        return (*row, True) if end.deferred else row
     return None
 
 
@@ -141,8 +158,8 @@ WRITERS: Mapping[int, Callable[[Any], tuple[Any, ...] | None]] = {
     Call.KIND: _call_row,
     Outcome.KIND: _outcome_row,
 }
-"""By kind: the message as the array that is its body; None for one that the table has to look
-at."""
+"""Fast writer by kind: returns the array that is the body, or None if the table must look at the
+message."""
 
 __all__ += ["encode_all", "kind_of", "no_extension", "unpack"]
 
@@ -173,32 +190,41 @@ LIMITS: Mapping[int, int] = {
     m.SetPoint.KIND: 4 * KIB,
     m.Withdraw.KIND: 16,
 }
-"""Largest body of each kind (bytes), the MAC not counted. A value of the global memory (1 MiB) fits
-into CALL and RESULT; images and other large data have connections of their own."""
+"""Largest body of each kind (bytes, without the MAC).
+
+A value of the global memory (1 MiB) fits into CALL and RESULT. Images and other large data have
+connections of their own.
+"""
 
 MAX_VALUES = 1 << 17
-"""Most values in one message, all that its arrays and maps hold: 1 MiB of floats. Together with the
-limit of bytes this is what keeps other callers waiting while one message is read: some 30 ms at the
-worst."""
+"""Most values in one message, counted over all its arrays and maps: 1 MiB of floats.
+
+Together with the limit of bytes it bounds how long other callers wait while one message is decoded:
+about 30 ms at worst.
+"""
 ENTRY = 6
-"""Values that an entry of a map counts as: its key is checked, hashed and put in its place."""
+"""How many values one entry of a map counts as: its key must be checked, hashed and inserted."""
 MAX_CONTAINERS_OF_TICK = 100_000
-"""Of a TICK, which only members of one cell send each other, in lock step."""
+"""Most arrays and maps in a TICK, which only members of one lock-step cell send to each other."""
 UNCOUNTED = MAX_CONTAINERS
-"""Bodies up to so many bytes are read without counting what is in them: they cannot hold more."""
+"""Bodies of up to this many bytes are decoded without counting: each array or map takes at least
+one byte, so a body this short cannot hold too many of them."""
 _SELDOM = frozenset((m.Call.KIND, m.Outcome.KIND))
-"""Kinds whose last field, a bool, is left out when it is false: a peer that does not know it yet is
-not bothered with it."""
+"""Kinds whose last field is a bool that is left out when it is false, so a peer that does not know
+the field still reads the message."""
 _COUNTED = frozenset((m.Call.KIND, m.Outcome.KIND, m.Event.KIND, m.Answer.KIND))
 _NUMBERS = frozenset((float, int))
 _TICK = Tick.KIND
 _ARRAY, _MESSAGE = 1, 2
-"""msgpack extension types inside Tick: an array of numbers, a message."""
+"""msgpack extension types inside a Tick: an array of numbers, and a message."""
 
 
 class ProtocolError(Exception):
-    """The other side broke the protocol. `code` is for programs, `text` for people; `before` came
-    well before the fault."""
+    """The other side broke the protocol, or a message cannot be sent.
+
+    `code` is for programs, `text` for people. `before` holds the messages that arrived complete
+    before the fault.
+    """
 
     def __init__(self, code: str, text: str, before: Iterable[Message] = ()) -> None:
         super().__init__(f"{code}: {text}")
@@ -208,11 +234,11 @@ class ProtocolError(Exception):
 
 
 class _FieldError(ValueError):
-    """What is wrong with one field; `decode` adds which."""
+    """One field is wrong; `decode` adds which field."""
 
 
 class _LongNameError(_FieldError):
-    """A name that is longer than any."""
+    """A name is longer than NAME_LENGTH."""
 
 
 def _name(value: str) -> str:
@@ -223,13 +249,13 @@ def _name(value: str) -> str:
 
 def _count(value: int) -> int:
     if not 0 <= value < COUNT_END:
-        raise _FieldError("not from 0 to 2^63 - 1")
+        raise _FieldError("expected an integer from 0 to 2^63 - 1")
     return value
 
 
 def _duration(value: float) -> float:
     if not 0.0 <= value < math.inf:
-        raise _FieldError("not a finite number >= 0")
+        raise _FieldError("expected a finite number >= 0")
     return value
 
 
@@ -246,21 +272,21 @@ def _plain_map(value: dict[Any, Any]) -> dict[Any, Any]:
 def _names(value: list[Any]) -> tuple[str, ...]:
     for item in value:
         if type(item) is not str:
-            raise _FieldError("not an array of str")
+            raise _FieldError("expected an array of str")
         _name(item)
     return tuple(value)
 
 
 def _numbers(value: list[Any]) -> tuple[float, ...]:
     if not _NUMBERS.issuperset(map(type, value)) or not all(map(math.isfinite, value)):
-        raise _FieldError("not an array of finite numbers")
+        raise _FieldError("expected an array of finite numbers")
     return tuple(map(float, value))
 
 
 def _executed(value: str) -> Executed:
     found = EXECUTED.get(value)
     if found is None:
-        raise _FieldError("not yes, no or unknown")
+        raise _FieldError("expected yes, no or unknown")
     return found
 
 
@@ -274,7 +300,7 @@ def _posted(item: Any) -> Posted:
         or tuple(map(type, item[:6])) != (int, int, str, str, str, str)
         or len(item) != 7
     ):
-        raise _FieldError("not an envelope")
+        raise _FieldError("expected an envelope of seven fields")
     due, sequence, party, source, target, channel, body = item
     inspect(body, _LEAVES)
     return Posted(
@@ -292,19 +318,20 @@ def _body_in(channel: str, body: Any) -> Any:
     return tuple(_body_in(channel, item) for item in body)
 
 
+# Types that msgpack packs as one of the types above: a tuple as an array, an int where a float is
+# expected.
 _ALSO: Mapping[type, tuple[type, ...]] = {list: (tuple,), float: (int,)}
 
 
 class _Field(NamedTuple):
-    """How a field of one annotation looks on the wire, and what is checked beyond its type."""
+    """The wire types of one annotation, and the check beyond the type."""
 
     types: tuple[type, ...]
     check: Callable[[Any], Any] | None
 
     @property
     def out(self) -> tuple[type, ...]:
-        """Types that it may have on its way out: packed they are those on its way in, or taken for
-        them."""
+        """Types that the field may have in a message that is to be sent."""
         return (*self.types, *_ALSO.get(self.types[0], ()))
 
 
@@ -323,11 +350,11 @@ _FIELDS = {
 }
 _FREE_TEXT = frozenset(("text", "reason"))
 _SHORTER = {"cause": "put long words into the text"}
-"""What to do about a name that is too long, by field."""
+"""The remedy for a name that is too long, by field."""
 
 
 class _Spec:
-    """One kind of message: how its fields are read and written."""
+    """How the fields of one kind of message are read and written."""
 
     __slots__ = (
         "checks",
@@ -358,11 +385,11 @@ class _Spec:
             (index + 1, name, field, field.check is not _name or name not in _FREE_TEXT)
             for index, (name, field) in enumerate(zip(self.names, self.fields, strict=True))
         ]
-        """Place in the array, name, field, and whether more than its type is checked."""
+        """Position in the array, name, field, and whether more than the type is checked."""
 
     def _checks(self, short: bool) -> tuple[tuple[int, Callable[[Any], Any]], ...]:
-        """Checks by position; a body shorter than the longest name needs none of its names
-        measured."""
+        """Return the checks by position. `short`: the body is shorter than the longest name, so no
+        name needs to be measured."""
         return tuple(
             (index, field.check)
             for index, (name, field) in enumerate(zip(self.names, self.fields, strict=True))
@@ -384,11 +411,11 @@ unpack = msgpack.unpackb
 
 
 def encode(message: Message) -> bytes:
-    """Body of a frame, without length and MAC: what `decode` takes, and nothing else.
+    """Encode a message as the body of a frame, without length and MAC.
 
-    Raises ProtocolError for a message that the other side would have to refuse, since a refusal
-    costs the connection: too large, a name too long, a number out of its range, data that is not
-    plain. Data in calls and results must have been through `plain`.
+    Raises ProtocolError for a message that the other side would have to refuse, because a refusal
+    costs the connection: the message is too large, a name is too long, a number is out of range, or
+    data is not plain. Data in calls and results must have been converted by `plain` before.
     """
     kind = message.KIND
     writer = WRITERS.get(kind)
@@ -426,7 +453,7 @@ def _small_enough(message: Message, body: bytes) -> bytes:
 
 
 def _row(message: Message) -> list[Any]:
-    """The array that is a message's body, each field checked as the other side will check it.
+    """Return the array of a message's body, with each field checked as the receiver will check it.
     Raises ProtocolError."""
     kind = message.KIND
     spec = _SPECS[kind]
@@ -450,7 +477,8 @@ def _row(message: Message) -> list[Any]:
 
 
 def _refuse_too_many(body: bytes, message: Message) -> None:
-    """What the other side would break the connection for ends the message here."""
+    """Raise ProtocolError for a message with too many values; the receiver would break the
+    connection for it."""
     try:
         _unpack_counted(body, message.KIND)
     except Exception as fault:
@@ -460,7 +488,7 @@ def _refuse_too_many(body: bytes, message: Message) -> None:
 
 
 def encode_all(messages: Iterable[Message]) -> list[bytes]:
-    """`encode` of each, the kinds that make up nearly all traffic without a call of it. Raises as
+    """Encode several messages; the fast kinds without one call of `encode` each. Raises as
     `encode`."""
     bodies: list[bytes] = []
     for message in messages:
@@ -473,7 +501,7 @@ def encode_all(messages: Iterable[Message]) -> list[bytes]:
                     bodies.append(body)
                     continue
             except (TypeError, ValueError, OverflowError):
-                pass  # `encode` says what is wrong with it
+                pass  # `encode` below raises the error with its cause
         bodies.append(encode(message))
     return bodies
 
@@ -500,7 +528,7 @@ def _extension(value: Any) -> msgpack.ExtType:
         return msgpack.ExtType(_ARRAY, pack_array(value))
     if type(value) in _LEAVES and type(value) is not Tick:
         return msgpack.ExtType(_MESSAGE, encode(value))
-    raise TypeError(f"a {type(value).__name__} cannot travel in an envelope")
+    raise TypeError(f"a {type(value).__name__} cannot be sent in an envelope")
 
 
 def _extension_in(code: int, data: bytes) -> Any:
@@ -512,22 +540,25 @@ def _extension_in(code: int, data: bytes) -> Any:
 
 
 def no_extension(code: int, data: bytes) -> Any:
-    """For `unpack`: no extension type may stand outside an envelope of lock step."""
+    """Refuse an extension type: they are allowed only inside the envelopes of lock step (hook for
+    `unpack`)."""
     raise _FieldError(f"unknown extension type {code}")
 
 
+# 0x91 to 0x9f is a msgpack fixarray of 1 to 15 elements; the kind follows as a positive fixint.
 def kind_of(head: bytes | bytearray | memoryview) -> int:
-    """Kind of the message whose body begins so (2 bytes needed). Raises ProtocolError if there is
-    no such kind."""
+    """Return the kind of the message whose body begins with these (at least 2) bytes. Raises
+    ProtocolError for an unknown kind."""
     if len(head) < 2 or not 0x91 <= head[0] <= 0x9F or head[1] not in _SPECS:
         raise ProtocolError(
-            "unknown_kind", "a body begins with an array of 1 to 15 fields and a known kind"
+            "unknown_kind",
+            "expected a body that begins with an array of 1 to 15 fields and a known kind",
         )
     return head[1]
 
 
 def decode(body: bytes | memoryview) -> Message:
-    """The message in a frame's body. Raises ProtocolError and nothing else."""
+    """Decode the body of a frame. Raises ProtocolError and nothing else."""
     kind = kind_of(body)
     limit = LIMITS[kind]
     if len(body) > limit:
@@ -538,7 +569,7 @@ def decode(body: bytes | memoryview) -> Message:
 
 
 def decode_kind(body: bytes | memoryview, kind: int) -> Message:
-    """`decode` of a body whose kind and length have been checked."""
+    """Decode a body whose kind and length have been checked."""
     reader = READERS.get(kind)
     size = len(body)
     if reader is not None and size <= UNCOUNTED:
@@ -547,14 +578,14 @@ def decode_kind(body: bytes | memoryview, kind: int) -> Message:
             if message is not None:
                 return message
         except Exception:
-            pass  # whatever it is, the table finds and names it
+            pass  # the table below finds the fault and words it
     return decode_by_table(body, kind, size)
 
 
 def decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
-    """`decode_kind` of a body of `size` bytes that no reader of `frequent.py` takes."""
+    """Decode a body of `size` bytes by the table: any kind, and any fault."""
     spec = _SPECS[kind]
-    index = 2  # the map: all that a reader can find fault with
+    index = 2  # the field to blame if `unpack` itself fails: the map of arguments or values
     try:
         try:
             if size <= UNCOUNTED and kind != _TICK:
@@ -569,18 +600,18 @@ def decode_by_table(body: bytes | memoryview, kind: int, size: int) -> Message:
         for index, check in spec.checks if size <= NAME_LENGTH else spec.long_checks:
             fields[index] = check(fields[index])
     except _FieldError as fault:
-        long = "a name is longer than it may be: " if isinstance(fault, _LongNameError) else ""
+        long = "a name is too long: " if isinstance(fault, _LongNameError) else ""
         raise ProtocolError("malformed", f"kind {kind}: {long}{fault}") from None
     except NotPlainError as fault:
         raise ProtocolError("malformed", f"kind {kind}, {spec.names[index]}: {fault}") from None
     except IndexError:
-        # A check of a trailing field that was left out: all before it have passed.
-        pass
+        pass  # the check of a trailing field that was left out; all fields before it have passed
     return spec.cls(*fields)
 
 
 class _Counter:
-    """Counts arrays and maps, and what they hold, while a large body is read."""
+    """Count arrays and maps, and the values in them, while a large body is decoded (hook for
+    msgpack)."""
 
     def __init__(self, containers: int) -> None:
         self.most = self.left = containers
@@ -616,8 +647,8 @@ def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
             counter.values = ENTRY * len(body)
         return msgpack.unpackb(body, use_list=False, ext_hook=_extension_in, **hooks)
     counter = _Counter(MAX_CONTAINERS)
-    # Arrays within arrays are counted when they end; none of those that have not ended may be
-    # longer than all may be together.
+    # The hooks count an array only when it is complete. Until then msgpack's own limits apply: no
+    # single array may be longer than all arrays together.
     longest = {"max_array_len": MAX_VALUES, "max_map_len": MAX_VALUES // ENTRY}
     return msgpack.unpackb(
         body, ext_hook=no_extension, list_hook=counter, object_hook=counter, **longest
@@ -625,10 +656,10 @@ def _unpack_counted(body: bytes | memoryview, kind: int) -> Any:
 
 
 def _other_types(spec: _Spec, fields: list[Any]) -> None:
-    """Settle fields that differ from the usual types: trailing ones left out, int for float, nil
-    where it may stand."""
+    """Convert fields that differ from the usual types: trailing ones left out, int for float, nil
+    where it is allowed."""
     if not spec.required <= len(fields) <= len(spec.fields):
-        raise _FieldError(f"{len(fields)} fields instead of {len(spec.fields)}")
+        raise _FieldError(f"expected {len(spec.fields)} fields, found {len(fields)}")
     for position, (value, name, field) in enumerate(
         zip(fields, spec.names, spec.fields, strict=False)
     ):
@@ -636,5 +667,5 @@ def _other_types(spec: _Spec, fields: list[Any]) -> None:
             fields[position] = float(value)
         elif type(value) not in field.types:
             raise _FieldError(
-                f"{name} is a {type(value).__name__}, not a {field.types[0].__name__}"
+                f"{name}: expected a {field.types[0].__name__}, found a {type(value).__name__}"
             )

@@ -1,10 +1,11 @@
-"""The messages of the node protocol: what two processes say to each other, as plain typed records.
+"""Messages of the node protocol as plain typed records.
 
-Each class has a `KIND`, its number on the wire; `wire.py` turns messages into bytes and back. Only
-durations cross the wire, never a clock reading. The exchange is described in docs/protocol.md.
+Each class has a `KIND`, its number on the wire. `codec.py` turns messages into bytes and back. Only
+durations are sent, never a clock reading. docs/protocol.md describes the exchange.
 
-Nobody changes a message once it is made. Call and Outcome are not frozen all the same: that would
-make each of them eight times as long to make (0.9 us instead of 0.1), and every call makes four.
+Messages are never changed after they are made. Call and Outcome are still not `frozen`: making a
+frozen dataclass takes eight times as long (0.9 us instead of 0.1), and every call makes four of
+these.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any, ClassVar
 
 
 class Executed(StrEnum):
-    """Whether an action that ended in ERROR touched the world."""
+    """Whether an action that finished with ERROR may have changed the world."""
 
     YES = "yes"
     NO = "no"
@@ -25,7 +26,7 @@ class Executed(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """First message of the side that connects: who it is and what it speaks."""
+    """First message of the connecting side: who it is and which versions it speaks."""
 
     KIND: ClassVar[int] = 1
     oldest_version: int
@@ -34,18 +35,20 @@ class Hello:
     """"coordinator", "node" or "client"."""
     name: str
     boot: str
-    """Drawn anew at each start of the process: another boot never answers for this one."""
+    """Random text of each start of the process, so that a restarted process is never taken for the
+    old one."""
     epoch: int = 0
-    """Raised at each restart of a coordinator; messages of an older epoch are refused."""
+    """Raised at each restart of a coordinator. Messages with an older epoch are refused."""
     directory: str = ""
     """Hash of the sender's services.toml."""
     auth: bytes = b""
-    """The sender's nonce when the link has a key, else empty."""
+    """The wanted server name with a nonce (with a key) or a checksum (without); see
+    docs/protocol.md."""
 
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """Answer to Hello."""
+    """Positive answer to Hello."""
 
     KIND: ClassVar[int] = 2
     version: int
@@ -54,15 +57,16 @@ class Welcome:
     offers: tuple[str, ...] = ()
     """Actions and services that this caller may call."""
     runs: tuple[str, ...] = ()
-    """Ids of calls still going on, or ended and not acknowledged yet, of this caller's name."""
+    """Ids of this caller's calls that are still active, or finished and not acknowledged."""
     directory: str = ""
     auth: bytes = b""
-    """Proof that the server knows the key when the link has one, else empty."""
+    """Proof that the server knows the key; without a key a checksum of the opening."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refuse:
-    """The connection is refused or ended by a fault of the other side; nothing follows it."""
+    """The connection is refused, or ended because the other side broke the protocol. Nothing
+    follows it."""
 
     KIND: ClassVar[int] = 3
     code: str
@@ -71,33 +75,36 @@ class Refuse:
 
 @dataclass(slots=True)
 class Call:
-    """Run an action or ask a service. `id` is unique for ever; a known id is answered from what is
-    known, never run twice."""
+    """Run an action or call a service.
+
+    `id` is unique for ever. A node never runs the same id twice: it answers a known id with what it
+    knows.
+    """
 
     KIND: ClassVar[int] = 4
     id: str
     service: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
     deadline: float | None = None
-    """Seconds that the run may take; enforced by the node."""
+    """Longest duration of the run (s); the node enforces it."""
     epoch: int = 0
     boot: str = ""
-    """Boot that the caller believes to talk to; empty: any. Another boot answers `executed =
+    """Boot of the peer that the caller means; empty: any. Another boot answers `executed =
     unknown`."""
     parent: str = ""
-    """Id of the call on whose behalf this one is made; cancelled with it."""
+    """Id of the call on whose behalf this one is made; it is cancelled together with its parent."""
     seed: int = 0
-    """Seed of the mission run: an action's random draws are keyed by it."""
+    """Seed of the mission run, from which an action derives its random numbers."""
     again: bool = False
-    """It may have been sent before: a node that cannot rule out that it ran and was forgotten does
-    not run it.
+    """The call may have been sent before. A node that may have forgotten its id does not run it.
 
-    Left out on the wire when false."""
+    Left out on the wire when false.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Accept:
-    """The call was taken and its run begins."""
+    """The call was accepted and its run begins."""
 
     KIND: ClassVar[int] = 5
     id: str
@@ -105,7 +112,7 @@ class Accept:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """Progress of a run (fraction 0 to 1), for people."""
+    """Progress of a run (fraction from 0 to 1), for people."""
 
     KIND: ClassVar[int] = 6
     id: str
@@ -115,7 +122,7 @@ class Feedback:
 
 @dataclass(slots=True)
 class Outcome:
-    """RESULT: how the call ended; kept by the node until acknowledged."""
+    """RESULT: the outcome of a call. The node keeps it until it is acknowledged."""
 
     KIND: ClassVar[int] = 7
     id: str
@@ -125,26 +132,29 @@ class Outcome:
     text: str = ""
     executed: Executed = Executed.YES
     seconds: float = 0.0
-    """How long the run took on the node's clock."""
+    """Duration of the run on the node's clock (s)."""
     cpu_seconds: float = 0.0
     deferred: bool = False
-    """The status is provisional: a later verdict may correct it for the estimates. Left out on the
-    wire when false."""
+    """The status is provisional: a later verdict may correct it for the estimates.
+
+    Left out on the wire when false.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class ResultAck:
-    """The caller has the result safe; the node may forget it."""
+    """The caller has stored the result; the node may forget it."""
 
     KIND: ClassVar[int] = 8
     id: str
     more: tuple[str, ...] = ()
-    """Ids of further results acknowledged with it."""
+    """Ids of further results that are acknowledged with it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """Stop a run; it still ends with an Outcome (cause `cancelled` unless it had ended before)."""
+    """Stop a run. It still finishes with an Outcome (cause `cancelled`, unless it finished
+    before)."""
 
     KIND: ClassVar[int] = 9
     id: str
@@ -153,21 +163,21 @@ class Cancel:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of the outside world, of a run that goes on (`run` is its call id), or a changed
+    """An event of the outside world or of an active run (`run` is its call id), or a changed
     variable."""
 
     KIND: ClassVar[int] = 10
     name: str
     source: str
     number: int
-    """Counts up by source from 1; 0 for one that need not be acknowledged (a pulse)."""
+    """Counts up from 1 for each source; 0 for an event that needs no acknowledgement (a pulse)."""
     data: Mapping[str, Any] = field(default_factory=dict)
     run: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class EventAck:
-    """The receiver has the source's events up to this number safe."""
+    """The receiver has stored the source's events up to this number."""
 
     KIND: ClassVar[int] = 11
     source: str
@@ -176,7 +186,7 @@ class EventAck:
 
 @dataclass(frozen=True, slots=True)
 class Subscribe:
-    """Send me the events of these names from now on (replaces an earlier subscription)."""
+    """Send me events of these names from now on; replaces an earlier subscription."""
 
     KIND: ClassVar[int] = 12
     names: tuple[str, ...]
@@ -184,14 +194,14 @@ class Subscribe:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A node-level order that is no action: `hold`, `release`, `stop` (stop routine of all
-    devices), `status`."""
+    """A command to the node itself, not an action: `hold`, `release`, `stop` (stop routine of all
+    devices), `status`, ..."""
 
     KIND: ClassVar[int] = 13
     id: str
     verb: str
     target: str = ""
-    """A device, or empty for all of the node."""
+    """A device; empty for the whole node."""
     data: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -223,8 +233,8 @@ class Pong:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Lock step: all that the sender sends at this tick to the receiver, and its end-of-tick mark
-    in one."""
+    """Lock step: all envelopes that the sender sends to this receiver at this tick. It also marks
+    the end of the tick."""
 
     KIND: ClassVar[int] = 17
     number: int
@@ -233,7 +243,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """The sender leaves in good order."""
+    """The sender closes the connection in an orderly way."""
 
     KIND: ClassVar[int] = 18
     text: str = ""
@@ -241,7 +251,7 @@ class Bye:
 
 @dataclass(frozen=True, slots=True)
 class Challenge:
-    """Answer of a server with a key to Hello: its nonce."""
+    """A server's answer to Hello when it has a key: its nonce."""
 
     KIND: ClassVar[int] = 19
     auth: bytes
@@ -249,7 +259,7 @@ class Challenge:
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """Answer to Challenge: the client knows the key."""
+    """Answer to Challenge: proves that the client knows the key."""
 
     KIND: ClassVar[int] = 20
     auth: bytes
@@ -257,35 +267,35 @@ class Proof:
 
 @dataclass(frozen=True, slots=True)
 class StreamOpen:
-    """First message on a stream's own connection: set points of this stream follow, one each
-    `period` seconds."""
+    """First message on a stream's own connection: one set point follows every `period` seconds."""
 
     KIND: ClassVar[int] = 21
     stream: str
     period: float
     ticket: str = ""
-    """What the receiving node gave out for this stream; a receiver that asks for none ignores
+    """The ticket that the receiving node issued for this stream; a receiver that needs none ignores
     it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SetPoint:
-    """The newest set point of a stream, repeated each period while its sender stands by it."""
+    """The newest set point of a stream, repeated every period as long as the sender wants it
+    followed."""
 
     KIND: ClassVar[int] = 22
     number: int
     """Counts up from 1 with each message of the stream."""
     values: tuple[float, ...]
     held: float = 0.0
-    """Seconds that the sender has stood by these values already: 0 when they are new."""
+    """Age of these values at the sender (s): 0 when they are new."""
     elapsed: float = 0.0
-    """Seconds since the stream was opened, on the sender's clock: tells the receiver what was late
-    on its way."""
+    """Time since the stream was opened, on the sender's clock (s). From it the receiver computes
+    the delay."""
 
 
 @dataclass(frozen=True, slots=True)
 class Withdraw:
-    """The sender stands by its last set point no more."""
+    """The last set point must not be followed any longer."""
 
     KIND: ClassVar[int] = 23
 

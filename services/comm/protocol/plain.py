@@ -1,9 +1,8 @@
-"""Plain data: what may stand in a message's arguments, values and data, checked on its way in and
-on its way out.
+"""Plain data: what may stand in a message's arguments, values and data.
 
 Plain is None, bool, int (64 bits), float, str, bytes, list and dict with str keys, nested at most
 `DEPTH` deep. Arrays of numbers (`ndarray` of uint8 or float64) are plain only inside the envelopes
-of lock step.
+of lock step. Data is checked by the sender (`plain`) and by the receiver (`inspect`).
 """
 
 from __future__ import annotations
@@ -18,24 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 DEPTH = 32
-"""How deep plain data may be nested."""
+"""Deepest nesting of plain data."""
 
 LARGEST = 16 << 20
-"""Bytes of the largest message: nothing in it has more items or characters."""
+"""Size of the largest message (bytes): nothing in it has more items or characters."""
 MAX_CONTAINERS = 20_000
-"""Most arrays and maps in one message: one byte each on the wire, some 70 in memory."""
+"""Most arrays and maps in one message. Each takes one byte on the wire, but about 70 bytes in
+memory."""
 
 SCALARS = frozenset((NoneType, bool, int, float, str, bytes))
 _SIMPLE = SCALARS - {int}
 _INT_MIN, _INT_MAX = -(2**63), 2**64 - 1
 _INT64 = 2**63
 _KEY, _SHORT_INT = 60, 200
-"""Characters of a key, and bits of an integer, that stand in an error's text."""
+"""Characters of a key, and bits of an integer, that an error message shows."""
 _MOST_FOREIGN = 100_000
-"""Items of a mapping that is not a dict: what yields them may never end."""
+"""Most items of a mapping that is not a dict, because its iterator may never end."""
 
-# The base's own method takes the content of a subclass as it is, whatever the subclass has made of
-# `str()` or `__iter__`.
+# Calling the method of the base class copies the real content of a subclass, even if the subclass
+# overrides `__str__` or `__iter__`.
 _BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = (
     (str, str.__str__),
     (bytes, lambda value: b"".join((value,))),
@@ -46,22 +46,22 @@ _BASES: tuple[tuple[type, Callable[[Any], Any]], ...] = (
     (tuple, lambda value: tuple.__getitem__(value, slice(None))),
 )
 _NUMPY_KINDS = "biufUS"
-"""Kinds of numpy scalars that are numbers and texts: a date would become a number."""
+"""Kinds of numpy scalars that are numbers or text. A date would silently become a number."""
 _DTYPES: Mapping[int, np.dtype[Any]] = {1: np.dtype("u1"), 2: np.dtype("<f8")}
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _MAX_DIMENSIONS = 4
 
 
 class NotPlainError(TypeError):
-    """A value that no message can carry; its text says where in the data and what to do."""
+    """A value that no message can carry. The text says where it is in the data and what to do."""
 
 
 def plain(value: Any, where: str = "value") -> Any:
-    """The same data in plain types only: a copy, tuples as lists, numpy scalars as Python numbers.
+    """Return a copy of the data in plain types: tuples become lists, numpy scalars Python numbers.
 
-    Done by the sender, so that a value is refused where it was made and both ends see the same
-    types whether they live in one process or in two. `where` names the data in the error. Raises
-    NotPlainError; whether a whole message of it is small enough is for `codec.encode` to say.
+    The sender calls it, so a bad value is refused where it was made, and the receiver sees the same
+    types whether it lives in this process or in another. `where` names the data in the error.
+    Raises NotPlainError. Whether the whole message is small enough is checked by `codec.encode`.
     """
     left = [MAX_CONTAINERS]
     return (
@@ -72,8 +72,8 @@ def plain(value: Any, where: str = "value") -> Any:
 
 
 def _plain(value: Any, where: str, depth: int, left: list[int]) -> Any:
-    """`left` counts down the containers: of data that holds one of its parts many times over there
-    may be no end."""
+    """Copy one value. `left` counts down the containers: data that contains itself would never
+    end."""
     kind = type(value)
     if kind in _SIMPLE:
         return value
@@ -106,17 +106,17 @@ def _plain_dict(
             raise NotPlainError(f"{where}: the key {_shown(key)} is not a str")
         kind = type(item)
         if kind in _SIMPLE or (kind is int and -_INT64 <= item < _INT64):
-            copy[key] = item  # as below, without naming the place
+            copy[key] = item  # as `_plain`, without building the name of the position
         elif kind is list and depth > 1 and left[0] > 0 and _SIMPLE.issuperset(map(type, item)):
             left[0] -= 1
-            copy[key] = item[:]  # likewise
+            copy[key] = item[:]  # a list of simple values: one copy without a look at each
         else:
             copy[key] = _plain(item, f"{where}.{key[:_KEY]}", depth - 1, left)
     return copy
 
 
 def _shown(key: Any) -> str:
-    """A key for people; what an object makes of itself is not asked for."""
+    """Return a key as text for an error message, without calling an object's own `repr`."""
     short = type(key) in _SIMPLE or (type(key) is int and key.bit_length() <= _SHORT_INT)
     return repr(key)[:_KEY] if short else f"of type {type(key).__name__}"
 
@@ -148,8 +148,10 @@ def _plain_other(value: Any, where: str, depth: int, left: list[int]) -> Any:
 
 
 def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH) -> None:
-    """Refuse decoded data that is not plain or nested too deep. `extra` are further leaf types.
-    Raises NotPlainError."""
+    """Check decoded data: raise NotPlainError if it is not plain or nested too deep.
+
+    `extra` are further leaf types that are allowed.
+    """
     kind = type(value)
     if kind is dict:
         if depth == 0:
@@ -174,15 +176,20 @@ def inspect(value: Any, extra: frozenset[type] = frozenset(), depth: int = DEPTH
 
 
 def pack_array(array: NDArray[Any]) -> bytes:
-    """An array as bytes: dtype code, number of dimensions, u32 lengths, numbers in C order. Raises
-    NotPlainError."""
+    """Encode an array: dtype code, number of dimensions, u32 lengths, then the numbers in C order.
+
+    Raises NotPlainError.
+    """
     code = _code(array)
     return struct.pack(f">BB{array.ndim}I", code, array.ndim, *array.shape) + array.tobytes()
 
 
 def copy_array(array: NDArray[Any]) -> NDArray[Any]:
-    """What `unpack_array` makes of `pack_array`'s bytes, read-only, at the price of one copy.
-    Raises NotPlainError."""
+    """Return what `unpack_array(pack_array(array))` would return, read-only, at the cost of one
+    copy.
+
+    Raises NotPlainError.
+    """
     _code(array)
     copy: NDArray[Any] = np.frombuffer(array.tobytes(), array.dtype).reshape(array.shape)
     return copy
@@ -199,7 +206,8 @@ def _code(array: NDArray[Any]) -> int:
 
 
 def unpack_array(data: bytes) -> NDArray[Any]:
-    """Inverse of `pack_array`, read-only. Raises NotPlainError on anything but a whole array."""
+    """Decode the bytes of `pack_array`; the result is read-only. Raises NotPlainError on anything
+    else."""
     if (
         len(data) < 2
         or data[0] not in _DTYPES

@@ -1,12 +1,11 @@
-"""Proof of a shared key and the seal of each frame: HMAC-SHA256 (RFC 2104, FIPS 180-4) from the
-standard library.
+"""Proof of a shared key, and the seal (MAC) of each frame: HMAC-SHA256 (RFC 2104, FIPS 180-4).
 
-Both ends draw a nonce; the transcript is all bytes of HELLO and CHALLENGE, the name of the wanted
-server among them. The client proves the key over the transcript, the server over transcript and
-WELCOME, and each direction gets a sealing key of its own, so neither a recorded nor a mirrored
-frame is ever accepted, and neither the version range nor the wanted name can be changed on the way.
-The key itself never crosses the wire. Without a key each frame carries a CRC-32 in the seal's
-place: it finds accidents, not attacks.
+Each end draws a nonce. The transcript is all bytes of HELLO and CHALLENGE, which include the name
+of the wanted server. The client proves the key over the transcript, the server over transcript and
+WELCOME, and each direction gets a sealing key of its own. So a recorded or mirrored frame is never
+accepted, and neither the version range nor the wanted name can be changed on the way. The key
+itself is never sent. Without a key each frame carries a CRC-32 in place of the seal: it finds
+accidents, not attacks.
 """
 
 from __future__ import annotations
@@ -26,23 +25,22 @@ from petrobot.services.host.whole_file import write_whole
 NONCE_BYTES = 32
 PROOF_BYTES = 32
 SEAL_BYTES = 16
-"""HMAC-SHA256 cut to its first 128 bits."""
+"""HMAC-SHA256 truncated to its first 128 bits (RFC 2104, section 5)."""
 KEY_BYTES = 32
 LARGEST_SECRET = 1 << 16
-"""Bytes of a key file that are read at most."""
+"""Most bytes that are read of a key file."""
 CHECK_BYTES = 4
-"""CRC-32 (IEEE 802.3, as zlib's), big endian: in the place of proof and seal where there is no
-key."""
+"""Size of the CRC-32 (IEEE 802.3, the same as zlib's; big endian), which stands in place of proof
+and seal when there is no key."""
 
 UNPROVEN = "unauthenticated refusal"
-"""A refusal that does not prove the key: a man in the middle can say it, too, so it counts as a
-broken link, no more."""
+"""Prefix for a refusal that does not prove the key. Anybody on the network could have sent it, so
+it only counts as a broken link."""
 
 Keys = bytes | tuple[bytes, ...]
-"""The shared key, or all keys that are accepted while the key is being replaced, the newest
-first."""
+"""The shared key; or, while the key is being replaced, all accepted keys, the newest first."""
 
-_BLOCK = 64
+_BLOCK = 64  # block size of SHA-256 (bytes)
 
 
 class _Hash(Protocol):
@@ -54,11 +52,11 @@ class _Hash(Protocol):
 
 
 class KeyNeededError(Exception):
-    """A socket that other hosts can reach was to be opened without a key."""
+    """A socket that other hosts can reach must not be opened without a key."""
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only processes of this host can reach a socket bound to `host`."""
+    """Return whether only processes of this host can reach a socket bound to `host`."""
     if host == "localhost":
         return True
     try:
@@ -68,8 +66,8 @@ def is_loopback(host: str) -> bool:
 
 
 def require_key(name: str, host: str, key: Keys | bool | None) -> None:
-    """Refuse to listen where other hosts can connect unless there is a key, or certificates. Raises
-    KeyNeededError."""
+    """Raise KeyNeededError if other hosts can connect to `host` and there is neither key nor
+    certificate."""
     if not key and not is_loopback(host):
         raise KeyNeededError(
             f"{name}: refuses to listen on {host}, which other hosts can reach, without a "
@@ -85,35 +83,36 @@ class KeyFileError(Exception):
 
 
 def proof(key: bytes, label: str, transcript: bytes) -> bytes:
-    """Proof of the key for one side of one connection (32 bytes)."""
+    """Return the proof of the key for one side of one connection (32 bytes)."""
     return hmac.digest(key, label.encode() + b"\0" + transcript, "sha256")
 
 
 def same(a: bytes, b: bytes) -> bool:
-    """Compare in a time that does not depend on where they differ."""
+    """Compare two secrets in constant time, so that the duration does not tell where they
+    differ."""
     return hmac.compare_digest(a, b)
 
 
 class Seal:
-    """MAC of one direction of one connection: each frame's number and body under a key of this
-    connection alone.
+    """MAC of one direction of one connection, over each frame's number and body.
 
-    The number is counted by both ends and not sent, so a frame lost, repeated or moved breaks the
-    seal.
+    The key is derived for this connection and direction alone. Both ends count the frames; the
+    number is not sent. So a lost, repeated or moved frame breaks the seal.
     """
 
     __slots__ = ("_inner", "_number", "_outer")
 
     def __init__(self, key: bytes, direction: str, transcript: bytes) -> None:
         own = proof(key, direction, transcript).ljust(_BLOCK, b"\0")
-        # The two half-way states of HMAC are kept: a third of the time of hmac.digest on a short
-        # frame.
+        # HMAC is H(key ^ opad | H(key ^ ipad | message)), with ipad 0x36 and opad 0x5c repeated (RFC
+        # 2104). The two hashes that have already consumed the padded key are kept and copied for
+        # each frame. On a short frame this takes a third of the time of hmac.digest.
         self._inner: _Hash = hashlib.sha256(bytes(byte ^ 0x36 for byte in own))
         self._outer: _Hash = hashlib.sha256(bytes(byte ^ 0x5C for byte in own))
         self._number = 0
 
     def next(self, body: bytes | memoryview) -> bytes:
-        """Seal of the next frame (16 bytes)."""
+        """Return the seal of the next frame (16 bytes)."""
         inner = self._inner.copy()
         inner.update(self._number.to_bytes(8, "big"))
         inner.update(body)
@@ -124,37 +123,39 @@ class Seal:
 
 
 class Check:
-    """What stands in the place of a seal on a connection without a key: CRC-32 of the body alone.
+    """Checksum in place of a seal on a connection without a key: CRC-32 of the body.
 
-    TCP keeps the order and the number of frames, but its own sum has 16 bits and misses some of the
-    changed ones (Stone and Partridge, "When the CRC and TCP checksum disagree", SIGCOMM 2000).
+    TCP keeps order and number of frames, but its own checksum has only 16 bits and misses some
+    changes (Stone and Partridge, "When the CRC and TCP checksum disagree", SIGCOMM 2000).
     """
 
     __slots__ = ()
 
     def next(self, body: bytes | memoryview) -> bytes:
-        """Check of a frame (4 bytes)."""
+        """Return the checksum of a frame (4 bytes)."""
         return check(body)
 
 
 def check(body: bytes | memoryview, before: bytes = b"") -> bytes:
-    """CRC-32 of `before` and `body` together (4 bytes)."""
+    """Return the CRC-32 of `before` and `body` together (4 bytes)."""
     return crc32(body, crc32(before)).to_bytes(CHECK_BYTES, "big")
 
 
 def all_keys(keys: Keys | None) -> tuple[bytes, ...]:
-    """The accepted keys, the newest first; none without a key."""
+    """Return the accepted keys, the newest first; empty if there is no key."""
     return () if keys is None else (keys,) if isinstance(keys, bytes) else keys
 
 
 def new_key() -> bytes:
-    """A fresh shared key."""
+    """Draw a new shared key."""
     return secrets.token_bytes(KEY_BYTES)
 
 
 def write_key(path: Path, key: bytes) -> None:
-    """Write a key file, one line of hexadecimal digits that its owner alone may read. Raises
-    KeyFileError if it exists."""
+    """Write a key file: one line of hexadecimal digits, readable by its owner only.
+
+    Raises KeyFileError if the file exists or cannot be written.
+    """
     try:
         write_whole(path, key.hex() + "\n", mode=0o600, fresh=True)
     except FileExistsError:
@@ -168,16 +169,15 @@ def write_key(path: Path, key: bytes) -> None:
 
 
 def read_secret(path: Path) -> bytes:
-    """What is in a file that its owner alone may read. Raises KeyFileError if others may, OSError
-    if it cannot be read.
+    """Read a file that only its owner may read. Raises KeyFileError if others may, OSError if it
+    cannot be read.
 
-    The file is opened once, and what is looked at is what was opened: a name could lead to another
-    file a moment later. A link to it is followed, as whoever may write services.toml could name any
-    file; whose file it is in the end decides.
+    The file is opened once, and the opened file is checked, not its name: a name could lead to
+    another file a moment later. A symbolic link is followed, because a user who can write
+    services.toml could name any file anyway; the owner of the final file decides.
     """
-    handle = os.open(
-        path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
-    )  # a pipe of that name must not hold us up
+    # O_NONBLOCK: opening a named pipe must not block.
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     with os.fdopen(handle, "rb") as file:
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):
@@ -195,8 +195,11 @@ def read_secret(path: Path) -> bytes:
 
 
 def read_key(path: Path) -> bytes:
-    """The shared key in a key file. Raises KeyFileError if it is missing, of another user, readable
-    by others, or no key."""
+    """Read the shared key from a key file.
+
+    Raises KeyFileError if the file is missing, belongs to another user, is readable by others, or
+    is not a key.
+    """
     try:
         key = bytes.fromhex(read_secret(path).decode("ascii").strip())
     except OSError as fault:

@@ -1,15 +1,16 @@
-"""One connection of the node protocol as a machine: bytes in, messages out, and the other way
-round.
+"""One connection of the node protocol as a sans-I/O state machine: bytes in, messages out, and the
+reverse.
 
 A frame is a u32 length (big endian), a body (`codec.py`) and, on an open connection, a seal of 16
-bytes (with a key) or a check of 4 bytes (without), which the length counts. No socket, clock or
-randomness of its own: the shell passes bytes and the nonce. Nothing but ProtocolError leaves it.
+bytes (with a key) or a checksum of 4 bytes (without). The length counts body and seal. The machine
+has no socket, clock or random numbers of its own: the caller passes bytes and the nonce. It raises
+only ProtocolError.
 
     opening  client: HELLO ->                       server: <- WELCOME or REFUSE
     with a key:      HELLO ->  <- CHALLENGE  PROOF ->        <- WELCOME or REFUSE
-    open     everything else, sealed or checked
-    closing  BYE or REFUSE was sent: nothing more goes out, what comes in is dropped
-    closed   BYE or REFUSE came, or the other side broke the protocol
+    open     all other messages, sealed or with a checksum
+    closing  BYE or REFUSE was sent: nothing more is sent, what arrives is dropped
+    closed   BYE or REFUSE arrived, or the other side broke the protocol
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from enum import Enum
 from typing import Final
 
 from petrobot.services.comm.protocol.codec import (
@@ -34,12 +36,30 @@ from petrobot.services.comm.protocol.codec import (
     unpack,
 )
 from petrobot.services.comm.protocol.messages import (
+    Accept,
+    Answer,
+    Bye,
+    Call,
+    Cancel,
     Challenge,
+    Command,
+    Event,
+    EventAck,
+    Feedback,
     Hello,
     Message,
+    Outcome,
+    Ping,
+    Pong,
     Proof,
     Refuse,
+    ResultAck,
+    SetPoint,
+    StreamOpen,
+    Subscribe,
+    Tick,
     Welcome,
+    Withdraw,
 )
 from petrobot.services.comm.protocol.security import (
     CHECK_BYTES,
@@ -54,43 +74,119 @@ from petrobot.services.comm.protocol.security import (
     proof,
     same,
 )
-from petrobot.services.comm.protocol.states import (
-    LAST,
-    MAY_COME,
-    MAY_GO,
-    NOTHING,
-    OVER,
-    STATES,
-    Phase,
-    Side,
-    State,
-)
+
+# States of a connection, and the tables of who may send what in which state.
+
+
+class Side(Enum):
+    """Which end of the connection this is."""
+
+    CLIENT = "client"
+    SERVER = "server"
+
+
+class ConnectionState(Enum):
+    """State of a connection as its owner sees it."""
+
+    OPENING = "opening"
+    OPEN = "open"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+class ConnectionPhase(Enum):
+    """State of a connection in full: it determines which message may come next."""
+
+    HELLO = "hello"
+    """Nothing was sent yet."""
+    HELLO_SENT = "hello sent"
+    CHALLENGED = "challenged"
+    """Server: waits for PROOF."""
+    PROVED = "proved"
+    """Client: PROOF was sent."""
+    DECIDING = "deciding"
+    """Server: its owner must answer WELCOME or REFUSE."""
+    OPEN = "open"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+STATES: Mapping[ConnectionPhase, ConnectionState] = {
+    ConnectionPhase.OPEN: ConnectionState.OPEN,
+    ConnectionPhase.CLOSING: ConnectionState.CLOSING,
+    ConnectionPhase.CLOSED: ConnectionState.CLOSED,
+}
+
+_BOTH = frozenset(cls.KIND for cls in (Ping, Pong, Tick, Bye, Refuse))
+_FROM_CLIENT = _BOTH | {
+    cls.KIND
+    for cls in (
+        Call,
+        ResultAck,
+        Cancel,
+        EventAck,
+        Subscribe,
+        Command,
+        StreamOpen,
+        SetPoint,
+        Withdraw,
+    )
+}
+_FROM_SERVER = _BOTH | {cls.KIND for cls in (Accept, Feedback, Outcome, Event, Answer)}
+NOTHING: frozenset[int] = frozenset()
+_REFUSE = frozenset((Refuse.KIND,))
+
+MAY_COME: Mapping[tuple[Side, ConnectionPhase], frozenset[int]] = {
+    (Side.SERVER, ConnectionPhase.HELLO): frozenset((Hello.KIND,)),
+    (Side.SERVER, ConnectionPhase.CHALLENGED): _REFUSE | {Proof.KIND},
+    (Side.SERVER, ConnectionPhase.OPEN): _FROM_CLIENT,
+    (Side.CLIENT, ConnectionPhase.HELLO_SENT): _REFUSE | {Challenge.KIND, Welcome.KIND},
+    (Side.CLIENT, ConnectionPhase.PROVED): _REFUSE | {Welcome.KIND},
+    (Side.CLIENT, ConnectionPhase.OPEN): _FROM_SERVER,
+}
+"""Kinds that may arrive, by side and phase."""
+MAY_GO: Mapping[tuple[Side, ConnectionPhase], frozenset[int]] = {
+    (Side.CLIENT, ConnectionPhase.HELLO): frozenset((Hello.KIND,)),
+    (Side.CLIENT, ConnectionPhase.HELLO_SENT): _REFUSE,
+    (Side.CLIENT, ConnectionPhase.PROVED): _REFUSE,
+    (Side.CLIENT, ConnectionPhase.OPEN): _FROM_CLIENT,
+    (Side.SERVER, ConnectionPhase.HELLO): _REFUSE,
+    (Side.SERVER, ConnectionPhase.CHALLENGED): _REFUSE,
+    (Side.SERVER, ConnectionPhase.DECIDING): _REFUSE | {Welcome.KIND},
+    (Side.SERVER, ConnectionPhase.OPEN): _FROM_SERVER,
+}
+"""Kinds that may be sent, by side and phase."""
+LAST = frozenset((Bye.KIND, Refuse.KIND))
+"""Kinds that end the connection."""
+OVER = (ConnectionPhase.CLOSING, ConnectionPhase.CLOSED)
+
 
 __all__ = [
     "NEWEST_VERSION",
     "OLDEST_VERSION",
     "Connection",
+    "ConnectionState",
     "ProtocolError",
     "Side",
-    "State",
     "negotiate",
 ]
 
 OLDEST_VERSION: Final = 2
 NEWEST_VERSION: Final = 2
-"""Versions of the protocol that this code speaks."""
+"""Versions of the protocol that this code speaks: OLDEST_VERSION to NEWEST_VERSION."""
 
 _HEADER: Final = 4
 _HEAD: Final = struct.Struct(">IBB")
-"""Length, then the first two bytes of the body: its array and the kind."""
+"""Length, and the first two bytes of the body: array marker and kind."""
 _head_at: Final = _HEAD.unpack_from
 _LARGE: Final = 4096
+"""From this size on (bytes) a body is passed on as a memoryview instead of a copy."""
 _NO_QUICK: Mapping[int, int] = {}
 
 
 def negotiate(oldest: int, newest: int) -> int | None:
-    """The newest version that this code and a peer with the range [oldest, newest] both speak; None
-    if there is none."""
+    """Return the newest version that this code and a peer with the range [oldest, newest] both
+    speak; None if there is none."""
     version = min(newest, NEWEST_VERSION)
     return version if version >= max(oldest, OLDEST_VERSION) and oldest <= newest else None
 
@@ -98,10 +194,10 @@ def negotiate(oldest: int, newest: int) -> int | None:
 class Connection:
     """One end of a connection. `nonce` (32 fresh random bytes) is needed with a `key`.
 
-    `server` is the name of the server: on its own side its name, on the client's the name that the
-    client asks for. HELLO carries it and WELCOME confirms it, both under the proof of the key; a
-    server of another name refuses, and is refused. A server sees HELLO only after its sender has
-    proved the key, and then sends WELCOME or REFUSE.
+    `server` is the name of the server: its own name on the server's side, the wanted name on the
+    client's side. HELLO carries it and WELCOME confirms it, both covered by the proof of the key;
+    each side refuses another name. With a key, a server sees HELLO only after the sender has proved
+    the key; it then answers WELCOME or REFUSE.
     """
 
     def __init__(
@@ -111,14 +207,14 @@ class Connection:
             raise ValueError(f"a connection with a key needs a nonce of {NONCE_BYTES} bytes")
         self.side = side
         self.version = 0
-        """Version agreed on; 0 before WELCOME."""
+        """Agreed version; 0 before WELCOME."""
         self.proven = True
-        """Whether a REFUSE that came is known to be the server's: with a key only if it was
+        """Whether a received REFUSE is known to be from the server: with a key, only if it was
         sealed."""
         self._server = server
         self._keys = all_keys(key)
         self._nonce = nonce
-        self._phase = Phase.HELLO
+        self._phase = ConnectionPhase.HELLO
         self._parts: list[bytes] = []
         self._have = 0
         self._need = 0
@@ -131,21 +227,21 @@ class Connection:
         self._may_come = MAY_COME.get((side, self._phase), NOTHING)
         self._may_go = MAY_GO.get((side, self._phase), NOTHING)
         self._quick_in: Mapping[int, int] = _NO_QUICK
-        """While the connection is open: the kinds that may come and end nothing, with the longest
-        frame of each (bytes),"""
+        """Open connection only: kinds that may arrive on the fast path, with the longest frame of
+        each (bytes). BYE and REFUSE are not among them, because they change the state."""
         self._quick_out = NOTHING
-        """and those that may go so."""
+        """Open connection only: kinds that may be sent on the fast path."""
 
     @property
-    def state(self) -> State:
-        """opening, open, closing or closed."""
-        return STATES.get(self._phase, State.OPENING)
+    def state(self) -> ConnectionState:
+        """Return the state: opening, open, closing or closed."""
+        return STATES.get(self._phase, ConnectionState.OPENING)
 
-    def _enter(self, phase: Phase) -> None:
+    def _enter(self, phase: ConnectionPhase) -> None:
         self._phase = phase
         self._may_come = MAY_COME.get((self.side, phase), NOTHING)
         self._may_go = MAY_GO.get((self.side, phase), NOTHING)
-        if phase is Phase.OPEN:
+        if phase is ConnectionPhase.OPEN:
             self._quick_in = {
                 kind: LIMITS[kind] + self._seal_bytes for kind in self._may_come - LAST
             }
@@ -154,21 +250,26 @@ class Connection:
             self._quick_in, self._quick_out = _NO_QUICK, NOTHING
 
     def data_to_send(self) -> bytes:
-        """Bytes that the handshake itself has to send; ask after each `receive_data`."""
+        """Return bytes that the handshake itself must send. Call it after each `receive_data`."""
         data = bytes(self._out)
         self._out.clear()
         return data
 
     def send(self, message: Message) -> bytes:
-        """Bytes of a message. Raises ProtocolError if it is too large or may not be sent now; then
-        nothing has changed."""
+        """Return the bytes of a message.
+
+        Raises ProtocolError if the message is too large or not allowed now; the state is then
+        unchanged.
+        """
         if message.KIND not in self._quick_out:
             return self._send_unusual(message)
         return self._frame(encode(message))
 
     def send_all(self, messages: Sequence[Message]) -> bytes:
-        """Bytes of messages that may all go and end nothing. Raises as `send`; then nothing has
-        changed."""
+        """Return the bytes of several messages that are allowed now and do not end the connection.
+
+        Raises as `send`; the state is then unchanged.
+        """
         if not self._quick_out.issuperset([message.KIND for message in messages]):
             raise ProtocolError("out_of_turn", "these messages have to be sent one by one")
         assert self._seal_out is not None
@@ -183,15 +284,15 @@ class Connection:
             raise ProtocolError(
                 "out_of_turn", f"{type(message).__name__} cannot be sent while {self._phase.value}"
             )
-        if self._phase is not Phase.OPEN:
+        if self._phase is not ConnectionPhase.OPEN:
             return self._send_opening(message)
         last_word = self._frame(encode(message))
-        self._enter(Phase.CLOSING)
+        self._enter(ConnectionPhase.CLOSING)
         return last_word
 
     def refusal(self, refuse: Refuse) -> bytes:
-        """Bytes of the last word to a side that has broken the protocol, sealed as soon as both are
-        known to share a key."""
+        """Return the bytes of a REFUSE to a side that broke the protocol, sealed if both are known
+        to share a key."""
         body = encode(refuse)
         return self._frame(body) if self.version else self._opening_refusal(body)
 
@@ -201,40 +302,43 @@ class Connection:
         return length.to_bytes(_HEADER, "big") + body + self._seal_out.next(body)
 
     def _opening_refusal(self, body: bytes) -> bytes:
-        # Proven by the seal that the first frame of the open connection would have had; nothing
-        # follows it.
+        # Once the key is proved, the refusal carries the seal that the first frame of the open
+        # connection would have had. Nothing follows it, so no frame number is used twice.
         return _opening_frame(body if self._seal_out is None else body + self._seal_out.next(body))
 
     def _send_opening(self, message: Message) -> bytes:
         if isinstance(message, Hello):
             self._transcript = self._hello_body(message)
-            self._enter(Phase.HELLO_SENT)
+            self._enter(ConnectionPhase.HELLO_SENT)
             return _opening_frame(self._transcript)
         if isinstance(message, Welcome):
             data = _opening_frame(self._welcome_body(message))
             self._open(message.version)
             return data
         data = self._opening_refusal(encode(message))
-        self._enter(Phase.CLOSING)
+        self._enter(ConnectionPhase.CLOSING)
         return data
 
     def _hello_body(self, hello: Hello) -> bytes:
-        """HELLO whose `auth` is: bytes of the check (u8), the server that is asked for, the check,
-        which is the nonce, or without a key the CRC-32 of all before it."""
+        """Return the body of HELLO with `auth`: size of the last part (u8), wanted server, last
+        part.
+
+        The last part is the nonce; without a key it is the CRC-32 of all bytes before it.
+        """
         end = self._nonce if self._keys else bytes(CHECK_BYTES)
         body = encode(replace(hello, auth=bytes((len(end),)) + self._server.encode() + end))
         return body if self._keys else _checked(body)
 
     def _welcome_body(self, welcome: Welcome) -> bytes:
-        # `auth` is the last field, so everything but its last bytes is covered without encoding
-        # twice on the other side.
+        # `auth` is the last field of WELCOME, so the proof can cover all bytes before it, and the
+        # other side need not encode the message again to check it.
         if not self._keys:
             return _checked(encode(replace(welcome, auth=bytes(CHECK_BYTES))), self._transcript)
         body = encode(replace(welcome, auth=bytes(PROOF_BYTES)))[:-PROOF_BYTES]
         return body + proof(self._keys[0], "server", self._transcript + body)
 
     def _share(self, key: bytes) -> None:
-        """Both sides are known to have this key: all that follows is sealed by it."""
+        """Seal all that follows with this key, which both sides are known to have."""
         self._keys = (key,)
         labels = ("client to server", "server to client")
         mine, theirs = labels if self.side is Side.CLIENT else labels[::-1]
@@ -246,13 +350,13 @@ class Connection:
         self._seal_bytes = SEAL_BYTES if self._keys else CHECK_BYTES
         if not self._keys:
             self._seal_out = self._seal_in = Check()
-        self._enter(Phase.OPEN)
+        self._enter(ConnectionPhase.OPEN)
 
     def receive_data(self, data: bytes) -> list[Message]:
-        """Messages completed by these bytes, in order.
+        """Return the messages completed by these bytes, in order.
 
-        Raises ProtocolError when the other side broke the protocol: the connection is closed then,
-        and what came well before the fault is in the error's `before`.
+        Raises ProtocolError if the other side broke the protocol. The connection is then closed,
+        and the error's `before` holds the messages that arrived complete before the fault.
         """
         if self._parts:
             self._parts.append(data)
@@ -269,13 +373,13 @@ class Connection:
             if start < len(data):
                 self._frames(data, start, messages)
         except ProtocolError as fault:
-            self._enter(Phase.CLOSED)
+            self._enter(ConnectionPhase.CLOSED)
             raise ProtocolError(fault.code, fault.text, messages) from None
         return messages
 
     def _quick_frames(self, data: bytes, messages: list[Message]) -> int:
-        """Take whole frames of an open connection for as long as nothing is unusual about them;
-        says how far it came."""
+        """Fast path: take whole, ordinary frames of an open connection from `data`. Return the end
+        of the last one."""
         size, start, longest, seal_bytes = len(data), 0, self._quick_in.get, self._seal_bytes
         last, least = size - _HEAD.size, seal_bytes + 2
         while start < last:
@@ -287,22 +391,22 @@ class Connection:
             part = self._unsealed(data, body, end)
             message = None
             if kind in READERS and length <= UNCOUNTED:
-                # As `decode_kind`, which would be one more call for each of a hundred thousand
-                # frames a second.
+                # The same as `decode_kind`, written out here: at a hundred thousand frames a second
+                # one more function call per frame can be measured.
                 try:
                     message = READERS[kind](
                         unpack(part, ext_hook=no_extension), length <= NAME_LENGTH
                     )
                 except Exception:
-                    message = None  # whatever it is, the table finds and names it
+                    message = None  # the table finds the fault and words it
             messages.append(message or decode_by_table(part, kind, len(part)))
             start = end
         return start
 
     def _frames(self, data: bytes, start: int, messages: list[Message]) -> None:
-        """Take whole frames, whatever they are; what is left waits for more, in parts, so that
-        nothing is moved twice."""
-        while self.state is not State.CLOSED and (end := self._frame_end(data, start)):
+        """Take whole frames of any kind. An incomplete rest is kept as a list of parts, so that no
+        byte is copied twice."""
+        while self.state is not ConnectionState.CLOSED and (end := self._frame_end(data, start)):
             message = self._take(data, start + _HEADER, end)
             start = end
             if message is not None:
@@ -312,11 +416,10 @@ class Connection:
             self._have = len(data) - start
 
     def _unsealed(self, data: bytes, start: int, end: int) -> bytes | memoryview:
-        """The body of a frame of an open connection, which lies with its seal or check at `start`
-        to `end`."""
+        """Check the seal of a frame that lies, without its length, at `start` to `end`. Return its
+        body."""
         assert self._seal_in is not None
         middle = end - self._seal_bytes
-        # A large body is not copied again to be taken apart.
         body = memoryview(data)[start:middle] if end - start > _LARGE else data[start:middle]
         if not same(data[middle:end], self._seal_in.next(body)):
             if self._keys:
@@ -329,8 +432,10 @@ class Connection:
         return body
 
     def _frame_end(self, data: bytes, start: int) -> int:
-        """Where the frame that begins at `start` ends; 0 if it is not all there. Refuses a bad one
-        as early as it can."""
+        """Return where the frame that begins at `start` ends; 0 if it is incomplete.
+
+        A bad frame is refused as early as possible, from its first six bytes.
+        """
         body = start + _HEADER
         self._need = _HEADER + 2
         if len(data) < body:
@@ -338,14 +443,16 @@ class Connection:
         length = int.from_bytes(data[start:body], "big")
         sealed = self._seal_bytes
         if length < 2 + sealed:
-            raise ProtocolError("malformed", f"a frame of {length} bytes")
+            raise ProtocolError("malformed", f"a frame of {length} bytes is too short")
         if len(data) < body + 2:
             return 0
         kind = kind_of(data[body : body + 2])
         if kind not in self._may_come:
-            raise ProtocolError("out_of_turn", f"kind {kind} cannot come while {self._phase.value}")
-        # A refusal of the opening may have a seal as well.
-        longest = LIMITS[kind] + (SEAL_BYTES if self._phase is Phase.PROVED else sealed)
+            raise ProtocolError(
+                "out_of_turn", f"kind {kind} is not allowed while {self._phase.value}"
+            )
+        # A REFUSE in answer to PROOF may carry a seal.
+        longest = LIMITS[kind] + (SEAL_BYTES if self._phase is ConnectionPhase.PROVED else sealed)
         if length > longest:
             raise ProtocolError(
                 "too_large", f"kind {kind}: {length} bytes are above the limit of {LIMITS[kind]}"
@@ -354,15 +461,15 @@ class Connection:
         return body + length if len(data) >= body + length else 0
 
     def _take(self, data: bytes, start: int, end: int) -> Message | None:
-        if self._phase is not Phase.OPEN:
+        if self._phase is not ConnectionPhase.OPEN:
             return self._take_opening(data[start:end])
         message = decode(self._unsealed(data, start, end))
         if message.KIND in LAST:
-            self._enter(Phase.CLOSED)
+            self._enter(ConnectionPhase.CLOSED)
         return message
 
     def _take_opening(self, body: bytes) -> Message | None:
-        if self._phase is Phase.PROVED and kind_of(body) == Refuse.KIND:
+        if self._phase is ConnectionPhase.PROVED and kind_of(body) == Refuse.KIND:
             body = self._refusal_body(body)
         message = decode(body)
         if isinstance(message, Hello):
@@ -375,12 +482,12 @@ class Connection:
         if isinstance(message, Welcome):
             self._take_welcome(message, body)
             return message
-        self.proven = not self._keys or (self.proven and self._phase is Phase.PROVED)
-        self._enter(Phase.CLOSED)
+        self.proven = not self._keys or (self.proven and self._phase is ConnectionPhase.PROVED)
+        self._enter(ConnectionPhase.CLOSED)
         return message
 
     def _refusal_body(self, body: bytes) -> bytes:
-        """The body of a refusal in answer to our proof, which is proven if the server has sealed
+        """Return the body of a REFUSE in answer to our PROOF; it is proven if the server has sealed
         it."""
         for key in self._keys:
             seal = Seal(key, "server to client", self._transcript)
@@ -395,7 +502,7 @@ class Connection:
             asked = f"{hello.oldest_version} to {hello.newest_version}"
             raise ProtocolError(
                 "version",
-                f"versions {asked} are asked for, {spoken} are spoken here: update the older side",
+                f"expected a version from {spoken}, got {asked}: update the older side",
             )
         self._transcript = body
         wanted, keyed = _wanted(hello, body)
@@ -403,20 +510,20 @@ class Connection:
             if keyed:
                 raise ProtocolError(
                     "no_key_here",
-                    "this side has no key: give it the same key file, or take yours away",
+                    "this side has no key: give it the same key file, or remove yours",
                 )
-            self._enter(Phase.DECIDING)
+            self._enter(ConnectionPhase.DECIDING)
             self._refuse_another(wanted)
             return hello
         if not keyed:
             raise ProtocolError(
-                "key_needed", "this side asks for a key: give the other side the same key file"
+                "key_needed", "this side requires a key: give the other side the same key file"
             )
         self._hello = hello
         challenge = encode(Challenge(self._nonce))
         self._transcript += challenge
         self._out += _opening_frame(challenge)
-        self._enter(Phase.CHALLENGED)
+        self._enter(ConnectionPhase.CHALLENGED)
         return None
 
     def _refuse_another(self, wanted: str) -> None:
@@ -426,14 +533,16 @@ class Connection:
     def _take_challenge(self, challenge: Challenge, body: bytes) -> None:
         if not self._keys:
             raise ProtocolError(
-                "key_needed", "the server asks for a key: give this side the same key file"
+                "key_needed", "the server requires a key: give this side the same key file"
             )
         if len(challenge.auth) != NONCE_BYTES:
-            raise ProtocolError("malformed", f"a nonce of {len(challenge.auth)} bytes")
+            raise ProtocolError(
+                "malformed", f"expected a nonce of {NONCE_BYTES} bytes, got {len(challenge.auth)}"
+            )
         self._transcript += body
         proofs = b"".join([proof(key, "client", self._transcript) for key in self._keys])
         self._out += _opening_frame(encode(Proof(proofs)))
-        self._enter(Phase.PROVED)
+        self._enter(ConnectionPhase.PROVED)
 
     def _take_proof(self, given: Proof) -> Hello | None:
         auth = given.auth
@@ -447,14 +556,14 @@ class Connection:
                 "wrong_key", "the client's key is not this side's key: use the same key file"
             )
         self._share(key)
-        self._enter(Phase.DECIDING)
+        self._enter(ConnectionPhase.DECIDING)
         assert self._hello is not None
         self._refuse_another(_wanted(self._hello, b"")[0])
         return self._hello
 
     def _take_welcome(self, welcome: Welcome, body: bytes) -> None:
         if self._keys:
-            if self._phase is not Phase.PROVED:
+            if self._phase is not ConnectionPhase.PROVED:
                 raise ProtocolError(
                     "no_key_there", "the server did not ask for the key: give it the same key file"
                 )
@@ -479,18 +588,20 @@ class Connection:
 
 
 def _opening_frame(body: bytes) -> bytes:
-    """As in every version of the protocol, so that an older side understands why it is refused."""
+    """Return a frame of the opening: no seal, as in every version, so that an older side can read
+    why it is refused."""
     return len(body).to_bytes(_HEADER, "big") + body
 
 
 def _checked(body: bytes, before: bytes = b"") -> bytes:
-    """A body that ends with room for its check, with the check."""
+    """Replace the last bytes of a body by the checksum of all before them."""
     body = body[:-CHECK_BYTES]
     return body + check(body, before)
 
 
 def _wanted(hello: Hello, body: bytes) -> tuple[str, bool]:
-    """The server that a HELLO asks for, and whether its sender has a key. Raises ProtocolError."""
+    """Return the server that a HELLO asks for, and whether its sender has a key. Raises
+    ProtocolError."""
     auth = hello.auth
     size = auth[0] if auth else 0
     if size not in (CHECK_BYTES, NONCE_BYTES) or len(auth) < 1 + size:
@@ -508,5 +619,5 @@ def _wanted(hello: Hello, body: bytes) -> tuple[str, bool]:
 def _wrong_node(here: str, wanted: str) -> ProtocolError:
     remedy = f"check host and port of {wanted} in services.toml"
     return ProtocolError(
-        "wrong_node", f"this is {here}, {wanted or 'nobody'} was asked for: {remedy}"
+        "wrong_node", f"this is {here}, but the client asked for {wanted or 'no name'}: {remedy}"
     )

@@ -1,1 +1,1 @@
-"""Streams from node to node: set points and images."""
+"""Streams between processes: set points and images."""

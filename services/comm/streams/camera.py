@@ -1,10 +1,9 @@
-"""Image sources behind one interface, and the images' wire format over TCP (cv2 devices and files:
-`capture.py`).
+"""Image sources behind one interface (`ImageSource`), and the wire format of images over TCP.
 
 Wire format, network byte order. Image: b"PIMG", generation u32, sequence u64, age f64 (s since
 mid-exposure when sent), height u16, width u16, length u32, then the grey levels row by row. Control
 (receiver to camera): b"PCTL", generation u32, rate f64 (images/s, 0: stop). The camera repeats the
-generation of the last control, so images of an earlier start are known and dropped.
+generation of the last control, so images of an earlier start are recognised and dropped.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import contextlib
 import errno
 import socket
 import struct
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,11 +21,111 @@ import numpy as np
 from numpy.typing import NDArray
 
 from petrobot.services.comm.protocol.security import is_loopback
-from petrobot.services.comm.streams.capture import CaptureImages
 from petrobot.services.comm.streams.image import Image, ImageSource
+
+# Images from any cv2.VideoCapture device or video file. OpenCV is imported at the first start, so
+# nodes without one need none.
 
 Clock = Callable[[], float]
 Pixels = NDArray[np.uint8]
+
+
+class CaptureImages:
+    """A cv2.VideoCapture device (a number) or a video file (a path), opened at the first start.
+
+    A thread reads a device's images as they come, so the newest one is never older than one
+    exposure. A file is paced by the clock: image k belongs to the time start + k / rate, and after
+    the last one there is none.
+    """
+
+    def __init__(self, target: int | str, clock: Clock, latency: float = 0.0) -> None:
+        """`latency`: time from mid-exposure until a device's image is available (s), from its
+        datasheet or measured."""
+        self._target = target
+        self._clock = clock
+        self._latency = latency
+        self._capture: Any = None
+        self._lock = threading.Lock()
+        self._newest: Image | None = None
+        self._sequence = 0
+        self._begin = 0.0
+        self._rate = 0.0
+        self._thread: threading.Thread | None = None
+        self._on = threading.Event()
+
+    def start(self, rate: float) -> None:
+        """Deliver images at about this rate (1/s). Raises ConnectionError with the source when it
+        cannot be opened."""
+        import cv2  # imported here: a node without a capture needs no OpenCV
+
+        self.stop()
+        if self._capture is None:
+            self._capture = cv2.VideoCapture(self._target)
+        if not self._capture.isOpened():
+            self._capture = None
+            raise ConnectionError(
+                f"camera source {self._target!r} cannot be opened: is it plugged in, does "
+                "the file exist?"
+            )
+        self._begin, self._rate, self._sequence, self._newest = self._clock(), rate, 0, None
+        if isinstance(self._target, str):
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, 0)
+            return
+        self._capture.set(cv2.CAP_PROP_FPS, rate)
+        self._on.set()
+        self._thread = threading.Thread(target=self._grab, name="capture", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Deliver no more images."""
+        self._on.clear()
+        if self._thread is not None:
+            self._thread.join()
+        self._thread, self._rate, self._newest = None, 0.0, None
+
+    def close(self) -> None:
+        """Release the device or file."""
+        self.stop()
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+    def newest(self) -> Image | None:
+        """Return the newest image that was not returned yet, None if there is none."""
+        if isinstance(self._target, str) and self._rate > 0.0:
+            self._advance_file()
+        with self._lock:
+            newest, self._newest = self._newest, None
+        return newest
+
+    def _advance_file(self) -> None:
+        due = int((self._clock() - self._begin) * self._rate)
+        while self._sequence <= due:
+            taken, pixels = self._capture.read()
+            if not taken:
+                return
+            self._newest = Image(
+                _grey(pixels), self._begin + self._sequence / self._rate, self._sequence
+            )
+            self._sequence += 1
+
+    def _grab(self) -> None:
+        while self._on.is_set():
+            taken, pixels = self._capture.read()
+            if not taken:
+                return  # unplugged: no more images, and the reader finds that the camera is dead
+            image = Image(_grey(pixels), self._clock() - self._latency, self._sequence)
+            self._sequence += 1
+            with self._lock:
+                self._newest = image
+
+
+def _grey(pixels: NDArray[Any]) -> Pixels:
+    """Return the grey levels (height, width) of a BGR or grey picture (weights of ITU-R BT.601)."""
+    if pixels.ndim == 2:
+        return np.asarray(pixels, np.uint8)
+    return np.asarray(np.rint(pixels[..., :3] @ np.array([0.114, 0.587, 0.299])), np.uint8)
+
 
 IMAGE_HEADER = struct.Struct("!4sIQdHHI")
 CONTROL = struct.Struct("!4sId")
@@ -34,21 +134,21 @@ LARGEST_IMAGE = 16 * 1024 * 1024
 BUFFER = 4 * 1024 * 1024
 CHUNK = 1 << 20
 RECEIVERS = 16
-"""Receivers at a time; above it one that wants no images gives way."""
+"""Most receivers at a time; above it a receiver that wants no images is closed."""
 ADMITTED = 4
-"""Connections taken in a poll: strangers must not hold up the loop that polls."""
+"""Connections accepted per poll: strangers must not delay the loop that polls."""
 RETRY = 0.5
-"""s between attempts to reach a camera that is away."""
+"""Pause between attempts to reach a camera that is away (s)."""
 IN_PROGRESS = (errno.EINPROGRESS, errno.EALREADY, errno.EWOULDBLOCK, errno.EAGAIN)
 
 
 class ImageFormatError(ValueError):
-    """Bytes that are no image of this format."""
+    """Bytes that are not an image or control of this format."""
 
 
 @dataclass(frozen=True, slots=True)
 class WireImage:
-    """An image as it crosses the wire: its age (s since mid-exposure), never a time."""
+    """An image as it is sent: with its age (s since mid-exposure), never with a time of day."""
 
     generation: int
     sequence: int
@@ -57,7 +157,7 @@ class WireImage:
 
 
 def encode_image(image: WireImage) -> bytes:
-    """Header and grey levels of one image, pixels (height, width) uint8."""
+    """Return header and grey levels of one image, pixels (height, width) uint8."""
     height, width = image.pixels.shape
     header = IMAGE_HEADER.pack(
         IMAGE_MAGIC, image.generation, image.sequence, image.age, height, width, height * width
@@ -66,14 +166,14 @@ def encode_image(image: WireImage) -> bytes:
 
 
 class ImageDecoder:
-    """Takes bytes cut anywhere; keeps only the newest whole image."""
+    """Decodes bytes that may be cut anywhere; keeps only the newest complete image."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
         self._newest: WireImage | None = None
 
     def feed(self, data: bytes | memoryview) -> None:
-        """Take bytes from the wire. Raises ImageFormatError when they are no images."""
+        """Add received bytes. Raises ImageFormatError when they are not images."""
         self._bytes += data
         while len(self._bytes) >= IMAGE_HEADER.size:
             magic, generation, sequence, age, height, width, length = IMAGE_HEADER.unpack_from(
@@ -86,7 +186,8 @@ class ImageDecoder:
                 or not age >= 0.0
             ):
                 raise ImageFormatError(
-                    f"no image header: {bytes(self._bytes[: IMAGE_HEADER.size]).hex()}"
+                    "expected the header of an image, got "
+                    f"{bytes(self._bytes[: IMAGE_HEADER.size]).hex()}"
                 )
             end = IMAGE_HEADER.size + length
             if len(self._bytes) < end:
@@ -98,14 +199,14 @@ class ImageDecoder:
             del self._bytes[:end]
 
     def take(self) -> WireImage | None:
-        """The newest whole image, once."""
+        """Return the newest complete image, once."""
         newest, self._newest = self._newest, None
         return newest
 
 
 class StreamImages:
-    """Images of a camera elsewhere, over TCP. Nothing blocks; a camera that is away is tried again
-    every half second."""
+    """Images of a camera in another process, over TCP. Nothing blocks; a camera that is away is
+    tried every half second."""
 
     def __init__(self, host: str, port: int, clock: Clock) -> None:
         self._address = host, port
@@ -118,19 +219,20 @@ class StreamImages:
         self._rate = 0.0
 
     def start(self, rate: float) -> None:
-        """Send images at about this rate (1/s); what was sent before counts no more."""
+        """Request images at about this rate (1/s); images sent before no longer count."""
         self._control(rate)
 
     def stop(self) -> None:
-        """Send no more images."""
+        """Request no more images."""
         self._control(0.0)
 
     def close(self) -> None:
-        """Leave the camera."""
+        """Disconnect from the camera."""
         self._drop(self._clock())
 
     def newest(self) -> Image | None:
-        """The newest image not taken yet; everything older in the socket is dropped."""
+        """Return the newest image that was not returned yet; all older ones in the socket are
+        dropped."""
         self._connect()
         if not self._connected or self._socket is None:
             return None
@@ -156,7 +258,7 @@ class StreamImages:
             return
         try:
             self._socket.sendall(CONTROL.pack(CONTROL_MAGIC, self._generation, self._rate))
-        except OSError:  # 16 bytes that do not fit into the buffer mean that nobody reads there
+        except OSError:  # if 16 bytes do not fit into the buffer, the camera does not read
             self._drop(self._clock())
 
     def _connect(self) -> None:
@@ -193,7 +295,7 @@ class StreamImages:
 
 
 class _Receiver:
-    """One receiver of an ImageServer: what it asked for and what is still to be written."""
+    """One receiver of an ImageServer: what it requested and what must still be written to it."""
 
     def __init__(self, link: socket.socket) -> None:
         self.link = link
@@ -203,7 +305,8 @@ class _Receiver:
         self.rest = memoryview(b"")
 
     def listen(self) -> None:
-        """Take its controls. Raises OSError or ImageFormatError when it is no receiver any more."""
+        """Read its controls. Raises OSError or ImageFormatError when the connection is of no use
+        any more."""
         with contextlib.suppress(BlockingIOError):
             data = self.link.recv(4096)
             if not data:
@@ -212,24 +315,27 @@ class _Receiver:
         while len(self.asked) >= CONTROL.size:
             magic, generation, rate = CONTROL.unpack_from(self.asked)
             if magic != CONTROL_MAGIC or not 0.0 <= rate <= 10_000.0:
-                raise ImageFormatError("no control of a camera")
+                raise ImageFormatError("expected a control message of a camera")
             self.generation, self.rate = generation, rate
             del self.asked[: CONTROL.size]
 
     def write(self) -> None:
-        """Write as much as the socket takes."""
+        """Write as much as the socket accepts."""
         with contextlib.suppress(BlockingIOError):
             while self.rest:
                 self.rest = self.rest[self.link.send(self.rest) :]
 
 
 class ImageServer:
-    """The camera's end of the wire, for the simulated camera. Nothing blocks: a slow receiver
-    misses images, no one waits."""
+    """Camera's end of the connection, for the simulated camera. Nothing blocks: a slow receiver
+    misses images."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Bind; port 0 takes a free one. Raises OSError when the address is taken, ValueError for
-        one that other hosts reach: images have neither secrecy nor authentication."""
+        """Bind; port 0 takes a free one.
+
+        Raises OSError when the address is in use, ValueError for an address that other hosts reach:
+        images are neither encrypted nor authenticated.
+        """
         if not is_loopback(host):
             raise ValueError(
                 f'address "{host}:{port}" leaves this host, and images are not protected: '
@@ -242,16 +348,16 @@ class ImageServer:
 
     @property
     def port(self) -> int:
-        """The port that it listens on."""
+        """Return the port at which it listens."""
         return int(self._listener.getsockname()[1])
 
     @property
     def rate(self) -> float:
-        """The highest rate (images/s) that a receiver wants, 0 when none wants any."""
+        """Return the highest rate (images/s) that a receiver wants, 0 if none wants images."""
         return max((receiver.rate for receiver in self._receivers), default=0.0)
 
     def poll(self) -> None:
-        """Take new receivers and controls, and go on writing. Call it often."""
+        """Accept receivers, read controls and continue writing. Call it often."""
         with contextlib.suppress(BlockingIOError):
             for _ in range(ADMITTED):
                 link, _ = self._listener.accept()
@@ -273,8 +379,8 @@ class ImageServer:
                 self._leave(receiver)
 
     def send(self, pixels: Pixels, age: float) -> None:
-        """Send an image, `age` s after mid-exposure, to all that want images and have taken the
-        last one whole."""
+        """Send an image, `age` s after mid-exposure, to all receivers that want images and have
+        received the last one completely."""
         for receiver in list(self._receivers):
             if receiver.rate <= 0.0 or receiver.rest:
                 continue
@@ -287,7 +393,7 @@ class ImageServer:
         self._sequence += 1
 
     def close(self) -> None:
-        """Stop listening and leave all receivers."""
+        """Stop listening and disconnect all receivers."""
         for receiver in list(self._receivers):
             self._leave(receiver)
         self._listener.close()
@@ -298,7 +404,7 @@ class ImageServer:
 
 
 class MemoryImages:
-    """Images of a camera in the same process (lock step): whoever has the camera puts them in."""
+    """Images of a camera in the same process (lock step): the owner of the camera puts them in."""
 
     def __init__(self, control: Callable[[float], None] = lambda rate: None) -> None:
         """`control` is called with the wanted rate (images/s), 0 to stop."""
@@ -307,33 +413,33 @@ class MemoryImages:
         self._on = False
 
     def start(self, rate: float) -> None:
-        """Send images at about this rate (1/s)."""
+        """Request images at about this rate (1/s)."""
         self._on, self._newest = True, None
         self._control(rate)
 
     def stop(self) -> None:
-        """Send no more images."""
+        """Request no more images."""
         self._on, self._newest = False, None
         self._control(0.0)
 
     def put(self, image: Image) -> None:
-        """Put in the newest image; dropped when images are not wanted."""
+        """Put in the newest image; it is dropped when images are not wanted."""
         if self._on:
             self._newest = image
 
     def newest(self) -> Image | None:
-        """The newest image not taken yet, None if there is none."""
+        """Return the newest image that was not returned yet, None if there is none."""
         newest, self._newest = self._newest, None
         return newest
 
     def close(self) -> None:
-        """Let the camera go."""
+        """Release the camera."""
         self.stop()
 
 
 def open_images(config: Mapping[str, Any], clock: Clock) -> ImageSource:
-    """The source that a device's config names: `source = "sim"` (with `address = "host:port"`),
-    "capture:0" or "file:PATH".
+    """Return the source that a device's config names: `source = "sim"` (with `address =
+    "host:port"`), "capture:0" or "file:PATH".
 
     Raises ValueError naming key and remedy.
     """

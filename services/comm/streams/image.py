@@ -1,4 +1,4 @@
-"""An image and where images come from."""
+"""An image, and the interface of its sources."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """One exposure: `pixels` (height, width) uint8 grey levels, mid-exposure `time` on the
+    """One exposure: `pixels` (height, width) uint8 grey levels, `time` of mid-exposure on the
     receiver's clock (s).
 
     `sequence` counts from 0.
@@ -23,16 +23,17 @@ class Image:
 
 
 class ImageSource(Protocol):
-    """A camera: simulated, a cv2.VideoCapture device, or a file."""
+    """A source of images: the simulated camera, a cv2.VideoCapture device, or a file."""
 
     def start(self, rate: float) -> None:
-        """Send images at about this rate (1/s)."""
+        """Begin to deliver images at about this rate (1/s)."""
 
     def stop(self) -> None:
-        """Send no more images."""
+        """Deliver no more images."""
 
     def newest(self) -> Image | None:
-        """The newest image not taken yet, None if there is none; older ones are dropped."""
+        """Return the newest image that was not returned yet, None if there is none; older ones are
+        dropped."""
 
     def close(self) -> None:
-        """Let the camera go."""
+        """Release the source."""

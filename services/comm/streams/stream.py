@@ -1,10 +1,10 @@
-"""Set points from node to node, each stream on a connection of its own: newest value wins.
+"""Set points from node to node, each stream on a connection of its own: the newest value wins.
 
-The sender opens with the handshake of the node protocol (role "stream"), then STREAM_OPEN, then one
-SET_POINT a period for as long as it stands by its values, and WITHDRAW when it does no more.
-Nothing here waits: a value that finds no room is dropped, since a newer one follows; the receiver
-drains its sockets to the newest value, and withdraws it once it is older than three periods, what
-it lost on its way included. Pacing is the sender's loop's.
+The sender opens with the handshake of the node protocol (role "stream") and STREAM_OPEN. Then it
+sends one SET_POINT per period as long as its values must be followed, and WITHDRAW when they must
+not. Nothing here blocks: a value that finds no room in the socket is dropped, because a newer one
+follows. The receiver reads its sockets up to the newest value, and withdraws it once it is older
+than three periods, including its delay on the way. The sender's own loop keeps the period.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 from petrobot.services.comm.protocol.messages import (
     Bye,
@@ -30,35 +30,178 @@ from petrobot.services.comm.protocol.messages import (
     Welcome,
     Withdraw,
 )
-from petrobot.services.comm.protocol.security import UNPROVEN, Keys, require_key, same
+from petrobot.services.comm.protocol.security import NONCE_BYTES, UNPROVEN, Keys, require_key, same
 from petrobot.services.comm.protocol.wire import (
     NEWEST_VERSION,
     OLDEST_VERSION,
+    Connection,
+    ConnectionState,
     ProtocolError,
     Side,
-    State,
 )
-from petrobot.services.comm.streams.line import STALE_AFTER, Incoming, Inlet, Line, Sink
+
+STALE_AFTER: Final = 3
+"""A set point is too old after so many periods."""
+
+_DRIFT: Final = 1e-4
+"""Assumed drift between two clocks (s/s); quartz is ten times better."""
+_CHUNK: Final = 1 << 14
+_READS: Final = 16
+"""Most reads of one connection per poll: a flood must not delay the servo loop that polls."""
+
+
+class Sink(Protocol):
+    """Receives the newest set point of a stream."""
+
+    def take(self, values: Sequence[float], held: float = 0.0) -> None:
+        """A set point has arrived, `held` seconds after its sender first sent these values."""
+
+    def withdraw(self) -> None:
+        """The last set point must not be followed: its sender withdrew it or is gone, or it is too
+        old."""
+
+
+class Lateness:
+    """Estimates how much longer a message took than the quickest one of its stream.
+
+    The clocks of sender and receiver have an unknown offset. The smallest difference between
+    arrival time and the sender's elapsed time is taken as the passage without delay.
+    """
+
+    __slots__ = ("_at", "_best")
+
+    def __init__(self) -> None:
+        self._best = math.inf
+        self._at = 0.0
+
+    def of(self, now: float, elapsed: float) -> float:
+        """Return the delay (s) of a message that was sent `elapsed` seconds into the stream and
+        arrives at `now`."""
+        offset = now - elapsed
+        # The quickest passage grows at the rate at which clocks may drift. Otherwise a very old one
+        # would make all later messages look late.
+        self._best = min(self._best + _DRIFT * (now - self._at), offset)
+        self._at = now
+        return offset - self._best
+
+
+class Inlet:
+    """Receiving end of one open stream (sans-I/O): drops what is older than three periods.
+
+    The delay of a set point on its way counts as age, so one that was held up is not mistaken for a
+    fresh one.
+    """
+
+    __slots__ = ("_lateness", "_limit", "_sink", "_until")
+
+    def __init__(self, period: float, sink: Sink) -> None:
+        self._limit = STALE_AFTER * period
+        self._sink = sink
+        self._lateness = Lateness()
+        self._until = math.inf
+
+    def receive(self, now: float, messages: Sequence[Message]) -> None:
+        """Handle what has arrived by `now`: the newest message counts, the others only improve the
+        estimate of the delay."""
+        newest: Message | None = None
+        late = 0.0
+        for message in messages:
+            if isinstance(message, SetPoint):
+                newest, late = message, self._lateness.of(now, message.elapsed)
+            elif isinstance(message, Withdraw):
+                newest = message
+        if isinstance(newest, SetPoint) and late <= self._limit:
+            self._until = now - late + self._limit
+            self._sink.take(newest.values, newest.held + late)
+        elif isinstance(newest, Withdraw) or now > self._until:
+            self._until = math.inf
+            self._sink.withdraw()
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A stream that a receiver accepts: its period (s), the sink of its values, and the ticket that
+    its sender must show."""
+
+    period: float
+    sink: Sink
+    ticket: str = ""
+
+
+class StreamConnection:
+    """One non-blocking connection, either end; `receiver` is the name of the listening end."""
+
+    def __init__(self, sock: socket.socket, side: Side, receiver: str, key: Keys | None) -> None:
+        sock.setblocking(False)
+        self.sock = sock
+        nonce = secrets.token_bytes(NONCE_BYTES) if key is not None else b""
+        self.connection = Connection(side, receiver, key=key, nonce=nonce)
+        self.unsent = b""
+
+    def tune(self) -> None:
+        """Set small buffers and short timeouts, so that old values do not queue up in the
+        kernel."""
+        sock = self.sock
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1500)
+
+    def write(self, data: bytes) -> None:
+        """Send, or keep what finds no room now. Raises OSError when the connection is gone."""
+        data = self.unsent + data
+        self.unsent = b""
+        if not data:
+            return
+        try:
+            sent = self.sock.send(data)
+        except BlockingIOError:
+            sent = 0
+        self.unsent = data[sent:]
+
+    def read(self, reads: int = _READS, chunk: int = _CHUNK) -> list[Message]:
+        """Return the messages that have arrived, with at most `reads` reads.
+
+        Raises OSError when the connection is gone, ProtocolError when the other side broke the
+        protocol.
+        """
+        messages: list[Message] = []
+        for _ in range(reads):
+            try:
+                data = self.sock.recv(chunk)
+            except BlockingIOError:
+                break
+            if not data:
+                raise ConnectionResetError("the other side hung up")
+            messages += self.connection.receive_data(data)
+            if out := self.connection.data_to_send():
+                self.write(out)
+            if len(data) < chunk:
+                break
+        return messages
+
 
 __all__ = ["STALE_AFTER", "Incoming", "Inlet", "Sink", "StreamReceiver", "StreamSender"]
 
 _CONNECTIONS: Final = 16
 _ADMITTED: Final = 4
-"""Connections taken in a poll, and"""
+"""Connections accepted per poll, so that strangers do not delay the servo loop that polls."""
 _STRANGERS_CHUNK: Final = 2048
-"""bytes read in a poll from one that has not opened a stream: strangers must not hold up the servo
-loop that polls."""
+"""Bytes read per poll from a connection that has not opened a stream yet, for the same reason."""
 _HANDSHAKE: Final = 2.0
 _RETRY: Final = 0.1
 
 
 class StreamSender:
-    """Sending end of one stream, for the loop of a worker: `send` never blocks, the connection
-    looks after itself.
+    """Sending end of one stream, for the loop of a worker. `send` never blocks; the connection is
+    maintained in passing.
 
-    It connects when there is first something to send, and again at most every 0.1 s when that fails
-    or the receiver is gone. `name` says who sends, `receiver` the name of the device that is to
-    receive: another one is sent nothing.
+    It connects when there is first something to send. When that fails or the receiver is gone, it
+    tries again at most every 0.1 s. `name` is the sender, `receiver` the device that must receive;
+    another device is sent nothing.
     """
 
     def __init__(
@@ -84,7 +227,7 @@ class StreamSender:
         self._receiver = receiver
         self._key = key
         self._clock = clock
-        self._line: Line | None = None
+        self._line: StreamConnection | None = None
         self._greeted = False
         self._again = -math.inf
         self._opened = 0.0
@@ -92,12 +235,12 @@ class StreamSender:
 
     @property
     def up(self) -> bool:
-        """Whether the receiver has welcomed the stream."""
-        return self._line is not None and self._line.connection.state is State.OPEN
+        """Return whether the receiver has welcomed the stream."""
+        return self._line is not None and self._line.connection.state is ConnectionState.OPEN
 
     def send(self, values: Sequence[float], held: float = 0.0) -> bool:
-        """Send the newest values, which the sender has stood by for `held` seconds. False if they
-        were dropped."""
+        """Send the newest values, which the sender has held for `held` seconds. Return False if
+        they were dropped."""
         line = self._line if self.up else self.advance()
         if line is not None and line.unsent:
             line = self.advance()
@@ -107,11 +250,11 @@ class StreamSender:
         self._number += 1
         elapsed = self._clock() - self._opened
         sent = self._write(line, SetPoint(self._number, tuple(map(float, values)), held, elapsed))
-        self.advance()  # what the receiver said can wait until the value is on its way
+        self.advance()  # read what the receiver sent only after the value is on its way
         return sent
 
     def withdraw(self) -> None:
-        """Stand by the last values no more."""
+        """Withdraw the last values."""
         line = self.advance()
         if line is not None:
             self._write(line, Withdraw())
@@ -124,8 +267,8 @@ class StreamSender:
                 line.write(line.connection.send(Bye("the stream ends")))
         self._drop(0.0)
 
-    def advance(self) -> Line | None:
-        """Look after the connection: connect, shake hands, notice its end. Gives it when the stream
+    def advance(self) -> StreamConnection | None:
+        """Maintain the connection: connect, shake hands, notice its end. Return it when the stream
         is open."""
         now = self._clock()
         if self._line is None and now >= self._again:
@@ -145,7 +288,7 @@ class StreamSender:
             self._drop(now + _RETRY)
         return self._line if self.up else None
 
-    def _write(self, line: Line, message: Message) -> bool:
+    def _write(self, line: StreamConnection, message: Message) -> bool:
         try:
             line.write(line.connection.send(message))
         except OSError:
@@ -156,7 +299,7 @@ class StreamSender:
     def _connect(self, now: float) -> None:
         host = self._address[0]
         sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-        self._line = Line(sock, Side.CLIENT, self._receiver, self._key)
+        self._line = StreamConnection(sock, Side.CLIENT, self._receiver, self._key)
         self._greeted = False
         try:
             self._line.tune()
@@ -166,7 +309,7 @@ class StreamSender:
         except OSError:
             self._drop(now + _RETRY)
 
-    def _greet(self, line: Line) -> None:
+    def _greet(self, line: StreamConnection) -> None:
         if self._greeted:
             return
         fault = line.sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
@@ -179,7 +322,7 @@ class StreamSender:
         self._greeted = True
         line.write(line.connection.send(self._hello))
 
-    def _take(self, line: Line, message: Message) -> None:
+    def _take(self, line: StreamConnection, message: Message) -> None:
         if isinstance(message, Welcome):
             self.refusal = ""
             self._opened, self._number = self._clock(), 0
@@ -201,7 +344,7 @@ class StreamSender:
 
 @dataclass(slots=True, eq=False)
 class _Guest:
-    line: Line
+    line: StreamConnection
     since: float
     stream: str = ""
     inlet: Inlet | None = None
@@ -233,7 +376,7 @@ class StreamReceiver:
         self._key = key
         self._clock = clock
         self._guests: dict[int, _Guest] = {}
-        """By the number of their sockets."""
+        """Connections by the file number of their socket."""
         self._ready = select.epoll()
         self._listener = socket.create_server(
             (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -243,17 +386,17 @@ class StreamReceiver:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where it listens."""
+        """Return the address at which it listens."""
         host, port = self._listener.getsockname()[:2]
         return str(host), int(port)
 
     def sockets(self) -> list[socket.socket]:
-        """What to wait on, for a loop that would rather wait than poll each cycle."""
+        """Return the sockets to wait on, for a loop that waits instead of polling each cycle."""
         return [self._listener, *(guest.line.sock for guest in self._guests.values())]
 
     def poll(self) -> None:
-        """Take in all that has arrived; never blocks."""
-        # Asked for first: a read of each socket in vain is an exception each, and this is called in
+        """Read all that has arrived; never blocks."""
+        # epoll first: a read of a socket without data raises an exception, and this function runs in
         # every servo cycle.
         ready = {number for number, _ in self._ready.poll(0.0)}
         now = self._clock()
@@ -266,7 +409,7 @@ class StreamReceiver:
             self._admit(now)
 
     def close(self) -> None:
-        """Listen no more and end all streams."""
+        """Stop listening and end all streams."""
         for guest in list(self._guests.values()):
             self._end(guest)
         self._ready.close()
@@ -276,7 +419,7 @@ class StreamReceiver:
         with contextlib.suppress(OSError):
             for _ in range(_ADMITTED):
                 sock, _ = self._listener.accept()
-                line = Line(sock, Side.SERVER, self._name, self._key)
+                line = StreamConnection(sock, Side.SERVER, self._name, self._key)
                 line.tune()
                 self._ready.register(sock, select.EPOLLIN)
                 newest = self._guests[sock.fileno()] = _Guest(line, now)
@@ -286,7 +429,7 @@ class StreamReceiver:
                     )
 
     def _wait(self, now: float, guest: _Guest) -> None:
-        """Nothing came: what is there grows older."""
+        """Nothing arrived on this connection: its last set point grows older."""
         if guest.inlet is not None:
             guest.inlet.receive(now, ())
         elif now > guest.since + _HANDSHAKE:
@@ -317,7 +460,7 @@ class StreamReceiver:
             self._end(guest)
 
     def _open(self, guest: _Guest, messages: list[Message]) -> list[Message]:
-        """Lead a connection through HELLO and STREAM_OPEN; gives what came after."""
+        """Handle HELLO and STREAM_OPEN of a connection; return the messages after them."""
         for position, message in enumerate(messages):
             if isinstance(message, Hello):
                 welcome = Welcome(NEWEST_VERSION, self._name, self._boot, tuple(self._streams))
@@ -339,7 +482,7 @@ class StreamReceiver:
         if incoming is None:
             return Refuse(
                 "unknown_stream",
-                f"{self._name} takes no stream {opening.stream}: see [streams] in services.toml",
+                f"{self._name} receives no stream {opening.stream}: see [streams] in services.toml",
             )
         if not math.isclose(opening.period, incoming.period):
             text = (
@@ -350,12 +493,12 @@ class StreamReceiver:
         if incoming.ticket and not same(opening.ticket.encode(), incoming.ticket.encode()):
             return Refuse(
                 "ticket",
-                f"the ticket for {opening.stream} is not the one that {self._name} gave out",
+                f"the ticket for {opening.stream} is not the one that {self._name} issued",
             )
         return None
 
     def _replace(self, guest: _Guest, stream: str) -> None:
-        """A stream has one sender: the newest."""
+        """Make this connection the sender of a stream; an older one is closed."""
         for older in [one for one in self._guests.values() if one.stream == stream]:
             self._end(older)
         incoming = self._streams[stream]
@@ -375,6 +518,6 @@ class StreamReceiver:
         number = guest.line.sock.fileno()
         if self._guests.get(number) is guest:
             del self._guests[number]
-            guest.line.sock.close()  # and with it epoll lets it go
+            guest.line.sock.close()  # this also removes it from the epoll
             if guest.inlet is not None:
                 self._streams[guest.stream].sink.withdraw()

@@ -1,1 +1,2 @@
-"""Mutual TLS: certificates, their expiry, and the listening socket."""
+"""TLS between the hosts of a cell: certificates, their expiry, and a listener with bounded
+handshakes."""

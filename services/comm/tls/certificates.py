@@ -1,10 +1,10 @@
-"""Makes the cell's certificates: an authority of its own, and a certificate for the coordinator and
-for each node.
+"""Make the cell's certificates: an authority of its own, and a certificate for the coordinator and
+each node.
 
-X.509 v3 (RFC 5280) with keys on the curve P-256. A node's certificate bears its name in
-services.toml, as common name and as DNS name: that is what the other end checks, so an address may
-change without a new certificate. What exists is kept, so the command can be run again when a node
-is added; a certificate that ends within 30 days is made anew.
+X.509 v3 (RFC 5280) with keys on the curve P-256. A node's certificate contains its name from
+services.toml, as common name and as DNS name. The other end checks this name, so an address may
+change without a new certificate. Existing files are kept, so the command can be run again when a
+node is added; a certificate that expires within 30 days is replaced.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CA_NAME = "petrobot cell authority"
 CA_LIFE = timedelta(days=3650)
 LIFE = timedelta(days=1095)
 CLOCKS = timedelta(days=1)
-"""How far the clocks of hosts may be apart: a certificate counts from so long before it was
+"""How much the clocks of hosts may differ: a certificate is valid from so long before it was
 made."""
 
 
@@ -38,17 +38,17 @@ class CertificateError(Exception):
 def make_certificates(
     folder: Path, parties: Sequence[str], now: datetime | None = None
 ) -> list[str]:
-    """Make what is missing of the authority and of each party's certificate and key; gives the
+    """Make the missing files of the authority and of each party's certificate and key; return the
     files written.
 
-    A party's certificate that ends soon is made anew, with its key. Keys are readable by their
-    owner alone. `now` is the time that the certificates count from (default: this moment). Raises
-    CertificateError, also when the authority itself ends soon.
+    A party's certificate that expires soon is replaced together with its key. Keys are readable by
+    their owner only. `now` is the time from which the certificates are valid (default: the
+    present). Raises CertificateError, also when the authority itself expires soon.
     """
     now = now or datetime.now(UTC)
     if clash := {"ca"} & set(parties):
         raise CertificateError(
-            f"a node is named {clash.pop()!r}, as the authority's files are; rename the node"
+            f"a node is named {clash.pop()!r}, like the files of the authority; rename the node"
         )
     written: list[str] = []
     try:
@@ -63,13 +63,13 @@ def make_certificates(
         ) from fault
     except ValueError as fault:
         raise CertificateError(
-            f"{folder}: what is there is no authority of this command ({fault}); remove it"
+            f"{folder}: its files are not an authority that this command made ({fault}); remove them"
         ) from fault
     return written
 
 
 def _lasts(file: Path, now: datetime) -> bool:
-    """Whether this certificate is there and good for some time."""
+    """Return whether this certificate exists and does not expire soon."""
     return (
         file.exists()
         and x509.load_pem_x509_certificate(file.read_bytes()).not_valid_after_utc - now > SOON
@@ -79,19 +79,19 @@ def _lasts(file: Path, now: datetime) -> bool:
 def _authority(
     folder: Path, now: datetime, written: list[str]
 ) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """The folder's authority, made if there is none."""
+    """Return the folder's authority; make it if there is none."""
     certificate, key = folder / CA_FILE, folder / CA_KEY
     if certificate.exists():
         if not key.exists():
             raise CertificateError(
-                f"{key}: is not here; run this where the authority was made, or name another folder"
+                f"{key}: not found; run this where the authority was made, or name another folder"
             )
         loaded = serialization.load_pem_private_key(key.read_bytes(), None)
         if not isinstance(loaded, ec.EllipticCurvePrivateKey):
             raise ValueError("another kind of key")
         if not _lasts(certificate, now):
             raise CertificateError(
-                f"{certificate}: the authority ends soon, or has ended; {RENEW_CA}"
+                f"{certificate}: the authority expires soon, or has expired; {RENEW_CA}"
             )
         return x509.load_pem_x509_certificate(certificate.read_bytes()), loaded
     private = ec.generate_private_key(ec.SECP256R1())
@@ -116,9 +116,8 @@ def _issue(
     written: list[str],
 ) -> None:
     private = ec.generate_private_key(ec.SECP256R1())
-    ends = min(
-        now + LIFE, authority.not_valid_after_utc
-    )  # nothing that it signed is good for longer
+    # A certificate is of no use after its authority has expired.
+    ends = min(now + LIFE, authority.not_valid_after_utc)
     made = (
         _builder(_name(party), authority.subject, private.public_key(), now, ends)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
@@ -183,7 +182,7 @@ def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(folder: Path, name: str, data: bytes, mode: int, written: list[str]) -> None:
-    """Write a file, whole or not at all; a key before its certificate, so that one that was broken
-    off is made again."""
+    """Write a file in one piece. The key is written before its certificate, so an interrupted pair
+    is made again."""
     write_whole(folder / name, data, mode=mode)
     written.append(name)

@@ -1,12 +1,12 @@
-"""What a party of the cell proves itself with: nothing on loopback, the shared key, or a
-certificate of its own (mutual TLS).
+"""How a party of the cell proves who it is: not at all on loopback, with the shared key, or with a
+certificate (mutual TLS).
 
-`[keys]` in services.toml says which: `file = "cell.key"` names the shared key, `certificates =
-"keys"` a folder with the cell's `ca.pem` and, on each host, `NAME.pem` and `NAME.key` of the
-parties that run there. TLS 1.3 (RFC 8446) only, and both ends show a certificate. A client asks for
-the node by its name, so no node can stand in for another; a server lets a party speak under the
-name of its certificate alone, but for the coordinator's, under which all of the operator's tools
-speak.
+`[keys]` in services.toml selects it: `file = "cell.key"` names the shared key; `certificates =
+"keys"` names a folder with the cell's `ca.pem` and, on each host, `NAME.pem` and `NAME.key` of the
+parties that run there. Only TLS 1.3 (RFC 8446) is used, and both ends show a certificate. A client
+asks for the node by name, so one node cannot stand in for another. A server accepts a party only
+under the name on its certificate; the coordinator's certificate also serves all tools of the
+operator.
 """
 
 from __future__ import annotations
@@ -37,36 +37,41 @@ RENEW_CA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """One party's. `key` is the shared key, or all that are accepted; `folder` that of the
-    certificates, `party` whose of them."""
+    """Credentials of one party.
+
+    `key` is the shared key, or all accepted keys; `folder` holds the certificates, `party` names
+    the one to use.
+    """
 
     party: str = ""
     key: Keys | None = None
     folder: Path | None = None
     also: Path | None = None
-    """Folder of another authority whose certificates are accepted, too, while it is being
-    replaced."""
+    """Folder of another authority whose certificates are also accepted, while the authority is
+    being replaced."""
 
     @property
     def guarded(self) -> bool:
-        """Whether strangers are kept out, so that a socket may be open to other hosts."""
+        """Return whether strangers are kept out, so that a socket may be open to other hosts."""
         return self.key is not None or self.folder is not None
 
     def server(self) -> ssl.SSLContext | None:
-        """TLS of a listening end; None without certificates. Raises KeyFileError."""
+        """Return the TLS context of a listening end; None without certificates. Raises
+        KeyFileError."""
         return self._context(ssl.PROTOCOL_TLS_SERVER)
 
     def client(self) -> ssl.SSLContext | None:
-        """TLS of a connecting end; None without certificates. Raises KeyFileError."""
+        """Return the TLS context of a connecting end; None without certificates. Raises
+        KeyFileError."""
         return self._context(ssl.PROTOCOL_TLS_CLIENT)
 
     def stream_key(self, ticket: str) -> Keys | None:
-        """What seals a set-point stream: the shared key, else, with certificates, one made of the
-        ticket that crossed TLS.
+        """Return the key that seals a set-point stream: the shared key; with certificates a key
+        derived from the ticket.
 
-        So no TLS stands in the servo's cycle. A ticket is the receiving device's secret, a dot, and
-        the stream's own; both are drawn anew at each start of the receiver and told to nobody but
-        through an authenticated connection.
+        So the servo's cycle needs no TLS. A ticket is the receiving device's secret, a dot, and the
+        stream's own part. Both are drawn at each start of the receiver, and sent only through an
+        authenticated (TLS) connection.
         """
         if self.key is not None or self.folder is None:
             return self.key
@@ -74,8 +79,8 @@ class Credentials:
         return hmac.digest(secret, b"petrobot set-point stream", hashlib.sha256) if secret else None
 
     def tell_ends(self, now: datetime | None = None) -> None:
-        """Say on standard error, once in this process each, which of the certificates shown here
-        end soon or have ended."""
+        """Report on standard error, once per process, which certificates used here expire soon or
+        have expired."""
         if self.folder is None:
             return
         now = now or datetime.now(UTC)
@@ -112,7 +117,7 @@ class Credentials:
                 or getattr(fault, "reason", "")
                 or type(fault).__name__
             )
-            text = f"{self.folder}: no certificate of {self.party} can be used ({reason})"
+            text = f"{self.folder}: cannot use the certificate of {self.party} ({reason})"
             raise KeyFileError(
                 f"{text}; make them with {MADE_BY} and copy {self.party}'s files here"
             ) from None
@@ -121,8 +126,10 @@ class Credentials:
 
 
 def credentials(directory: Directory, party: str) -> Credentials:
-    """The credentials of a node or of the coordinator. Raises KeyFileError when what services.toml
-    names cannot be used."""
+    """Return the credentials of a node or the coordinator.
+
+    Raises KeyFileError when the files that services.toml names cannot be used.
+    """
     keys = directory.keys
     if "certificates" not in keys:
         return Credentials(party, shared_keys(directory))
@@ -131,7 +138,7 @@ def credentials(directory: Directory, party: str) -> Credentials:
 
 
 def shared_keys(directory: Directory) -> Keys | None:
-    """The shared key that services.toml names, with the one that it names as accepted beside it.
+    """Return the shared key that services.toml names, with the second accepted key if there is one.
     Raises KeyFileError."""
     keys = directory.keys
     if "file" not in keys:
@@ -141,8 +148,8 @@ def shared_keys(directory: Directory) -> Keys | None:
 
 
 def name_on(certificate: dict[str, Any] | None) -> str:
-    """The common name on a certificate as `ssl.SSLSocket.getpeercert` gives it; empty if there is
-    none."""
+    """Return the common name on a certificate (as `ssl.SSLSocket.getpeercert` returns it); empty if
+    there is none."""
     for part in (certificate or {}).get("subject", ()):
         for field, value in part:
             if field == "commonName":
@@ -151,7 +158,7 @@ def name_on(certificate: dict[str, Any] | None) -> str:
 
 
 def may_speak_as(certified: str, role: str, name: str) -> bool:
-    """Whether the owner of a certificate may introduce itself with this role and name."""
+    """Return whether the owner of a certificate may introduce itself with this role and name."""
     if certified == COORDINATOR:
         return role in ("coordinator", "client")
     return bool(certified) and role in ("node", "stream") and name == certified

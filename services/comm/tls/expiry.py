@@ -1,8 +1,8 @@
-"""When certificates end, and who is told: read from the files themselves, said once, a month before
-it hurts.
+"""Find out when certificates expire, and warn once, a month before.
 
-Only the standard library: a host that runs a node needs no package for X.509. Of a certificate (RFC
-5280, section 4.1) no more is read than its `notAfter`.
+Only the standard library is used: a host that runs a node needs no package for X.509. Of a
+certificate (RFC 5280, section 4.1) only `notAfter` is read. The encoding is ASN.1 DER (ITU-T
+X.690): each element is a tag byte, a length, and the contents.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Final
 
 SOON: Final = timedelta(days=30)
-"""Who is told of an end so long before has the time to do something."""
+"""So long before the expiry the operator is warned, to have time to act."""
 DAY: Final = 86_400.0
-"""Seconds after which a process that lives long looks again."""
+"""Seconds after which a long-lived process checks again."""
 
 _SEQUENCE, _VERSION, _UTC_TIME, _TIME = 0x30, 0xA0, 0x17, 0x18
 _BEFORE_VALIDITY = 3
-"""Serial number, algorithm and issuer."""
+"""Elements before the validity: serial number, algorithm, issuer."""
 
 
 def ends_of(pem: str) -> datetime:
-    """When the first certificate of a PEM text ends. Raises ValueError if there is none that can be
+    """Return when the first certificate of a PEM text expires. Raises ValueError if it cannot be
     read."""
     first = pem[pem.find("-----BEGIN CERTIFICATE-----") :].partition("-----END CERTIFICATE-----")
     try:
@@ -37,27 +37,29 @@ def ends_of(pem: str) -> datetime:
         at, _ = _enter(der, at)
         return _time(der, _past(der, at))
     except (ValueError, IndexError) as fault:
-        raise ValueError(f"no certificate that can be read ({fault})") from None
+        raise ValueError(f"expected a PEM certificate ({fault})") from None
 
 
 def _element(der: bytes, at: int) -> tuple[int, int]:
-    """Where the contents of the element at `at` begin and end."""
+    """Return where the contents of the DER element at `at` begin and end."""
     length, at = der[at + 1], at + 2
-    if length & 0x80:
+    if length & 0x80:  # long form: the low bits say how many bytes of length follow
         size = length & 0x7F
         length, at = int.from_bytes(der[at : at + size], "big"), at + size
     if at + length > len(der):
-        raise ValueError("it is cut off")
+        raise ValueError("it is truncated")
     return at, at + length
 
 
 def _enter(der: bytes, at: int) -> tuple[int, int]:
+    """Return the contents of the SEQUENCE at `at`."""
     if der[at] != _SEQUENCE:
-        raise ValueError("it is not made as certificates are")
+        raise ValueError("it does not have the structure of a certificate")
     return _element(der, at)
 
 
 def _past(der: bytes, at: int) -> int:
+    """Return where the element after the one at `at` begins."""
     return _element(der, at)[1]
 
 
@@ -65,52 +67,52 @@ def _time(der: bytes, at: int) -> datetime:
     start, end = _element(der, at)
     text = der[start:end].decode("ascii")
     if der[at] == _UTC_TIME:
-        text = ("20" if text < "50" else "19") + text  # RFC 5280, 4.1.2.5.1
+        text = ("20" if text < "50" else "19") + text  # two-digit year: RFC 5280, 4.1.2.5.1
     elif der[at] != _TIME:
-        raise ValueError("its validity is no time")
+        raise ValueError("its validity is not a time")
     return datetime.strptime(text, "%Y%m%d%H%M%SZ").replace(tzinfo=UTC)
 
 
 def ending(file: Path, now: datetime, remedy: str) -> str:
-    """What to say of a certificate's file that ends soon or has ended; empty if neither, or if it
-    cannot be read."""
+    """Return a warning about a certificate file that expires soon or has expired; empty if neither,
+    or if it cannot be read."""
     try:
         ends = ends_of(file.read_text(encoding="ascii"))
     except (OSError, ValueError):
-        return ""  # whoever uses it says so
+        return ""  # the code that uses the certificate reports this
     if ends - now > SOON:
         return ""
     day = f"{ends:%Y-%m-%d %H:%M} UTC"
     if ends <= now:
-        return f"{file}: this certificate ended on {day}, nobody accepts it any more; {remedy}"
+        return f"{file}: this certificate expired on {day} and is not accepted any more; {remedy}"
     days = (ends - now).days
     left = f"in {days} days" if days > 1 else "within two days"
-    return f"{file}: this certificate ends {left}, on {day}; {remedy}"
+    return f"{file}: this certificate expires {left}, on {day}; {remedy}"
 
 
 _remedies: dict[Path, str] = {}
-"""Of the certificates that this process uses, by their files."""
+"""Remedies of the certificates that this process uses, by file."""
 _said: set[tuple[Path, bool]] = set()
 
 
 def watch(file: Path, now: datetime, remedy: str) -> None:
-    """This process uses a certificate: say on standard error once that it ends soon, and once that
-    it has ended."""
+    """This process uses a certificate: warn on standard error once when it expires soon, and once
+    when it has expired."""
     file = file.absolute()
     _remedies[file] = remedy
     _tell(file, now)
 
 
 def look_again(now: datetime) -> None:
-    """What `watch` does, of all certificates that it was given: for a process that lives long, once
-    a `DAY`."""
+    """Check all certificates that were passed to `watch`; a long-lived process calls it once a
+    `DAY`."""
     for file in list(_remedies):
         _tell(file, now)
 
 
 def _tell(file: Path, now: datetime) -> None:
     text = ending(file, now, _remedies[file])
-    kind = file, text.startswith(f"{file}: this certificate ended")
+    kind = file, text.startswith(f"{file}: this certificate expired")
     if text and kind not in _said:
         _said.add(kind)
         print(text, file=sys.stderr, flush=True)

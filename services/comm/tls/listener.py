@@ -1,10 +1,10 @@
-"""A listening TLS socket whose handshakes are bounded: asyncio's own would begin one for every
-connection that comes.
+"""A listening TLS socket with a bounded number of handshakes; asyncio's own starts one for every
+connection.
 
-Each handshake of asyncio's TLS has a buffer of 256 KiB, so 10,000 strangers would take 2.5 GiB
-before one showed a certificate. Here a connection costs a socket until its first bytes are there;
-then its handshake begins. Of both kinds there are so many at most; the oldest gives way, so that a
-good caller, who is quick, gets in between any number of slow ones.
+Each TLS handshake of asyncio has a buffer of 256 KiB, so 10,000 strangers would take 2.5 GiB before
+one of them showed a certificate. Here a connection costs only a socket until its first bytes
+arrive; then its handshake begins. The number of both kinds is limited, and the oldest is closed for
+a new one. So a good caller, which is quick, is served between any number of slow ones.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from functools import partial
 from typing import Final
 
 ACCEPTED: Final = 32
-"""Connections taken in one turn of the loop."""
+"""Connections accepted in one turn of the loop."""
 
 
 @dataclass(frozen=True)
@@ -27,43 +27,43 @@ class Admission:
     """What a listener asks its owner."""
 
     protocol: Callable[[], asyncio.BaseProtocol]
-    """Makes the protocol of a connection whose handshake is over."""
+    """Makes the protocol of a connection whose handshake is finished."""
     admits: Callable[[str], bool]
-    """Whether an address may try."""
+    """Returns whether an address may try."""
     failed: Callable[[str], None]
-    """Is told the address of one whose handshake came to nothing."""
+    """Receives the address of a connection whose handshake failed."""
 
 
 class TlsListener:
-    """Listens on one address. Not for threads: the running loop owns it."""
+    """Listens at one address. Not thread-safe: the running loop owns it."""
 
     def __init__(
         self, host: str, port: int, tls: ssl.SSLContext, handshake: float, limit: int
     ) -> None:
-        """`handshake`: seconds that one may take; `limit`: how many at a time. Raises OSError."""
+        """`handshake`: longest duration of one (s); `limit`: how many at a time. Raises OSError."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._listener = socket.create_server((host, port), family=family, backlog=128)
         self._listener.setblocking(False)
         self._tls, self._handshake, self._limit = tls, handshake, limit
         self._loop = asyncio.get_running_loop()
         self._waiting: dict[socket.socket, tuple[str, asyncio.TimerHandle]] = {}
-        """Connections that have said nothing: their address, and when they must have."""
+        """Connections that have sent nothing yet: their address, and the timer of their timeout."""
         self._shaking: dict[asyncio.Task[None], None] = {}
         self._ending: set[asyncio.Task[None]] = set()
         self._admission: Admission | None = None
 
     @property
     def sockets(self) -> tuple[socket.socket, ...]:
-        """The listening socket, as of an `asyncio.Server`."""
+        """Return the listening socket, as `asyncio.Server` does."""
         return (self._listener,)
 
     def start(self, admission: Admission) -> None:
-        """Listen."""
+        """Begin to listen."""
         self._admission = admission
         self._loop.add_reader(self._listener, self._accept, admission)
 
     def close(self) -> None:
-        """Listen no more; handshakes under way are broken off."""
+        """Stop listening; active handshakes are cancelled."""
         if self._listener.fileno() >= 0:
             self._loop.remove_reader(self._listener)
             self._listener.close()
@@ -73,7 +73,7 @@ class TlsListener:
             self._break_off(task)
 
     async def wait_closed(self) -> None:
-        """Until no handshake is under way."""
+        """Wait until no handshake is active."""
         while self._ending:
             await asyncio.wait(list(self._ending))
 
@@ -99,7 +99,7 @@ class TlsListener:
             self._admission.failed(address)
 
     def _drop(self, sock: socket.socket, close: bool = True) -> str:
-        """Wait for this one no more; gives its address."""
+        """Stop waiting for this connection; return its address."""
         address, timer = self._waiting.pop(sock)
         timer.cancel()
         self._loop.remove_reader(sock)
@@ -108,7 +108,7 @@ class TlsListener:
         return address
 
     def _begin(self, sock: socket.socket, admission: Admission) -> None:
-        """Its first bytes are there."""
+        """Begin the handshake of a connection whose first bytes have arrived."""
         address = self._drop(sock, close=False)
         if len(self._shaking) >= self._limit:
             self._break_off(next(iter(self._shaking)))
@@ -126,7 +126,7 @@ class TlsListener:
     ) -> None:
         self._shaking.pop(task, None)
         self._ending.discard(task)
-        if task.cancelled():  # broken off, perhaps before it began
+        if task.cancelled():  # perhaps before it began
             admission.failed(address)
             with contextlib.suppress(OSError):
                 sock.close()

@@ -14,15 +14,21 @@ import pytest
 from petrobot.services.comm.canopen.bus import Frame
 from petrobot.services.comm.canopen.cia301 import (
     SYNC,
+    DataType,
     NmtCommand,
-    Type,
     map_pdo,
     nmt,
     pdo_struct,
     sdo_read_request,
     sdo_write_request,
 )
-from petrobot.services.comm.canopen.cia402 import SENT, VELOCITY_RECEIVED, Mode, Object, to_units
+from petrobot.services.comm.canopen.cia402 import (
+    SENT,
+    VELOCITY_RECEIVED,
+    ObjectIndex,
+    OperationMode,
+    to_units,
+)
 from petrobot.services.comm.lockstep.channels import can_body
 from petrobot.services.comm.lockstep.party import TICK
 from petrobot.sim.track.laboratory import TrackLaboratory
@@ -63,14 +69,22 @@ class RoverMaster:
         groups = [[nmt(NmtCommand.ENTER_PREOPERATIONAL)]]
         for node in (1, 2):
             transfers = map_pdo(
-                Object.RPDO1, Object.RPDO1_MAPPING, 0x200 + node, 1, VELOCITY_RECEIVED
+                ObjectIndex.RPDO1, ObjectIndex.RPDO1_MAPPING, 0x200 + node, 1, VELOCITY_RECEIVED
             )
-            transfers += map_pdo(Object.TPDO1, Object.TPDO1_MAPPING, 0x180 + node, 1, SENT)
+            transfers += map_pdo(
+                ObjectIndex.TPDO1, ObjectIndex.TPDO1_MAPPING, 0x180 + node, 1, SENT
+            )
             writes = [(t.index, t.sub, t.type.pack(t.value or 0)) for t in transfers]
-            writes.append((Object.SYNC_PERIOD, 0, Type.UNSIGNED32.pack(20_000)))
-            writes.append((Object.MODE, 0, Type.INTEGER8.pack(Mode.CYCLIC_SYNCHRONOUS_VELOCITY)))
+            writes.append((ObjectIndex.SYNC_PERIOD, 0, DataType.UNSIGNED32.pack(20_000)))
+            writes.append(
+                (
+                    ObjectIndex.MODE,
+                    0,
+                    DataType.INTEGER8.pack(OperationMode.CYCLIC_SYNCHRONOUS_VELOCITY),
+                )
+            )
             groups.append([sdo_write_request(node, *write) for write in writes])
-        groups.append([sdo_write_request(3, 0x1800, 1, Type.UNSIGNED32.pack(0x183))])
+        groups.append([sdo_write_request(3, 0x1800, 1, DataType.UNSIGNED32.pack(0x183))])
         return [*groups, [nmt(NmtCommand.START)]]
 
     def frames(self, now: float = 0.0) -> list[Frame]:
@@ -125,7 +139,7 @@ class RoverBench(LaboratoryBench):
         self.master = RoverMaster()
         super().__init__(self.lab, self.master, "rover")
 
-    def read(self, node: int, index: int, kind: Type) -> int:
+    def read(self, node: int, index: int, kind: DataType) -> int:
         """An object of a node, over SDO."""
         self.master.replies.pop((node, index), None)
         self.post("can", "rover", can_body([sdo_read_request(node, index, 0)]))

@@ -15,18 +15,18 @@ import numpy as np
 import pytest
 
 from petrobot.services.comm.canopen.bus import Frame
+from petrobot.services.comm.canopen.cia301 import DataType, heartbeat, sdo_write_request
 from petrobot.services.comm.canopen.cia301 import NmtState as Network
-from petrobot.services.comm.canopen.cia301 import Type, heartbeat, sdo_write_request
 from petrobot.services.comm.canopen.cia402 import (
-    Fault,
-    Mode,
-    Object,
-    State,
+    DriveFault,
+    DriveState,
+    ObjectIndex,
+    OperationMode,
     StatusBit,
     from_units,
     state_of,
 )
-from petrobot.services.comm.canopen.hub import Hub
+from petrobot.services.comm.canopen.hub import CanHub
 from petrobot.sim.track.drives import RoverBus
 from petrobot.sim.track.rover import RoverBody
 from petrobot.sim.track.sensor import Echo, ReflectorSensor
@@ -37,7 +37,7 @@ BaseNode402: Any = importlib.import_module("canopen.profiles.p402").BaseNode402
 DRIVE_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("wheel_drive.eds"))
 SENSOR_EDS = str(files("petrobot.services.comm.canopen.eds").joinpath("reflector_sensor.eds"))
 PATIENCE = 10.0
-U16, U32, I32 = Type.UNSIGNED16, Type.UNSIGNED32, Type.INTEGER32
+U16, U32, I32 = DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.INTEGER32
 
 Bench = Callable[..., Any]
 
@@ -62,7 +62,7 @@ def test_wheels_turn_as_they_are_told_within_their_slope_and_lag(rover_bench: Be
     rises = np.diff([0.0, *speeds]) / 0.02
     assert rises.max() <= 20.0 + 1e-6  # the drives' acceleration
     assert speeds[-1] == pytest.approx(5.0, abs=0.01)
-    assert from_units(bench.read(1, Object.VELOCITY, I32)) == pytest.approx(5.0, abs=0.02)
+    assert from_units(bench.read(1, ObjectIndex.VELOCITY, I32)) == pytest.approx(5.0, abs=0.02)
     assert not bench.master.status[0] & StatusBit.INTERNAL_LIMIT
     assert bench.master.status[0] & StatusBit.FOLLOWS_COMMAND
 
@@ -100,15 +100,15 @@ def test_a_set_point_beyond_the_battery_is_cut_and_told(rover_bench: Bench) -> N
     bench.enable()
     bench.drive(1.2, 0.0)
     bench.wait(2.0)
-    most = from_units(bench.read(1, Object.MAX_SPEED, U32))
+    most = from_units(bench.read(1, ObjectIndex.MAX_SPEED, U32))
     assert most == pytest.approx(bench.lab.rover.top_speed, rel=1e-3)
     assert most < 10.5
     assert bench.lab.rover.wheels[0].speed == pytest.approx(most, rel=0.02)
     assert bench.master.status[0] & StatusBit.INTERNAL_LIMIT
-    volts = bench.read(2, Object.DC_LINK_VOLTAGE, U32) / 1e3
+    volts = bench.read(2, ObjectIndex.DC_LINK_VOLTAGE, U32) / 1e3
     assert volts == pytest.approx(bench.lab.rover.voltage, abs=0.05)
     bench.wait(20.0)
-    assert bench.read(2, Object.DC_LINK_VOLTAGE, U32) / 1e3 < volts - 0.5
+    assert bench.read(2, ObjectIndex.DC_LINK_VOLTAGE, U32) / 1e3 < volts - 0.5
 
 
 # State machine
@@ -125,8 +125,8 @@ def test_a_silent_master_stops_the_rover(rover_bench: Bench) -> None:
     assert bench.lab.rover.standing
     way = math.hypot(bench.lab.rover.x - before.x, bench.lab.rover.y - before.y)
     assert 0.04 < way < 0.15  # 0.1 s of patience, then the ramp
-    assert (1, Fault.SYNC_LOST) in bench.master.emergencies
-    assert (2, Fault.SYNC_LOST) in bench.master.emergencies
+    assert (1, DriveFault.SYNC_LOST) in bench.master.emergencies
+    assert (2, DriveFault.SYNC_LOST) in bench.master.emergencies
     bench.cut = False
     assert bench.run(lambda: bench.master.enabled, 1.0)  # the bench's master resets faults
     bench.wait(1.0)
@@ -143,7 +143,7 @@ def test_a_lost_heartbeat_stops_a_drive_that_watches_it(rover_bench: Bench) -> N
         (Frame(0x601, b"\x23\x16\x10\x01" + beat), heartbeat(0x7F, Network.OPERATIONAL)),
     )
     bench.wait(0.3)
-    assert (1, Fault.HEARTBEAT) in bench.master.emergencies
+    assert (1, DriveFault.HEARTBEAT) in bench.master.emergencies
     assert not any(node == 2 for node, _ in bench.master.emergencies)
 
 
@@ -155,7 +155,7 @@ def test_taking_the_power_away_lets_the_brakes_fall_in(rover_bench: Bench) -> No
     bench.master.enable = False
     bench.wait(0.3)
     assert bench.lab.rover.standing
-    assert state_of(bench.master.status[0]) is State.SWITCH_ON_DISABLED
+    assert state_of(bench.master.status[0]) is DriveState.SWITCH_ON_DISABLED
     assert all(wheel.braked for wheel in bench.lab.rover.wheels)
 
 
@@ -172,10 +172,14 @@ def test_leaving_operational_while_enabled_stops_the_motion(rover_bench: Bench) 
 @pytest.mark.parametrize(
     ("index", "value", "accepted"),
     [
-        (Object.MODE, Type.INTEGER8.pack(Mode.CYCLIC_SYNCHRONOUS_POSITION), False),
-        (Object.MODE, Type.INTEGER8.pack(1), False),
-        (Object.QUICK_STOP_DECELERATION, U32.pack(10_000_000), True),
-        (Object.MAX_SPEED, U32.pack(1), False),
+        (
+            ObjectIndex.MODE,
+            DataType.INTEGER8.pack(OperationMode.CYCLIC_SYNCHRONOUS_POSITION),
+            False,
+        ),
+        (ObjectIndex.MODE, DataType.INTEGER8.pack(1), False),
+        (ObjectIndex.QUICK_STOP_DECELERATION, U32.pack(10_000_000), True),
+        (ObjectIndex.MAX_SPEED, U32.pack(1), False),
     ],
 )
 def test_what_may_be_written(rover_bench: Bench, index: int, value: bytes, accepted: bool) -> None:
@@ -222,7 +226,7 @@ class LiveRover:
 
     def __init__(self, site: TrackSite) -> None:
         truth = site.truth("plain")
-        self.hub = Hub()
+        self.hub = CanHub()
         self.channel = self.hub.channel
         self.rover = RoverBody(truth.rover, np.random.default_rng(1))
         self.bus = RoverBus(self.rover, ReflectorSensor(lambda now: [Echo(0.25, 2.0)]))
@@ -320,9 +324,9 @@ def test_the_canopen_package_masters_our_wheel_drive(live: LiveRover, network: A
         node.sdo[0x6060].raw = 8
     assert refused.value.code in (0x06090030, 0x08000022)
     assert 20_000 < node.sdo[0x6079].raw < 26_000
-    live.bus.trip(1, Fault.OVERHEATED)
+    live.bus.trip(1, DriveFault.OVERHEATED)
     _until(lambda: bool(node.emcy.log), "no EMCY came")
-    assert node.emcy.log[0].code == Fault.OVERHEATED
+    assert node.emcy.log[0].code == DriveFault.OVERHEATED
     _until(lambda: live.rover.wheels[1].braked, "the brake does not fall in")
 
 

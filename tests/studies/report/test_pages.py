@@ -336,7 +336,7 @@ def test_report_of_a_recorded_run(
     from petrobot.coordinator.run.lockstep import CoordinatorParty
     from petrobot.coordinator.run.recording import JournalStore
     from petrobot.services.comm.location_file import load as load_directory
-    from petrobot.services.comm.lockstep.cell import Cell
+    from petrobot.services.comm.lockstep.cell import LockStepCell
 
     monkeypatch.syspath_prepend(str(HERE))
     directory, parameters = load_directory(SERVICES), {**TOY.parameters, "regime": "rough"}
@@ -350,7 +350,7 @@ def test_report_of_a_recorded_run(
         directory, Setting(with_runs(TOY, 8)[0], parameters, 8, 3), "fetch-1", "boot", store
     )
     party = CoordinatorParty(directory, mission)
-    assert Cell(
+    assert LockStepCell(
         [party, *(lockstep_party(directory, node) for node in directory.nodes.values())]
     ).run(lambda: party.over, 100_000)
     store.sync()

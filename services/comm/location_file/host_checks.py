@@ -1,21 +1,24 @@
-"""What a location file promises of this host, looked at before anything is launched: code that is
-there, keys, files of numbers.
+"""Checks of what services.toml says about this host: code, keys, parameter files, and the address
+to listen at.
 
-Nothing is imported: a module is found, and its names are read from its source. So the look is
-quick, and does not run what it finds. A node's own start imports everything and says what else is
-wrong.
+The checks of code run before anything is launched and import nothing: a module is located, and its
+names are read from its source. So they are fast and do not run the code that they check. A node
+imports everything when it starts, and then reports all other faults.
 """
 
 from __future__ import annotations
 
 import ast
+import errno
 import importlib.util
 import ipaddress
+import socket
 from collections.abc import Container, Iterator
+from contextlib import contextmanager
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 
-from petrobot.services.comm.location_file import Directory, module_name
+from petrobot.services.comm.location_file import Directory, DirectoryError, module_name
 from petrobot.services.comm.location_file.reading import Faults, nearest
 
 LOOPBACK_NAMES = ("localhost", "ip6-localhost")
@@ -24,12 +27,12 @@ LOOPBACK_NAMES = ("localhost", "ip6-localhost")
 def misplaced(
     directory: Directory, *, everywhere: bool = False, actions: bool = True
 ) -> tuple[str, ...]:
-    """One line for each fault, as "FILE:LINE: KEY: what is wrong; remedy"; empty when there is
-    none.
+    """Return one line for each fault, as "FILE:LINE: KEY: what is wrong; remedy"; empty when there
+    is none.
 
-    Import paths are looked at for nodes on loopback addresses alone, as what other hosts have is
-    not known here; `everywhere`: for all nodes, as a lock-step cell launches them all here.
-    `actions` False: theirs are not, as scripted ones replace them.
+    Import paths are checked only for nodes on loopback addresses, because this host does not know
+    what other hosts have installed. `everywhere`: for all nodes, because a lock-step cell launches
+    them all here. `actions` False: not for actions, because scripted ones replace them.
     """
     faults = Faults(_text(directory.source), str(directory.source))
     open_nodes = [n.name for n in directory.nodes.values() if not is_loopback(n.host)]
@@ -62,7 +65,7 @@ def misplaced(
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this host reaches the address."""
+    """Return whether only this host reaches the address."""
     if host in LOOPBACK_NAMES:
         return True
     try:
@@ -74,11 +77,8 @@ def is_loopback(host: str) -> bool:
 def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
-    except (
-        OSError,
-        UnicodeDecodeError,
-    ):  # a directory that was made of a text: its lines are not known
-        return ""
+    except (OSError, UnicodeDecodeError):
+        return ""  # the directory was made from a text; its lines are not known
 
 
 def _imports(
@@ -111,8 +111,8 @@ def _check_arguments(directory: Directory, here: Container[str], faults: Faults)
 
 
 def _parameters(path: str) -> set[str] | None:
-    """What a function may be given by name beside its context; None if that cannot be told, or if
-    it takes anything."""
+    """Return the names of a function's arguments without its context; None if unknown or if it
+    accepts any name."""
     module, _, attribute = path.partition(":")
     tree = _source(_spec(module))
     for statement in tree.body if tree is not None else ():
@@ -129,9 +129,7 @@ def _parameters(path: str) -> set[str] | None:
 def _spec(module: str) -> ModuleSpec | None:
     try:
         return importlib.util.find_spec(module_name(module))
-    except (
-        Exception
-    ):  # a parent package that cannot be imported, whatever it raises: told by `_unknown`
+    except Exception:  # a parent package that cannot be imported; `_unknown` reports it
         return None
 
 
@@ -145,8 +143,8 @@ def _source(spec: ModuleSpec | None) -> ast.Module | None:
 
 
 def _unknown(path: str) -> str:
-    """What is wrong with an import path, with the remedy; empty if nothing is, as far as its source
-    tells."""
+    """Return what is wrong with an import path, with the remedy; empty if nothing is, as far as its
+    source shows."""
     module, _, attribute = path.partition(":")
     try:
         spec = importlib.util.find_spec(module_name(module))
@@ -167,7 +165,8 @@ def _unknown(path: str) -> str:
 
 
 def _names(spec: ModuleSpec) -> set[str] | None:
-    """Names that a module's source binds at its top level; None if that cannot be told from it."""
+    """Return the names that a module's source binds at its top level; None if the source does not
+    show them."""
     tree = _source(spec)
     if tree is None:
         return None
@@ -188,5 +187,60 @@ def _names(spec: ModuleSpec) -> set[str] | None:
             case ast.Expr():
                 pass
             case _:
-                return None  # bound under a condition, in a loop, ...
+                return None  # names may be bound under a condition, in a loop, ...
     return None if "*" in found or "__getattr__" in found else found
+
+
+# Why a node cannot listen at its address in services.toml: file, key and remedy instead of the
+# text of the operating system.
+
+WORDS = {
+    errno.EADDRINUSE: (
+        "port",
+        "{port} is in use on {host}; end the process that listens there, or write another port",
+    ),
+    errno.EACCES: ("port", "{port} may not be used by this user; write one above 1023"),
+    errno.EADDRNOTAVAIL: (
+        "host",
+        "{host} is not an address of this host; start the node on its own host, or correct it",
+    ),
+}
+"""By errno: the wrong key, and what to do about it."""
+
+
+def cannot_listen(key: str, host: str, port: int, fault: OSError) -> str:
+    """Return why it is not possible to listen there; `key` is the table with host and port."""
+    at, words = WORDS.get(
+        fault.errno or 0, ("host", "cannot listen on {host}:{port}: {why}; correct host and port")
+    )
+    if isinstance(fault, socket.gaierror):
+        at, words = "host", "{host} is neither an address nor a known name ({why}); correct it"
+    return f"{key}.{at}: " + words.format(host=host, port=port, why=fault.strerror or fault)
+
+
+@contextmanager
+def listening(directory: Directory, node: str) -> Iterator[None]:
+    """Convert an OSError of the code inside to a DirectoryError that names the address in
+    services.toml."""
+    try:
+        yield
+    except OSError as fault:
+        host, port = directory.address(node)
+        text = cannot_listen(f"nodes.{node}", host, port, fault)
+        raise DirectoryError((f"{directory.source}: {text}",)) from fault
+
+
+def refuse_unusable(directory: Directory, node: str) -> None:
+    """Check that the address can be used, before devices are touched. Raises DirectoryError.
+
+    A second process of a node must not disturb the devices of the first.
+    """
+    host, port = directory.address(node)
+    with listening(directory, node):
+        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[
+            0
+        ]
+        with socket.socket(family, kind, number) as probe:
+            # The same option as the listener has: connections that have ended do not block the port.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from petrobot.services.comm.calls.link import Beat, Heart, Timing
+from petrobot.services.comm.calls.link import Beat, Heartbeat, LinkTiming
 from tests.waiting import Limit
 
 
 def test_the_heart_pings_then_gives_up() -> None:
-    heart = Heart(0.0, Timing())
+    heart = Heartbeat(0.0, LinkTiming())
     seen: list[tuple[float, Beat]] = []
     limit = Limit("the loss of the peer", steps=10)
     while (not seen or seen[-1][1] is not Beat.LOST) and limit.left():
@@ -18,7 +18,7 @@ def test_the_heart_pings_then_gives_up() -> None:
 
 
 def test_what_is_heard_puts_the_end_off() -> None:
-    heart = Heart(0.0, Timing())
+    heart = Heartbeat(0.0, LinkTiming())
     for tick in range(1, 40):
         heart.heard = tick * 0.25 - 0.1
         assert heart.advance(heart.due()) is Beat.NOTHING
@@ -26,7 +26,7 @@ def test_what_is_heard_puts_the_end_off() -> None:
 
 
 def test_a_process_that_stood_still_itself_listens_before_it_blames_the_other() -> None:
-    heart = Heart(0.0, Timing())
+    heart = Heartbeat(0.0, LinkTiming())
     assert heart.advance(5.0) is Beat.PING
     assert heart.due() == pytest.approx(5.25)
     assert heart.advance(5.25) is Beat.LOST

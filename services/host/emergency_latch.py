@@ -1,14 +1,14 @@
-"""The emergency stop's latch on disk: a node that is started again must not let devices move that
-somebody has stopped.
+"""The latch of the emergency stop on disk: a restarted node must not move devices that were
+stopped.
 
-One small file a node, on the node's own host, with the names of the devices that obey nobody (`*`:
-all of them). The node keeps it, and looks for it before each run on a device, and a few times a
-second; `petrobot estop` writes it for a node of its own host that does not answer. A file that
-cannot be read or understood counts as `*`: whoever is unsure leaves the devices stopped.
+It is one small file per node, on the node's own host, with the names of the devices that accept no
+commands (`*`: all). The node writes it, and checks it before each run on a device and several times
+per second. `petrobot estop` writes it for a node of its own host that does not answer. A file that
+cannot be read or understood counts as `*`: in doubt, devices stay stopped.
 
-The file stands in `$PETROBOT_STATE`, else in `.petrobot` beside services.toml, else, where that
-cannot be written, in a folder of the user's own (`$XDG_STATE_HOME` or `~/.local/state`). What lies
-in any of them counts; clearing clears them all.
+The file is in `$PETROBOT_STATE`; else in `.petrobot` beside services.toml; else, if that cannot be
+written, in a folder of the user (`$XDG_STATE_HOME` or `~/.local/state`). A file in any of these
+folders counts, and clearing clears all of them.
 """
 
 from __future__ import annotations
@@ -27,22 +27,25 @@ FOLDER: Final = ".petrobot"
 
 
 class LatchError(OSError):
-    """The latch cannot be written or removed: file and why."""
+    """The latch cannot be written or removed; the text names file and reason."""
 
 
 class Latch:
-    """The latch of one node. `folders` are where it may lie, the one to be written first."""
+    """The latch of one node. `folders` are the possible folders; the first one that is writable is
+    written."""
 
     def __init__(self, node: str, folders: Iterable[Path]) -> None:
         self.paths = tuple(folder / f"{node}.stopped" for folder in folders)
 
     def stopped(self) -> frozenset[str]:
-        """Names of devices that obey nobody; `ALL` among them: all. Costs a look at each file's
-        name while there is none."""
+        """Return the names of the stopped devices; with `ALL` among them, all are stopped.
+
+        While there is no latch this costs one failed open per folder.
+        """
         return frozenset().union(*(_read(path) for path in self.paths))
 
     def stop(self, devices: Iterable[str]) -> Path:
-        """Keep that these devices are stopped, too; gives where, once it is safe on disk. Raises
+        """Add devices to the stopped ones. Return the file, once it is safe on disk. Raises
         LatchError."""
         names = sorted(self.stopped() | set(devices))
         faults = []
@@ -56,8 +59,8 @@ class Latch:
         raise LatchError("; ".join(faults))
 
     def clear(self, devices: Iterable[str], all_devices: Iterable[str]) -> None:
-        """These devices obey again; `all_devices` is what `ALL` stands for. Raises LatchError, and
-        then nothing is cleared."""
+        """Allow these devices to move again; `all_devices` is what `ALL` stands for. Raises
+        LatchError, and then nothing is cleared."""
         stopped = self.stopped()
         left = (set(all_devices) if ALL in stopped else set(stopped)) - set(devices)
         if left:
@@ -70,17 +73,17 @@ class Latch:
                     path.unlink(missing_ok=True)
             except OSError as fault:
                 raise LatchError(
-                    f"{path}: {fault.strerror}; remove it by hand once the cell is safe"
+                    f"{path}: {fault.strerror}; remove this file by hand once the cell is safe"
                 ) from fault
 
     @property
     def kept(self) -> bool:
-        """Whether it could be written now, as far as permissions say."""
+        """Return whether it could be written now, according to the permissions."""
         return any(_writable(path.parent) for path in self.paths)
 
 
 def latch_of(source: Path, node: str) -> Latch:
-    """The latch of a node whose services.toml is `source`."""
+    """Return the latch of a node whose services.toml is `source`."""
     given = os.environ.get(STATE)
     if given:
         return Latch(node, [Path(given)])
