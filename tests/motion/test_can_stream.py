@@ -116,7 +116,9 @@ def test_back_to_back(pair: tuple[can.BusABC, can.BusABC], message: can.Message)
         assert sender.recv(timeout=0.0) is None, "a port does not hear itself"
 
 
-def test_many_frames_arrive_in_order_and_none_is_lost(pair: tuple[can.BusABC, can.BusABC]) -> None:
+def test_many_frames_arrive_in_order_and_no_frame_is_lost(
+    pair: tuple[can.BusABC, can.BusABC],
+) -> None:
     sender, receiver = pair
     for number in range(2000):
         sender.send(
@@ -282,7 +284,7 @@ def test_a_port_that_does_not_read_is_dropped_and_does_not_stop_the_bus() -> Non
         each.close()
 
 
-def test_local_ports_and_python_can_and_stream_ports_hear_each_other() -> None:
+def test_local_ports_and_python_can_and_stream_ports_receive_each_other() -> None:
     hub = Hub()
     local, stream = hub.port(), StreamPort(hub.channel)
     foreign = PythonCanBus(_open(hub.channel))
