@@ -142,8 +142,8 @@ def _peaks(size: Grey, first: float) -> tuple[Grey, Vector]:
 
 
 def _straight(aside: Vector, place: Vector) -> tuple[list[float], float]:
-    """Return the straight line through all points except the worst one (value at 0, slope), and how
-    far the rest is off it (m, rms)."""
+    """Return the line through all points except the worst one (value at 0, slope), and the distance
+    of the rest from it (m, rms)."""
     line = polynomial(aside, place, 1)
     off = np.abs(place - line[0] - line[1] * aside)
     keep = np.arange(place.size) != int(off.argmax())

@@ -1,7 +1,7 @@
-"""The film of a run from above, with what the rover's camera saw, as a video or an animated
-picture. From a score alone.
+"""Film of a run from above, with the view of the rover's camera, as a video or an animated picture.
+Needs only a score.
 
-`python -m petrobot.sim.track.film RUN.json --film run.webm --plan run.svg` makes film and floor
+`python -m petrobot.sim.track.film RUN.json --film run.webm --plan run.svg` draws film and floor
 plan of a result file.
 """
 
@@ -29,7 +29,7 @@ Picture = NDArray[np.uint8]
 
 ROVER_FILE: Final = Path(__file__).parents[2] / "services" / "mobile" / "rover.toml"
 WIDTH: Final = 640
-"""px, of the film's greater side."""
+"""px, greater side of the film."""
 _PATH, _ROVER, _REFLECTOR = (15, 72, 217), (230, 120, 30), (59, 212, 255)
 """Blue, green, red."""
 _PANEL: Final = (225, 225, 225)
@@ -40,7 +40,7 @@ _EYE: Final = (160, 120)
 
 
 class FilmError(ValueError):
-    """A film that cannot be made; the text says what to do."""
+    """The film cannot be made; the message says what to do."""
 
 
 class FilmView:
@@ -69,11 +69,11 @@ class FilmView:
             cv2.circle(self.still, self.pixel(gap.x, gap.y), 5, _REFLECTOR, -1, cv2.LINE_AA)
 
     def pixel(self, x: float, y: float) -> tuple[int, int]:
-        """Where a point of the floor (m) is in the film."""
+        """Return the pixel of a point of the floor (m)."""
         return round((x - float(self._low[0])) * self.scale), round((self._top - y) * self.scale)
 
     def draw_rover(self, image: Picture, x: float, y: float, heading: float) -> None:
-        """The rover's outline at a pose."""
+        """Return the rover's outline at a pose."""
         c, s = np.cos(heading), np.sin(heading)
         outline = [self.pixel(x + c * u - s * w, y + s * u + c * w) for u, w in _OUTLINE.tolist()]
         cv2.fillPoly(image, [np.array(outline, np.int32)], _ROVER, cv2.LINE_AA)
@@ -82,8 +82,8 @@ class FilmView:
 def images(
     score: Mapping[str, Any], nominal: Mapping[str, Any], fps: float = 20.0, speedup: float = 4.0
 ) -> Iterator[Picture]:
-    """The film's images (rows, columns, 3), blue, green, red: the run `speedup` times as fast as it
-    was.
+    """Yield the film's images (rows, columns, 3), blue, green, red; the run is shown `speedup`
+    times as fast as it was.
 
     `nominal`: the rover's file, for the camera's view in the corner.
     """
@@ -110,7 +110,7 @@ def images(
 
 
 def _inset(image: Picture, seen: Picture, text: str) -> None:
-    """The camera's view and the time, right of the plan."""
+    """Draw the camera's view and the time, right of the plan."""
     left = image.shape[1] - _EYE[0] - 8
     image[8 : 8 + _EYE[1], left : left + _EYE[0]] = seen[..., None]
     cv2.putText(
@@ -142,7 +142,7 @@ def film(
     fps: float = 20.0,
     speedup: float = 4.0,
 ) -> int:
-    """Write the film; the format goes by the suffix (.webm, .mp4, .avi, .gif, .webp). Gives the
+    """Write the film in the format of the suffix (.webm, .mp4, .avi, .gif, .webp); return the
     number of images.
 
     Raises FilmError for another suffix, a run without a path, or a file that cannot be written.
@@ -152,7 +152,8 @@ def film(
         return _write_animation(list(images(score, nominal, fps, speedup)), path, fps)
     if suffix not in _FOURCC:
         raise FilmError(
-            f"{path}: no film format {suffix!r}; there are {', '.join((*_FOURCC, *_ANIMATED))}"
+            f"{path}: unknown film format {suffix!r}; the formats are "
+            f"{', '.join((*_FOURCC, *_ANIMATED))}"
         )
     writer: cv2.VideoWriter | None = None
     count = 0
@@ -181,7 +182,7 @@ def _write_animation(pictures: Sequence[Picture], path: Path, fps: float) -> int
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """Return the parser of the command line."""
     commands = argparse.ArgumentParser(
         prog="python -m petrobot.sim.track.film",
         description="Draws the floor plan and the film of a run on the track from its result file.",
@@ -214,7 +215,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw; gives the exit code."""
+    """Draw; return the exit code."""
     options = parser().parse_args(arguments)
     try:
         score = json.loads(options.result.read_text(encoding="utf-8"))

@@ -1,5 +1,5 @@
-"""The floor plan of a run as SVG, still or animated: squares, track, reflectors, the path driven,
-penalties. From a score alone."""
+"""Floor plan of a run as SVG, still or animated: squares, track, reflectors, the path driven,
+penalties. Needs only a score."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from petrobot.sim.track.elements import (
 )
 
 WIDTH_PX: Final = 720
-"""Width of the drawing at its natural size."""
+"""px, width of the drawing at its natural size."""
 PATH_COLOURS: Final = ("#d9480f", "#1c7ed6", "#2b8a3e", "#862e9c", "#c2255c", "#0b7285")
-"""One for each run drawn, also told apart by dashes."""
+"""One colour for each run drawn; dashes also distinguish them."""
 _DASHES: Final = ("", "0.25 0.1", "0.1 0.08", "0.4 0.1 0.1 0.1", "0.02 0.08", "0.6 0.1")
 _LIGHT, _DARK = "#f4f1ea", "#34322e"
 _RIM: Final = 0.3
@@ -35,12 +35,13 @@ _ROVER: Final = ((0.18, 0.0), (0.06, 0.2), (-0.22, 0.2), (-0.22, -0.2), (0.06, -
 def floor_plan(
     scores: Sequence[Mapping[str, Any]], names: Sequence[str] = (), *, seconds: float = 0.0
 ) -> str:
-    """SVG of one track and the paths that runs drove on it; `scores` as
-    `sim.track_referee.Referee.score` gives them, all of one track. With `seconds` above 0 a rover
-    drives along each path in so much time, over and over. Raises ValueError without a run.
+    """Return an SVG of one track and the paths that runs drove on it.
+
+    `scores` are results of `TrackReferee.score`, all of one track. With `seconds` above 0 a rover
+    drives along each path in so much time, repeatedly. Raises ValueError without a run.
     """
     if not scores:
-        raise ValueError("no run to draw: give one score at least")
+        raise ValueError("no run to draw: give at least one score")
     track = Track.read(scores[0]["track"])
     left, bottom, right, top = _extent(track)
     high = top - bottom + 0.7 * len(scores)
@@ -71,8 +72,8 @@ def floor_plan(
 
 
 def pictures(result: Mapping[str, Any]) -> dict[str, str]:
-    """Pictures for the report of a run, SVG by title, from its result (a score and what else the
-    result holds); empty before a score was given."""
+    """Return pictures for the report of a run, SVG by title, from its result (a score and what else
+    the result contains); empty before there is a score."""
     if "track" not in result or not result.get("path"):
         return {}
     seconds = max(4.0, min(30.0, float(result["path"][-1][0]) / 4.0))
@@ -87,8 +88,8 @@ def _title(score: Mapping[str, Any]) -> str:
 
 
 def _extent(track: Track) -> tuple[float, float, float, float]:
-    """Left, bottom, right and top of what is drawn (m): the track's squares and one around them as
-    far as the board goes, and a rim in which there is room for a rover at the board's edge."""
+    """Return left, bottom, right and top of the drawing (m): the track's squares and one around
+    them as far as the board reaches, plus a margin for a rover at the board's edge."""
     columns = [element.square[0] for element in track.elements]
     rows = [element.square[1] for element in track.elements]
     return (
@@ -140,7 +141,7 @@ def _line(element: Element, way: float) -> str:
 
 
 def _reflectors(track: Track, score: Mapping[str, Any]) -> list[str]:
-    """A disc for each that hangs, a ring for each that has fallen."""
+    """Draw a disc for each reflector that is present, a ring for each that has fallen."""
     parts = []
     for gap, crossing in zip(track.gaps, score["crossings"], strict=True):
         fill, what = ("#ffd43b", "hangs") if crossing["reflector"] else ("none", "has fallen")
@@ -186,7 +187,7 @@ def _path(score: Mapping[str, Any], number: int) -> list[str]:
 
 
 def _driving(score: Mapping[str, Any], number: int, seconds: float) -> str:
-    """The rover along its path at the speed that it had, all in `seconds`."""
+    """Animate the rover along its path at its relative speed, in `seconds` in total."""
     rows = score["path"]
     if len(rows) < 2:
         return ""
@@ -209,7 +210,7 @@ def _driving(score: Mapping[str, Any], number: int, seconds: float) -> str:
 def _legend(
     score: Mapping[str, Any], number: int, name: str, at: tuple[float, float], width: float
 ) -> list[str]:
-    """One line below the plan, in letters that let it fit."""
+    """Return one line below the plan, in letters small enough to fit."""
     (x, y), text = at, f"{name}: {summary(score)}"
     colour, dash = PATH_COLOURS[number % len(PATH_COLOURS)], _DASHES[number % len(_DASHES)]
     dashes = f' stroke-dasharray="{dash}"' if dash else ""
@@ -222,7 +223,7 @@ def _legend(
 
 
 def summary(score: Mapping[str, Any]) -> str:
-    """A run in one line."""
+    """Return a run in one line."""
     what = (
         "stopped at the T"
         if score["stopped_at_T"]

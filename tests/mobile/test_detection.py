@@ -116,7 +116,7 @@ def test_swapping_black_and_white_changes_nothing(
 
 @EVERY
 @pytest.mark.parametrize("back", [0.5, 0.7, 0.9, 1.1])
-def test_the_line_goes_on_where_its_colour_is_inverted(name: str, back: float) -> None:
+def test_the_line_continues_where_its_colour_is_inverted(name: str, back: float) -> None:
     """The edge of a square lies across the view: the same line is seen before and behind it, and
     has not ended."""
     floor = DrawnFloor("SSS")
@@ -135,7 +135,7 @@ def test_an_empty_square_shows_no_line(name: str) -> None:
 
 
 @EVERY
-def test_the_edge_of_a_square_alone_is_no_line(name: str) -> None:
+def test_the_edge_of_a_square_alone_is_not_a_line(name: str) -> None:
     """Beside the track, along the border between black and white."""
     floor = DrawnFloor("sss")
     assert not look(name, floor, DrawnPose(0.3, 1.0, 0.0)).seen
@@ -143,7 +143,7 @@ def test_the_edge_of_a_square_alone_is_no_line(name: str) -> None:
 
 @EVERY
 def test_the_line_before_decides_which_of_two_is_followed(name: str) -> None:
-    """Where one goes on from what was seen before and another lies aside, the first is taken."""
+    """Of two lines, the one that continues the last sight is taken."""
     floor = DrawnFloor("SSS")
     pose = floor.at(0.5, 0.0, 0.0)
     image = PHOTOGRAPHER(floor, pose, np.random.default_rng(3))

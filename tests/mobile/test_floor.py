@@ -53,7 +53,7 @@ def test_both_ways_of_sampling_agree_where_the_image_shows_the_floor() -> None:
     assert np.abs(rows - points)[both].max() < 1.0
 
 
-def test_what_lies_out_of_the_image_is_no_number() -> None:
+def test_a_point_outside_the_image_gives_nan() -> None:
     image = np.zeros((VIEW.height, VIEW.width), dtype=np.uint8)
     grey = VIEW.sample(image, np.array([0.2, 0.6, 0.6]), np.array([0.0, 2.0, 0.0]))
     assert np.isnan(grey).tolist() == [True, True, False]

@@ -57,7 +57,7 @@ def test_the_end_is_recognised_and_placed(
 
 
 @pytest.mark.parametrize("elements", ["SSS", "SLRS", "SRLLS"])
-def test_a_track_that_goes_on_has_no_end(elements: str) -> None:
+def test_a_track_that_continues_has_no_end(elements: str) -> None:
     length = sum(2.0 if e == "S" else math.pi / 2 for e in elements)
     assert drive(DrawnFloor(elements), 0.3, length - 1.6, 0.06) == []
 
@@ -73,7 +73,7 @@ def test_one_image_is_not_believed() -> None:
     ]
 
 
-def test_a_line_that_vanishes_is_looked_for_anew_after_three_images() -> None:
+def test_a_line_that_vanishes_is_searched_again_after_three_images() -> None:
     floor, random = DrawnFloor("SSS"), np.random.default_rng(0)
     watcher = LineWatcher(WATCH, detect_edges)
     blank = np.full((120, 160), 90, dtype=np.uint8)

@@ -73,7 +73,7 @@ def test_each_end_of_a_stretch_was_a_choice_by_a_variable(usual: dict[str, Any])
     assert places.count("stop_at_t") == 1 and places.count("watch_track") == 3
 
 
-def test_a_drive_that_fails_is_reset_and_the_run_goes_on() -> None:
+def test_a_drive_that_fails_is_reset_and_the_run_continues() -> None:
     result = run(20501, "plain", faults={"kind": "drive_fault", "joint": 1, "after": 4.0})
     assert result["struck"] and ("follow_track", "error", "drive_fault") in result["ends"]
     assert result["status"] == "success" and result["stopped_at_T"] and result["penalties"] == []

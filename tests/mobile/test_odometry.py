@@ -26,7 +26,7 @@ def test_an_arc_is_exact_in_however_many_steps(length: float, turn: float, steps
     assert odometry.way == pytest.approx(length)
 
 
-def test_turning_on_the_spot_is_no_way() -> None:
+def test_turning_on_the_spot_adds_no_distance() -> None:
     odometry = Odometry(0.4)
     odometry.add(0.0, -0.2, 0.2)
     assert odometry.pose == pytest.approx((0.0, 0.0, 1.0)) and odometry.way == 0.0

@@ -28,8 +28,8 @@ def play(
     happening: Callable[[float], None] | None = None,
     **arguments: Any,
 ) -> Rehearsal:
-    """Rehearse an action in the yard, whose clock goes on from one to the next; `happening` is told
-    each tick."""
+    """Rehearse an action in the yard, whose clock continues from one to the next; `happening` is
+    called each tick."""
     begun = yard.ports.now
 
     def world(now: float) -> None:
@@ -103,7 +103,7 @@ def test_following_comes_to_the_end_and_stays_on_the_line(
     )
 
 
-def test_the_t_is_told_from_an_interruption_and_stopped_at() -> None:
+def test_the_t_is_distinguished_from_an_interruption_and_stopped_at() -> None:
     floor = DrawnFloor("SS", bar=True)
     yard = enabled(Yard(floor, START))
     followed = play(yard, driving.follow_feed_forward).result
@@ -171,7 +171,7 @@ def blindly_on(yard: Yard, end: Odo, ahead: float) -> None:
     assert yard.body.standing and yard.rover.state()["sights"] == 0
 
 
-def test_a_rover_that_stands_beyond_the_gap_goes_on_and_not_back() -> None:
+def test_a_rover_that_stands_beyond_the_gap_drives_on_and_not_back() -> None:
     """It stands where a first attempt has ended: nearer to where the track resumes than where a
     search goes to look."""
     yard, followed = gap_yard("s", reflector=False)
@@ -188,7 +188,7 @@ def test_a_rover_that_stands_beyond_the_gap_goes_on_and_not_back() -> None:
 
 
 def test_a_line_seen_in_passing_is_not_regained_by_turning_away_from_it() -> None:
-    """The sights of a turn on the spot make nobody follow what then lies behind."""
+    """What is seen during a turn on the spot is not followed when it lies behind."""
     yard, followed = gap_yard("s", reflector=False)
     end = Odo(*followed.values["line_end"])
     blindly_on(yard, end, 1.0)
@@ -244,7 +244,7 @@ def test_a_drive_fault_ends_the_run_and_a_reset_mends_it() -> None:
     assert yard.body.standing
     enabled(yard)
     assert play(yard, driving.follow_feed_forward).result.values["at_t"] is False, (
-        "it goes on where it was"
+        "it resumes where it was"
     )
 
 
@@ -275,7 +275,7 @@ def test_a_silent_action_does_not_drive_on() -> None:
     assert (state["mode"], state["reason"]) == ("rest", "silent_action") and yard.body.standing
 
 
-def test_a_pause_holds_and_goes_on() -> None:
+def test_a_pause_holds_and_then_the_motion_resumes() -> None:
     yard = enabled(Yard(DrawnFloor("SSSSS"), START))
     yard.rover.command(yard.ports.now, {"do": "follow", "speed": 0.5})
     yard.run(0.3)

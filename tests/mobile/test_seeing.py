@@ -113,7 +113,7 @@ def test_a_line_that_vanishes_without_an_end_is_lost() -> None:
     assert (played.result.status, played.result.cause) == ("error", "no_line")
 
 
-def test_a_camera_that_goes_dark_is_an_error_and_is_started_anew() -> None:
+def test_a_camera_that_goes_dark_is_an_error_and_is_started_again() -> None:
     drive = CarriedCamera(DrawnFloor("SSS"), 0.3, 0.1, dark=0.5)
     played = drive.play(seeing.watch_edges)
     assert (played.result.status, played.result.cause) == ("error", "no_image")

@@ -55,7 +55,7 @@ def without(node: int, *bases: int) -> Callable[[Frame], bool]:
     return lambda frame: frame.id not in {base + node for base in bases}
 
 
-def test_a_sensor_that_never_answers_keeps_nobody_from_driving() -> None:
+def test_a_sensor_that_never_answers_does_not_prevent_driving() -> None:
     bench = WheelBench()
     bench.passes = lambda frame: frame.id & 0x7F != SENSOR
     bench.enabled()
@@ -98,7 +98,7 @@ def test_silence_of_one_drive_stops_both(base: int, text: str) -> None:
     bench.enabled()
 
 
-def test_an_emergency_is_told_with_its_wheel_and_its_code() -> None:
+def test_an_emergency_is_reported_with_its_wheel_and_its_code() -> None:
     bench = WheelBench().enabled()
     bench.master.receive(bench.now, emergency(LEFT, DriveFault.OVERCURRENT, 0x03))
     (trouble,) = bench.master.troubles
@@ -106,10 +106,10 @@ def test_an_emergency_is_told_with_its_wheel_and_its_code() -> None:
     assert bench.master.wheel(trouble) == "left wheel"
     bench.master.receive(bench.now, Frame(EMCY_BASE + LEFT, b"\0"))
     bench.master.receive(bench.now, Frame(TPDO1_BASE + LEFT, b"\0"))
-    assert len(bench.master.troubles) == 1, "malformed frames are nobody's"
+    assert len(bench.master.troubles) == 1, "malformed frames belong to no wheel"
 
 
-def test_a_restarted_sensor_is_no_trouble_and_a_restarted_drive_is() -> None:
+def test_a_restarted_drive_is_a_trouble_and_a_restarted_sensor_is_not() -> None:
     bench = WheelBench().enabled()
     bench.master.receive(bench.now, Frame(HEARTBEAT_BASE + SENSOR, b"\0"))
     told = [trouble.text for trouble in bench.master.troubles]

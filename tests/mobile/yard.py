@@ -93,7 +93,8 @@ class Yard:
         self.floor, self.reflectors = floor, reflectors
         random = np.random.default_rng(seed)
         self.body = Body(truth.rover, random)
-        self.body.place(truth.rover, (begin.x, begin.y, begin.heading), random)  # type: ignore[arg-type]
+        start = begin.x, begin.y, begin.heading
+        self.body.place(truth.rover, start, random)  # type: ignore[arg-type]
         self._sensor = truth.sensor
         self.bus = YardBus(RoverBus(self.body, ReflectorSensor(self._echoes)))
         self._random = np.random.default_rng(seed + 1)
@@ -119,7 +120,7 @@ class Yard:
                 self.ports.receiver.take(self._sight().values())
 
     def run(self, seconds: float) -> None:
-        """Let time pass with nobody acting."""
+        """Let time pass without any action."""
         for tick in range(round(seconds / TICK)):
             now = self.ports.now + TICK
             self.world(now)

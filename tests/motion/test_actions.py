@@ -22,8 +22,8 @@ class PredictedBall:
     """A ball that leaves the edge `leaves` seconds from the start, as vision would predict it 50
     times a second from `seen` on.
 
-    Predictions go on until `until` (s after the start, default: when the ball has fallen). The ball
-    lies in the cup from its arrival on if it is to be `caught`.
+    Predictions continue until `until` (s after the start, default: when the ball has fallen). The
+    ball lies in the cup from its arrival on if it is to be `caught`.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ def test_intercept_is_in_place_before_the_ball(play: Any, action: Callable[..., 
     assert result.status is Status.SUCCESS
     assert result.values["slack"] > 0.2
     assert result.values["point"][1] == pytest.approx(0.15, abs=0.002)
-    assert play.device.state["mode"] == "follow", "following goes on"
+    assert play.device.state["mode"] == "follow", "following continues"
     assert play.device.state["in_place"]
 
 
@@ -74,7 +74,7 @@ def test_intercept_waits_for_a_good_prediction(play: Any) -> None:
     assert result.values["slack"] < 0.1
 
 
-def test_intercept_that_comes_late_is_a_failure_and_goes_on(play: Any) -> None:
+def test_an_interception_that_is_late_is_a_failure_and_keeps_following(play: Any) -> None:
     result = play.play(actions.intercept_tilted(play), PredictedBall(leaves=0.3, y=0.3, seen=0.25))
     assert (result.status, result.cause) == (Status.FAILURE, "late")
     assert play.device.state["mode"] == "follow"

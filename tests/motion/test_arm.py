@@ -63,7 +63,7 @@ def test_it_enables_itself_at_the_start_and_holds_where_it_is(make_rig: Any) -> 
     assert not any(rig.plant.braked)
 
 
-def test_it_stays_off_when_told_so(make_rig: Any) -> None:
+def test_it_stays_off_when_configured_so(make_rig: Any) -> None:
     rig = make_rig(config={"enable": False})
     assert rig.run(1.0, lambda: rig.arm.state()["phase"] == "running")
     rig.run(0.2)
@@ -176,7 +176,7 @@ def test_it_holds_within_three_periods_of_the_stream(rig: Any) -> None:
     assert not state["in_place"]
     _check_limits(rig)
     _follow(rig, 0.8, y=0.3)
-    assert rig.arm.state()["in_place"], "it goes on when set points come again"
+    assert rig.arm.state()["in_place"], "it resumes when set points come again"
 
 
 @pytest.mark.parametrize("y", [-0.3, 0.3])
@@ -436,11 +436,11 @@ def test_an_arm_that_slows_down_in_mid_motion_is_followed_by_its_commands(
     assert np.max(speeds / ARM.speed) > 0.9, "it knows that the arm is fast again"
 
 
-def test_a_ball_in_the_cup_is_told_once_when_it_has_come_to_stay(rig: Any) -> None:
+def test_a_ball_in_the_cup_is_reported_once_when_it_stays(rig: Any) -> None:
     rig.drives.ball(True)
     rig.run(0.2)
     assert rig.arm.state()["ball_in_cup"]
-    assert rig.events == [], "nobody waits for a ball"
+    assert rig.events == [], "no action waits for a ball"
     rig.drives.ball(False)
     _follow(rig, 0.2)
     rig.drives.ball(True)

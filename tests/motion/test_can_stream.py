@@ -116,7 +116,9 @@ def test_back_to_back(pair: tuple[can.BusABC, can.BusABC], message: can.Message)
         assert sender.recv(timeout=0.0) is None, "a port does not hear itself"
 
 
-def test_many_frames_arrive_in_order_and_none_is_lost(pair: tuple[can.BusABC, can.BusABC]) -> None:
+def test_many_frames_arrive_in_order_and_no_frame_is_lost(
+    pair: tuple[can.BusABC, can.BusABC],
+) -> None:
     sender, receiver = pair
     for number in range(2000):
         sender.send(

@@ -36,7 +36,7 @@ PATIENCE = 10.0
 
 
 class LiveDrives:
-    """Our drives on a hub, kept going by a thread; simulated time goes on with the wall's."""
+    """Our drives on a hub, run by a thread; simulated time follows the wall clock."""
 
     def __init__(self, plant: Any, table: Any) -> None:
         self.hub = CanHub()

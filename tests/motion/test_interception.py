@@ -162,7 +162,7 @@ def test_a_set_point_gets_older_while_it_lies() -> None:
         [0.5, 0.62, 0.1, 0.62, -1.0, 0.0, 0.0, -0.003, 0.01],
     ],
 )
-def test_what_is_no_catch_point_is_refused(values: list[float]) -> None:
+def test_malformed_catch_points_are_refused(values: list[float]) -> None:
     with pytest.raises(ValueError, match="catch point: expected"):
         Prediction.parse(values)
 

@@ -182,7 +182,7 @@ class CatchingBench(LaboratoryBench):
         self.wait(self.master.move(self.now, goal) + 0.1)
 
     def catch_one(self) -> dict[str, Any]:
-        """One whole cycle of a clairvoyant catcher: it is told where the oracle would catch. Gives
+        """One whole cycle of a clairvoyant catcher, which knows where the oracle would catch. Gives
         the throw's row."""
         lab = self.lab
         count = len(lab.referee.score(self.now)["throws"])

@@ -105,7 +105,7 @@ class CycleBench:
         assert not client.failure
 
     def cycle(self, word: int, odd: int | None, asks: bool) -> None:
-        """A cycle with this controlword (the `odd` drive gets another one); perhaps somebody reads
+        """A cycle with this controlword (the `odd` drive gets another one); perhaps a client reads
         objects behind it."""
         frames = [
             Frame(

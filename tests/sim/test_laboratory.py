@@ -32,8 +32,8 @@ Digests = Callable[..., list[str]]
 def test_the_oracles_poses_do_catch_in_the_whole_cell(
     bench: Benches, site: Site, regime: str
 ) -> None:
-    """Drives, arm, cup and ball together: whoever knows the oracle's pose catches what it calls
-    reachable."""
+    """Drives, arm, cup and ball together: a catcher that knows the oracle's pose catches what it
+    calls reachable."""
     here = bench(seed=11, regime=regime)
     here.enable()
     here.want_images(0.001)

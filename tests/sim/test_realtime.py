@@ -209,7 +209,7 @@ def test_two_buses_or_cameras_are_one_too_many(tmp_path: Path, extra: str, says:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("taken", ["node", "bus", "camera"])
-def test_an_address_that_is_taken_is_told_by_file_address_and_remedy(
+def test_an_address_in_use_is_reported_with_file_address_and_remedy(
     tmp_path: Path, taken: str
 ) -> None:
     """A second laboratory would meet all three."""

@@ -122,7 +122,7 @@ class CameraBench:
     latency: float = 0.012
     light: Callable[[float], float] = lambda time: 1.0
     gone_after: float = float("inf")
-    """s after the release: somebody takes the ball away."""
+    """s after the release at which the ball is taken away."""
     dead_from: float = float("inf")
     """s: the camera dies."""
     arm: tuple[Array, Sequence[float]] | None = None
@@ -222,7 +222,7 @@ class BenchContext:
         raise AssertionError("vision raises no events")
 
     def verdict(self, run: str, status: Status, cause: str = "", text: str = "") -> None:
-        raise AssertionError("vision judges nobody")
+        raise AssertionError("vision judges no result")
 
     def progress(self, fraction: float, **data: Any) -> None:
         assert 0.0 <= fraction <= 1.0
@@ -230,7 +230,7 @@ class BenchContext:
     async def call(
         self, service: str, /, deadline: float | None = None, **arguments: Any
     ) -> Result:
-        raise AssertionError("vision calls nobody")
+        raise AssertionError("vision calls no service")
 
     async def get(self, name: str) -> Any:
         raise AssertionError("vision reads no variables")
@@ -267,4 +267,4 @@ def run_action(
         result: Result = done.value
         return result
     action.close()
-    raise AssertionError(f"the action still goes on after {limit} s")
+    raise AssertionError(f"the action is still active after {limit} s")

@@ -27,7 +27,7 @@ def pinhole(cell: dict[str, Any]) -> PinholeCamera:
 
 @pytest.fixture
 def bench(pinhole: PinholeCamera) -> CameraBench:
-    """A bench whose noise begins anew."""
+    """A bench whose noise restarts."""
     pinhole.reseed(np.random.default_rng(11))
     return CameraBench(pinhole)
 

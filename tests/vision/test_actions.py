@@ -121,7 +121,7 @@ def test_late_images_of_a_fast_ball_are_a_failure_not_an_error(context: BenchCon
     assert "exit" in tracked.values
 
 
-def test_between_images_the_stream_goes_on_with_fresh_times(context: BenchContext) -> None:
+def test_between_images_the_stream_continues_with_fresh_times(context: BenchContext) -> None:
     """When images fail to come for a moment, set points still do, and their time to go runs
     down."""
     bench = context.bench
@@ -169,7 +169,7 @@ def test_camera_that_dies_while_tracking(context: BenchContext) -> None:
         context.bench, actions.predict_kalman(context, ball=located.values["ball"])
     )
     assert (tracked.status, tracked.cause) == (Status.ERROR, "no_image")
-    assert context.published[-1][1] is None, "withdrawn: nobody stands by it"
+    assert context.published[-1][1] is None, "withdrawn: no action publishes it"
     assert context.device.stopped()
 
 
@@ -214,7 +214,7 @@ def test_arm_and_cup_at_the_edge_do_not_lose_the_ball(context: BenchContext) -> 
     assert max(abs(late) for before, late, _, _ in streamed(context) if before < 0.4) < 0.008
 
 
-def test_someone_reaching_over_the_table_is_no_ball(context: BenchContext) -> None:
+def test_a_person_reaching_over_the_table_is_not_a_ball(context: BenchContext) -> None:
     """An arm that sweeps over the table towards the near edge while there is no ball."""
     bench = context.bench
     advance = bench.advance
@@ -307,7 +307,7 @@ def test_cancel_ends_the_images(context: BenchContext, stage: str) -> None:
     assert stage == "locate" or context.published[-1][1] is None
 
 
-def test_tracker_goes_on_from_ages_when_the_image_is_not_remembered(context: BenchContext) -> None:
+def test_tracker_starts_from_ages_when_the_image_is_not_remembered(context: BenchContext) -> None:
     """Another process of the camera: sequence numbers mean nothing to it, ages do."""
     context.bench.ball = RolledBall((2.12, 0.0), (0.62, 0.1), 1.2)
     located = run_action(context.bench, actions.locate_background(context))
@@ -330,7 +330,7 @@ def test_tracker_goes_on_from_ages_when_the_image_is_not_remembered(context: Ben
         {"sequence": 1, "age": None, "sigma": 0.001, "places": [[0.0, 2.0, 0.0]] * 3},
     ],
 )
-def test_a_ball_that_is_none_is_refused(context: BenchContext, ball: Mapping[str, Any]) -> None:
+def test_malformed_ball_data_is_refused(context: BenchContext, ball: Mapping[str, Any]) -> None:
     tracked = run_action(context.bench, actions.predict_least_squares(context, ball=ball))
     assert (tracked.status, tracked.cause) == (Status.ERROR, "bad_ball")
     assert not [values for _, values in context.published if values]

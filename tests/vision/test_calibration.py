@@ -50,7 +50,7 @@ def table_error(found: Optics, camera: PinholeCamera | Optics) -> Array:
 def folder(
     cell: dict[str, Any], pinhole: PinholeCamera, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """Board images of the simulated camera, as somebody would take them."""
+    """Board images of the simulated camera, as an operator would take them."""
     pinhole.reseed(np.random.default_rng(21))
     place = tmp_path_factory.mktemp("views")
     save_board_views(place, cell, pinhole, np.random.default_rng(22))

@@ -64,7 +64,7 @@ def test_duties_towards_the_node(context: BenchContext) -> None:
     assert camera.stopped() and camera.hold(0.0) == "held"
     assert camera.start()
     assert not camera.stopped() and camera.hold(0.0) == "cannot hold"
-    assert not camera.start(), "goes on at that rate already"
+    assert not camera.start(), "images already arrive at that rate"
     assert camera.start(25.0) and camera.rate == 25.0
     camera.step(0.0)
     camera.release(0.0)
@@ -106,7 +106,7 @@ def test_detectors_are_made_once(context: BenchContext) -> None:
     assert camera.detector("threshold", lambda: FixedThreshold(camera.view)) is first
 
 
-def test_a_source_that_cannot_be_opened_is_no_image(context: BenchContext) -> None:
+def test_a_source_that_cannot_be_opened_is_the_error_no_image(context: BenchContext) -> None:
     from petrobot.services.vision import actions
 
     class Unplugged:

@@ -79,7 +79,7 @@ def test_scattered_candidates_are_no_ball() -> None:
 
 
 @pytest.mark.parametrize("velocity", [(1.5, 0.0), (0.0, 1.0), (-0.1, 0.0), (-6.0, 0.0)])
-def test_what_does_not_roll_towards_the_edge_is_no_ball(velocity: tuple[float, float]) -> None:
+def test_what_does_not_roll_towards_the_edge_is_not_a_ball(velocity: tuple[float, float]) -> None:
     places = [[(1.4 + velocity[0] * 0.02 * k, velocity[1] * 0.02 * k)] for k in range(8)]
     assert not any(follow(Confirmation(4), places))
 

@@ -284,7 +284,7 @@ def test_background_keeps_no_ghost_of_a_passing_ball(
     assert background.known and background.images == 45
 
 
-def test_background_begins_anew_with_another_image_size() -> None:
+def test_background_restarts_with_another_image_size() -> None:
     background = Background(first=2)
     background.learn(np.full((4, 4), 100, np.uint8))
     background.learn(np.full((6, 4), 50, np.uint8))

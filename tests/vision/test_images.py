@@ -129,7 +129,7 @@ def test_images_flow_at_the_asked_rate_and_stop(
 def test_newest_wins_and_no_one_waits_for_a_slow_receiver(
     server: ImageServer, receiver: StreamImages
 ) -> None:
-    """A receiver that does not read misses images; the camera goes on at once and memory does not
+    """A receiver that does not read misses images; the camera continues at once and memory does not
     grow."""
     receiver.start(50.0)
     until(lambda: server.rate > 0.0, server.poll, receiver.newest)
@@ -238,7 +238,7 @@ def test_a_file_is_paced_by_the_clock(film: Path) -> None:
     clock = [100.0]
     images: ImageSource = CaptureImages(str(film), lambda: clock[0])
     assert images.newest() is None
-    for _ in range(2):  # a second start begins anew
+    for _ in range(2):  # a second start begins again
         images.start(25.0)
         begin = clock[0]
         first = images.newest()

@@ -101,7 +101,7 @@ def test_more_effort_is_more_accurate(regime: str) -> None:
     ("name", "least", "most"), [("least_squares", 0.4, 1.4), ("kalman", 0.25, 2.4)]
 )
 @pytest.mark.parametrize("count", [6, 10, 20])
-def test_stated_uncertainty_is_honest(name: str, least: float, most: float, count: int) -> None:
+def test_stated_uncertainty_is_correct(name: str, least: float, most: float, count: int) -> None:
     """A predictor's own sigma of the time covers its errors without being idle, in slow and fast
     regimes."""
     for regime in ("A", "C"):

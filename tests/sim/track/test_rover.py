@@ -40,7 +40,10 @@ IDEAL = RoverTruth(
 )
 
 
-def rover(pose: FloorPose = FloorPose(0.0, 0.0, 0.0), seed: int = 1, **changes: Any) -> RoverBody:  # noqa: B008
+ORIGIN = FloorPose(0.0, 0.0, 0.0)
+
+
+def rover(pose: FloorPose = ORIGIN, seed: int = 1, **changes: Any) -> RoverBody:
     rng = np.random.default_rng(seed)
     made = RoverBody(replace(IDEAL, **changes), rng)
     made.place(made.truth, pose, rng)

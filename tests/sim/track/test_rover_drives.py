@@ -51,7 +51,7 @@ def write(bench: Any, node: int, index: int, value: bytes) -> None:
 # Set points
 
 
-def test_wheels_turn_as_they_are_told_within_their_slope_and_lag(rover_bench: Bench) -> None:
+def test_wheels_follow_their_set_points_within_slope_and_lag(rover_bench: Bench) -> None:
     bench = rover_bench(regime="plain")
     bench.enable()
     bench.drive(0.5, 0.0)
@@ -95,7 +95,7 @@ def test_positions_wrap_at_32_bits(rover_bench: Bench) -> None:
     assert bench.master.positions[0] == pytest.approx(wheel.angle * 1e6 - 2**32, abs=2e5)
 
 
-def test_a_set_point_beyond_the_battery_is_cut_and_told(rover_bench: Bench) -> None:
+def test_a_set_point_beyond_the_battery_is_cut_and_reported(rover_bench: Bench) -> None:
     bench = rover_bench(regime="plain+sag")
     bench.enable()
     bench.drive(1.2, 0.0)
@@ -222,7 +222,7 @@ def test_a_tpdo_carries_the_two_nearest_echoes() -> None:
 
 
 class LiveRover:
-    """Our drives on a hub, kept going by a thread; simulated time goes on with the wall's."""
+    """Our drives on a hub, run by a thread; simulated time follows the wall clock."""
 
     def __init__(self, site: TrackSite) -> None:
         truth = site.truth("plain")

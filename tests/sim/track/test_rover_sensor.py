@@ -101,7 +101,7 @@ def test_noise_offsets_and_rounding() -> None:
     assert np.abs(bearings / 0.0005 - np.round(bearings / 0.0005)).max() < 1e-6
 
 
-def test_misses_and_false_returns_come_as_often_as_told() -> None:
+def test_misses_and_false_returns_have_the_given_rates() -> None:
     draws = rng()
     missing = replace(PERFECT, miss=0.4)
     seen = sum(

@@ -138,7 +138,7 @@ def test_the_competition_like_track_is_valid_and_has_everything() -> None:
         (lambda: Track.by_seed(1, 8, 5), "fewer"),
     ],
 )
-def test_what_is_no_track_is_refused(make: object, text: str) -> None:
+def test_an_invalid_track_is_refused(make: object, text: str) -> None:
     assert callable(make)
     with pytest.raises(TrackError) as refusal:
         make()
@@ -175,7 +175,7 @@ def test_no_point_of_the_line_is_nearer_than_the_nearest(track: Track, x: float,
     assert near.distance <= math.hypot(ends.x - x, ends.y - y) + 1e-9
 
 
-def test_the_line_goes_on_straight_before_the_start_and_after_the_end() -> None:
+def test_the_line_continues_straight_before_the_start_and_after_the_end() -> None:
     element = Element(ElementKind.LEFT, (0, 0), 0, 0.0)
     assert element.at(-0.5) == pytest.approx((-0.5, 1.0, 0.0))
     assert element.at(math.pi / 2 + 0.5) == pytest.approx((1.0, 2.5, math.pi / 2))

@@ -67,7 +67,7 @@ def test_a_new_experiment_puts_the_rover_back_and_keeps_the_drives(rover_bench: 
     assert (score["time_s"], score["reached_m"], score["regime"]) == (0.0, 0.0, "arcs+slip")
 
 
-def test_the_reflectors_in_view_are_told(rover_bench: Bench) -> None:
+def test_the_reflectors_in_view_are_reported(rover_bench: Bench) -> None:
     bench = rover_bench()
     bench.call("laboratory_prepare", seed=7, regime="straight", elements=10, interruptions=1)
     bench.enable()

@@ -58,7 +58,7 @@ def test_the_plan_shows_track_reflectors_path_and_penalties(score: dict[str, Any
     assert summary(score) in "".join(element.text or "" for element in root.iter(f"{SVG}text"))
 
 
-def test_two_runs_are_told_apart_and_names_are_escaped(score: dict[str, Any]) -> None:
+def test_two_runs_are_distinguished_and_names_are_escaped(score: dict[str, Any]) -> None:
     root = ElementTree.fromstring(floor_plan([score, score], ["homing & more", "<search>"]))
     texts = [element.text or "" for element in root.iter(f"{SVG}text")]
     assert [text.partition(":")[0] for text in texts] == ["homing & more", "<search>"]

@@ -149,7 +149,7 @@ def test_what_makes_no_laboratory_is_refused(
 
 
 @pytest.mark.processes
-def test_as_a_process_it_serves_until_told_to_end(tmp_path: Path) -> None:
+def test_as_a_process_it_serves_until_sigterm(tmp_path: Path) -> None:
     file = services_file(tmp_path)
     directory = load(file)
     process = program("--services", str(file))

@@ -148,7 +148,7 @@ def test_where_it_must_stop(
     )
 
 
-def test_a_run_that_is_over_while_it_still_goes_on_has_not_stopped() -> None:
+def test_a_run_scored_while_the_rover_still_moves_has_not_stopped() -> None:
     referee, now = ride([(0.0, 7.0), (13.9, 7.0)], stand=0.2)
     score = referee.score(now)
     assert score["finished"]
@@ -193,7 +193,7 @@ def test_the_path_is_thinned_out(rover_bench: Callable[..., Any]) -> None:
     assert path[-1][1] == pytest.approx(5.0, abs=0.1)
 
 
-def test_another_part_of_the_track_is_no_short_cut() -> None:
+def test_another_part_of_the_track_is_not_a_short_cut() -> None:
     """Where two parts run 2 m apart, crossing over to the later one skips what lies between."""
     track = Track.of((1, 1), 0, "SSSSLLSSSS", (3,))
     referee, now = ride([(2.0, 3.0), (5.0, 3.0), (5.0, 5.0), (3.0, 5.0)], track)
