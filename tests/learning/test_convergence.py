@@ -14,17 +14,17 @@ import pytest
 from petrobot.coordinator.learning.batch import Response
 from petrobot.coordinator.learning.rules import NikolicFu, Rule, Tracking
 from petrobot.coordinator.learning.selectors import RULES
-from tests.learning.worlds import Played, World, gapped, play
+from tests.learning.worlds import BanditWorld, PlayedTrials, gapped, play
 
 SEEDS = 1000
 
 
-def free(gap: float, best: float = 0.9) -> World:
+def free(gap: float, best: float = 0.9) -> BanditWorld:
     """Reliability alone counts."""
     return replace(gapped(gap, best), cost=(0.0,) * 4)
 
 
-def converged(rule: Rule, world: World, trials: int = 500, seeds: int = SEEDS) -> float:
+def converged(rule: Rule, world: BanditWorld, trials: int = 500, seeds: int = SEEDS) -> float:
     """Share of seeds with p >= 0.95 on the optimum."""
     played = play(rule, world, trials, seeds, np.random.default_rng(1))
     return float(np.mean(played.p_best[-1] >= 0.95))
@@ -40,7 +40,7 @@ def test_the_fast_variant_finds_the_optimum_in_500_trials(gap: float, best: floa
 
 def test_costs_with_scatter_are_found_too() -> None:
     """J differs by cost alone (gap 0.25), each run's cost scatters by 32 %."""
-    world = World("costs", (0.9,) * 4, (4.0, 4.0, 4.0, 3.0))
+    world = BanditWorld("costs", (0.9,) * 4, (4.0, 4.0, 4.0, 3.0))
     assert converged(RULES["nikolic_fu_fast"](), world) >= 0.99
 
 
@@ -98,9 +98,9 @@ def test_equal_actions_cost_no_regret(name: str) -> None:
     assert np.all(played.optimal == 1.0)
 
 
-def changing(rule: Rule) -> Played:
+def changing(rule: Rule) -> PlayedTrials:
     """The best and the worst action change places after 1,000 of 2,000 trials."""
-    world = World("changing", (0.5, 0.5, 0.5, 0.9), (0.0,) * 4, 1000, (0.9, 0.5, 0.5, 0.5))
+    world = BanditWorld("changing", (0.5, 0.5, 0.5, 0.9), (0.0,) * 4, 1000, (0.9, 0.5, 0.5, 0.5))
     return play(rule, world, 2000, 300, np.random.default_rng(3), (1000, 2000))
 
 
@@ -126,7 +126,7 @@ def test_tracking_follows_a_small_move_late_in_its_life() -> None:
     Without the floor the gain is 1 / 4000^0.7 = 0.003 by then, and p of the new best action is 0.76
     instead of 0.96.
     """
-    world = World("drifting", (0.85, 0.72), (0.0, 0.0), 4000, (0.72, 0.85))
+    world = BanditWorld("drifting", (0.85, 0.72), (0.0, 0.0), 4000, (0.72, 0.85))
     played = play(Tracking(), world, 4600, 100, np.random.default_rng(5))
     assert played.p_best[0].mean() > 0.9
 

@@ -13,7 +13,7 @@ from petrobot.coordinator.learning.rules import Rule
 
 
 @dataclass(frozen=True)
-class World:
+class BanditWorld:
     """Reliability and mean cost of each action; from `change` on (trials) those of `later`."""
 
     name: str
@@ -27,7 +27,7 @@ class World:
         """Actions."""
         return len(self.reliability)
 
-    def at(self, trial: int) -> World:
+    def at(self, trial: int) -> BanditWorld:
         """The world at a trial (from 0), without its future."""
         if self.change is None or trial < self.change:
             return replace(self, change=None)
@@ -46,13 +46,13 @@ class World:
         return float(low[1] - low[0])
 
 
-def gapped(gap: float, best: float = 0.9, n: int = 4) -> World:
+def gapped(gap: float, best: float = 0.9, n: int = 4) -> BanditWorld:
     """One action of reliability `best`, all others `gap` worse; equal costs."""
-    return World(f"gap {gap:g}", (best - gap, *([best - gap] * (n - 2)), best), (1.0,) * n)
+    return BanditWorld(f"gap {gap:g}", (best - gap, *([best - gap] * (n - 2)), best), (1.0,) * n)
 
 
 @dataclass
-class Played:
+class PlayedTrials:
     """What came of it: arrays over seeds (rows)."""
 
     batch: Batch
@@ -70,13 +70,13 @@ class Played:
 
 def play(
     rule: Rule,
-    world: World,
+    world: BanditWorld,
     trials: int,
     seeds: int,
     rng: np.random.Generator,
     checkpoints: Sequence[int] = (),
     watch: Callable[[int, Batch, Index], None] | None = None,
-) -> Played:
+) -> PlayedTrials:
     """Play a rule in `seeds` copies of a world; each row has uniform numbers of its own."""
     batch, n = rule.begin(seeds, world.n), world.n
     offered = np.ones((seeds, n), dtype=bool)
@@ -101,4 +101,4 @@ def play(
             p_best.append(batch.p[:, j <= j.min() + 1e-12].sum(axis=1))
             shares.append(recent[: t + 1].mean(axis=0))
     optimal = recent[: min(trials, 100)].mean(axis=0)
-    return Played(batch, np.array(regret), optimal, np.array(p_best), np.array(shares), marks)
+    return PlayedTrials(batch, np.array(regret), optimal, np.array(p_best), np.array(shares), marks)

@@ -1,14 +1,13 @@
-"""Speed of the analysis beside other tools, in one run: states/s, firings/s, GSPN solve and
-completion times, with memory.
+"""Compare the speed of the analysis with other tools in one run: states/s, firings/s, times of GSPN
+solution and completion, and memory.
 
-    python -m tools.bench.analysis            # all of it; tools that are not installed are named
-                                              and skipped
-    python -m tools.bench.analysis --quick    # small nets only
-    python -m tools.bench.analysis --write docs/figures-analysis.md    # the table as a page, too
+    python -m tools.bench.analysis            everything; tools that are not installed are named
+    python -m tools.bench.analysis --quick    small nets only
+    python -m tools.bench.analysis --write docs/figures-analysis.md    also write the table as a page
 
-Every measurement runs in a process of its own, so that its peak memory is its own; seconds are CPU
-seconds without imports and compilation. Only figures of one run are comparable: the ratios say how
-many times longer the other tool takes.
+Every measurement runs in a process of its own, so its peak memory is its own. Seconds are CPU
+seconds without imports and compilation. Only figures of the same run are comparable: the ratios say
+how many times longer the other tool takes.
 """
 
 from __future__ import annotations

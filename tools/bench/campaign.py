@@ -1,8 +1,9 @@
-"""What a campaign adds to its cells: CPU seconds a trial in a block and in a bare lock-step cell of
-the same seeds, in turn.
+"""Measure what a campaign adds to its cells: CPU seconds per trial in a block and in a bare
+lock-step cell with the same seeds, alternating.
 
-`python -m tools.bench.campaign [--trials N] [--rounds N]`; the first round of each warms caches and
-does not count.
+    python -m tools.bench.campaign [--trials N] [--rounds N]
+
+The first round of each fills caches and does not count.
 """
 
 from __future__ import annotations

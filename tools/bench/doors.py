@@ -1,12 +1,13 @@
-"""What attacks cost a node: its memory, and how long a good client's calls take meanwhile.
+"""Measure what attacks cost a node: its memory, and the duration of a good client's calls
+meanwhile.
 
     python tools/bench/doors.py
     python tools/bench/doors.py --json out.json
 
-The server is a process of its own, the attackers are others (for connections) or this one. *Grown*
-is by how much the server's largest resident set (VmHWM) exceeds that of its start. The good client
-calls every millisecond, from this process, which is also busy attacking: its times are upper
-bounds, and ratios to the calm row are what counts.
+The server is a process of its own; the attackers are other processes (for connections) or this one.
+*Grown*: the increase of the server's largest resident set (VmHWM) since its start. The good client
+calls every millisecond from this process, which is also busy attacking, so its times are upper
+bounds; only the ratios to the calm row matter.
 """
 
 from __future__ import annotations

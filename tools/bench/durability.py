@@ -1,13 +1,14 @@
-"""What the journal costs: a token in, an action started on another process, its result, a firing,
-the next start, over and over.
+"""Measure what the journal costs: a token in, an action started in another process, its result, a
+firing, the next start, again and again.
 
-    python tools/bench/durability.py                 # best on the disk that runs/ is on
+    python tools/bench/durability.py                    best on the disk that holds runs/
     python tools/bench/durability.py --rounds 5 --json out.json
 
-Contenders take turns in one run: the bare wire (one call after the other), the executor without a
-journal, with one that is flushed (actions without a device), with one that is synced at each start
-(an action with a device). Counts syncs per firing, and times a group of independent starts that
-share one sync. Ratios are what counts: microseconds are this machine's and this disk's.
+The contenders alternate within one run: the bare wire (one call after the other), the executor
+without a journal, with a journal that is flushed (actions without a device), and with one that is
+synced at each start (an action with a device). It also counts syncs per firing, and times a group
+of independent starts that share one sync. Only ratios matter: microseconds depend on machine and
+disk.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ def directory(folder: Path, lines: int, device: bool) -> Directory:
     return parse(text, path)
 
 
-class Bench:
+class JournalBench:
     """Everything that is measured, by name: us per token of each round."""
 
     def __init__(self, folder: Path, tokens: int) -> None:
@@ -163,9 +164,9 @@ class Bench:
         self.us.setdefault(name, []).append((time.perf_counter() - begun) / self._tokens * 1e6)
 
 
-async def measure(folder: Path, rounds: int, tokens: int) -> Bench:
+async def measure(folder: Path, rounds: int, tokens: int) -> JournalBench:
     """All contenders in turn, so that a busy machine is busy for all."""
-    bench = Bench(folder, tokens)
+    bench = JournalBench(folder, tokens)
     plain, held, group = (
         directory(folder / "a", 1, False),
         directory(folder / "b", 1, True),

@@ -1,16 +1,14 @@
-"""How long an emergency stop takes: from the order to the quick stop on the drives' bus, and the
-whole command beside it.
+"""Measure how long an emergency stop takes: from the order to the quick stop on the drives' bus,
+and for the whole command.
 
-    python tools/bench/estop.py                      # 200 stops over a warm connection, 20 whole
-                                                     commands python tools/bench/estop.py --stops 50
-                                                     --json out.json
+    python tools/bench/estop.py                     200 stops over an open connection, 20 commands
+    python tools/bench/estop.py --stops 50 --json out.json
 
 The simulated drives, the motion node and this bench are processes of their own, as in the cell.
-*Warm* is a client that is connected already, as the coordinator and the page's server are: from the
-moment the order is given to the moment a port on the bus hears the first controlword QUICK STOP.
-*Command* is `petrobot estop` from the start of its process: Python and its imports are in it.
-Before each stop the drives are enabled again by an action. The bus has cycles of 4 ms, so 2 ms are
-its own on average.
+*Warm*: the client is already connected, as the coordinator and the page's server are; the time is
+from the order until a port on the bus receives the first controlword QUICK STOP. *Command*:
+`petrobot estop` from the start of its process, including Python and its imports. Before each stop
+an action enables the drives again. The bus has cycles of 4 ms, which cost 2 ms on average.
 """
 
 from __future__ import annotations

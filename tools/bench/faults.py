@@ -1,19 +1,17 @@
-"""How long until a lost process is known: a node at its caller, the sender of a set-point stream at
-its receiver.
+"""Measure how long it takes until a lost process is noticed: a node by its caller, the sender of a
+set-point stream by its receiver.
 
-    python tools/bench/faults.py                       # 30 of each
+    python tools/bench/faults.py                      30 rounds of each
     python tools/bench/faults.py --rounds 5 --json out.json
-    python tools/bench/faults.py --busy --alarms 60    # both cores loaded; false alarms in 60 s,
-                                                       too
+    python tools/bench/faults.py --busy --alarms 60   both cores busy; also false alarms in 60 s
 
-Each round starts a process of its own, waits until it works, and kills it (kill -9), freezes it
-(SIGSTOP) or cuts the cable to it (no byte comes through and no word that it is over). A node is
-known to be lost when the caller is told (`PeerLost`), a stream when its receiver withdraws the last
-value; that one is given in periods of the stream. Its run has ended when the caller is given its
-one end, ERROR `lost`, executed = unknown. Floors: killed node 50 ms, its run 0.3 s; frozen or cut
-both 1.2 s; stream 3 periods and one look of the receiver's loop (the longest that it took in these
-rounds). A false alarm is a node that lives and is said to be lost: with `--alarms` four of them are
-watched, each with a run, in as many seconds.
+Each round starts a process, waits until it works, and kills it (kill -9), freezes it (SIGSTOP) or
+cuts its cable (no byte arrives, and no end of the connection). A node counts as noticed when the
+caller gets `PeerLost`, a stream when its receiver withdraws the last value (in periods of the
+stream), a run when the caller receives its end: ERROR `lost`, executed = unknown. Limits: killed
+node 50 ms, its run 0.3 s; frozen or cut: both 1.2 s; stream: 3 periods and one pass of the
+receiver's loop (the longest in these rounds). A false alarm is a living node that is reported lost:
+with `--alarms`, four nodes with one run each are watched for so many seconds.
 """
 
 from __future__ import annotations

@@ -1,22 +1,21 @@
-"""How much the operator's page costs: per painted update in the browser, and in the coordinator's
-own loop.
+"""Measure what the operator's page costs: per painted update in the browser, and in the
+coordinator's own loop.
 
     python tools/bench/hmi.py [--nodes 100 300] [--seconds 8] [--gate-cpu MS] [--json FILE]
 
-A synthetic net is fed 50 updates a second (a firing with its marking, progress of three runs, one
-variable) through the real feed and server. Measured: in headless Chromium the main thread's time
-for each painted update (Chromium's own `TaskDuration`), frames a second, gaps in the sequence, and
-the time from the change in the server to the painted frame; in the loop its own CPU time and how
-late its 50 Hz ticker came, without a client and with five in another process, one of which reads
-next to nothing. `--gate-cpu` makes the run fail when a painted update costs more, or when there was
-a gap.
+A synthetic net receives 50 updates per second (a firing with its marking, progress of three runs,
+one variable) through the real feed and server. Measured in headless Chromium: time of the main
+thread per painted update (Chromium's `TaskDuration`), frames per second, gaps in the sequence, and
+the time from the change in the server to the painted frame. Measured in the loop: its CPU time and
+how late its 50 Hz ticker was, without a client and with five in another process, one of which reads
+almost nothing. With `--gate-cpu` the run fails if a painted update costs more, or after a gap.
 
     python tools/bench/hmi.py --checks 300 [--rounds 3] [--seconds 8] [--json FILE]
 
-A real mission in real time over two nodes fires as fast as its actions of 10 ms allow, while an
-asker in another process gives commands and, in every second turn, a third process draws: three
-checks of a net of so many places at a time, without a pause. Told are firings a second and the
-commands' latency with and without the drawing, and the ratios of their medians.
+A real-time mission over two nodes fires as fast as its actions of 10 ms allow. Another process
+gives commands. In every second round, a third process draws: three checks at a time of a net with
+so many places, without a pause. Reported are firings per second and the latency of the commands
+with and without the drawing, and the ratios of their medians.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Times appends to the journal beside SQLite in WAL mode, in turn in one process; prints medians
-and 99 % quantiles."""
+"""Time appends to the journal and to SQLite in WAL mode, alternating in one process; print medians
+and 99 % quantiles.
+"""
 
 from __future__ import annotations
 

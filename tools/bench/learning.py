@@ -1,14 +1,14 @@
 """The convergence study of docs/learning.md: every selector in Bernoulli worlds with known J, 1,000
 seeds each.
 
-    python -m tools.bench.learning            the table, under three minutes of one core
-    python -m tools.bench.learning --write    put it into docs/learning.md and draw
+    python -m tools.bench.learning            the table, less than three minutes on one core
+    python -m tools.bench.learning --write    write it to docs/learning.md, and draw
                                               docs/pictures/learning-*.svg (needs matplotlib)
     python -m tools.bench.learning --long     also a million trials of the schemes of Nikolic and Fu
-                                              (ten minutes or so)
+                                              (about ten minutes)
 
-The worlds are played with the rules that mission runs use (tests/learning/test_selectors.py
-compares them bit by bit).
+The worlds use the same rules as mission runs (tests/learning/test_selectors.py compares them bit by
+bit).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from petrobot.coordinator.learning.batch import Array
 from petrobot.coordinator.learning.rules import NikolicFu, Rule
 from petrobot.coordinator.learning.selectors import RULES
-from tests.learning.worlds import Played, World, gapped, play
+from tests.learning.worlds import BanditWorld, PlayedTrials, gapped, play
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "learning.md"
@@ -36,7 +36,7 @@ LONG = sorted({int(x) for x in np.geomspace(10, 10**6, 26)})
 LONG_SEEDS = 16
 
 
-def free(gap: float, best: float = 0.9) -> World:
+def free(gap: float, best: float = 0.9) -> BanditWorld:
     """Reliability alone counts."""
     return replace(gapped(gap, best), cost=(0.0,) * 4)
 
@@ -45,9 +45,9 @@ WORLDS = {
     "easy": free(0.4),
     "middle": free(0.2),
     "hard": free(0.05),
-    "costs": World("costs", (0.95, 0.9, 0.85, 0.6), (4.0, 1.2, 2.0, 3.0)),
+    "costs": BanditWorld("costs", (0.95, 0.9, 0.85, 0.6), (4.0, 1.2, 2.0, 3.0)),
     "equal": free(0.0, 0.8),
-    "changing": World(
+    "changing": BanditWorld(
         "changing", (0.5, 0.5, 0.5, 0.9), (0.0,) * 4, TRIALS // 2, (0.9, 0.5, 0.5, 0.5)
     ),
 }
@@ -65,7 +65,7 @@ def rules() -> dict[str, Rule]:
     return {name: make() for name, make in RULES.items()} | NOTED | CONTROLS
 
 
-def at(played: Played, values: Array, trial: int) -> Array:
+def at(played: PlayedTrials, values: Array, trial: int) -> Array:
     """A figure of each seed after so many trials."""
     row: Array = values[list(played.checkpoints).index(trial)]
     return row
@@ -141,7 +141,7 @@ def _cell(figures: dict[str, Any]) -> str:
 # --- a million trials -------------------------------------------------------------------------
 
 
-def long_run(rule: Rule, world: World) -> dict[str, Any]:
+def long_run(rule: Rule, world: BanditWorld) -> dict[str, Any]:
     """1 - p* and the smallest number of tries of any action, by trial."""
     tries: list[float] = []
 

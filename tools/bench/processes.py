@@ -1,5 +1,6 @@
-"""Processes of a benchmark: started again from the same script, one core each end, and the
-quantiles of what they measured."""
+"""Processes of a benchmark: started from the same script, one core per process, and quantiles of
+what they measure.
+"""
 
 from __future__ import annotations
 

@@ -1,15 +1,16 @@
 """Repeat the tests that start processes while every core is busy, and report how often each failed.
 
     python -m tools.bench.under_load 20            all tests marked `processes`
-    python -m tools.bench.under_load 5 tests/cli   those of a folder (everything after the number is
-                                                   for pytest)
+    python -m tools.bench.under_load 5 tests/cli   those of a folder (further arguments go to
+                                                   pytest)
 
-Each round has one process of load a core beside it, and a limit. What pytest said is kept in
-reports/under_load. Exit code 1 if any test failed in any round, or a round reached its limit.
+Each round runs beside one busy process per core, and has a time limit. The output of pytest is kept
+in reports/under_load. Exit code 1 if a test failed in any round, or a round reached its limit.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import shutil
@@ -78,7 +79,12 @@ def one_round(number: int, chosen: list[str]) -> tuple[int, list[str]]:
 def main() -> int:
     """Repeat, count, report."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends pytest and the load, too
-    rounds, chosen = int(sys.argv[1]), sys.argv[2:]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("rounds", type=int, help="how often to repeat the tests")
+    options, chosen = parser.parse_known_args()
+    rounds = options.rounds
     shutil.rmtree(KEPT, ignore_errors=True)
     KEPT.mkdir(parents=True)
     failures: Counter[str] = Counter()

@@ -1,15 +1,15 @@
-"""Speed of the wire beside others, in one run: call round trip, calls per second, 100 kB, set-point
-streams.
+"""Compare the speed of the wire with other libraries in one run: round trip of a call, calls per
+second, 100 kB, set-point streams.
 
-    python tools/bench/wire.py                       # all that is installed
+    python tools/bench/wire.py                      everything that is installed
     python tools/bench/wire.py --quick --json out.json
 
-Contenders take turns every few calls, so that a busy machine is busy for all. Each end is a process
-of its own. All is measured three times: with both ends SCHED_FIFO on different cores (where that is
-permitted), as ordinary processes that share one core, and as the scheduler likes it. The first two
-show the code's own cost; in the third the scheduler may keep the ends of one contender on one core
-and put those of another on two, of which the other one has to be woken for each message. Ratios are
-what counts: microseconds are this machine's.
+The contenders alternate every few calls, so that a busy machine affects all of them. Each end is a
+process of its own. Everything is measured three times: with both ends SCHED_FIFO on different cores
+(where that is permitted), as ordinary processes that share one core, and as the scheduler decides.
+The first two show the cost of the code. In the third, the scheduler may keep both ends of one
+contender on one core and those of another on two, where each message has to wake the other end.
+Only ratios matter: microseconds depend on the machine.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PINNED, SHARED, ORDINARY = "a core each end", "one core for both ends", "as the 
 """How the two ends are scheduled."""
 
 
-class Table:
+class ResultTable:
     """What was measured, by contender."""
 
     def __init__(self, contenders: Sequence[type[Contender]], pinned: bool) -> None:
@@ -114,7 +114,7 @@ Goals = dict[str, tuple[list[float], float, bool]]
 """By goal: what the rounds gave, the limit, and whether their median keeps to it."""
 
 
-def call_goals(table: Table) -> Goals:
+def call_goals(table: ResultTable) -> Goals:
     """The goals of calls."""
     ours, sealed, bare = Petrobot.name, PetrobotSealed.name, Bare.name
     goals: Goals = {}
@@ -151,7 +151,7 @@ def _below(found: list[float], limit: float) -> tuple[list[float], float, bool]:
 def scheduled(how: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """All measurements with one way of scheduling."""
     pinned = how == PINNED
-    table = Table([one for one in CONTENDERS if _is_installed(one)], pinned)
+    table = ResultTable([one for one in CONTENDERS if _is_installed(one)], pinned)
     try:
         table.measure(arguments.rounds, arguments.calls)
     finally:

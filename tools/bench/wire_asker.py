@@ -1,8 +1,8 @@
-"""The two ends of a contender of `wire.py`, a process each: who asks, told from outside what to
-measure, and who answers.
+"""The two ends of a contender of `wire.py`, one process each: one asks, as `wire.py` tells it, and
+one answers.
 
-No contender shares a process with another: how large a heap is, for one, decides whether each read
-of asyncio's gets fresh pages from the kernel, and so what a bare echo takes.
+No contender shares a process with another: the size of the heap, for example, decides whether each
+read of asyncio gets fresh pages from the kernel, and so how long a bare echo takes.
 """
 
 from __future__ import annotations

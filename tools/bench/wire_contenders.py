@@ -1,7 +1,7 @@
-"""The contenders of `wire.py`: one echo service each, served by a process of its own and asked by
-another one.
+"""The contenders of `wire.py`: one echo service each, in a process of its own, called by another
+process.
 
-All carry the same record there and back: a name, three numbers and a text, by value.
+All of them carry the same record there and back: a name, three numbers and a text, by value.
 """
 
 from __future__ import annotations

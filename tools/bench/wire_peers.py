@@ -1,6 +1,7 @@
-"""The peers that `wire.py` is measured beside, each used as its own manual says for speed.
+"""The libraries with which `wire.py` compares petrobot, each used as its own manual recommends for
+speed.
 
-Pyro5 with msgpack and a proxy a thread, RPyC with tuples (dicts travel by reference), pyzmq and
+Pyro5 with msgpack and one proxy per thread, RPyC with tuples (dicts travel by reference), pyzmq and
 grpc on asyncio.
 """
 

@@ -1,9 +1,9 @@
-"""Set points through a `StreamSender` beside the same numbers through a raw socket: how old each is
-when it is taken.
+"""Compare set points through a `StreamSender` with the same numbers through a raw socket: how old
+each one is when it is received.
 
-One process sends both, each at its rate, half a period apart; one process takes both in from one
-`select`. So the two see the same scheduler, the same pacing by absolute deadline and the same load,
-and what differs is what the stream itself does.
+One process sends both, at the same rate, half a period apart; one process receives both from one
+`select`. So both have the same scheduler, the same pacing by absolute deadlines and the same load,
+and the difference is what the stream itself does.
 """
 
 from __future__ import annotations

@@ -1,1 +1,2 @@
-"""Every promised figure in full: measured by `make proof`, written to docs/figures.md."""
+"""Every figure that the documentation promises, measured in full: `make proof` writes
+docs/figures.md."""

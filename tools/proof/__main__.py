@@ -1,10 +1,9 @@
-"""`make proof`: checks every promised figure in full and writes them to docs/figures.md. Resumes
-where it stopped.
+"""Check every promised figure in full and write them to docs/figures.md (`make proof`).
 
-Each result is kept in reports/proof with the state of the sources that gave it; a proof whose
-sources have not changed since is not run again. `--only NAME ...` runs some, `--fresh` forgets what
-is kept, `--jobs K` runs K at once (speeds are always measured alone), `--page` only writes the
-page.
+Each result is stored in reports/proof with a hash of the sources that it depends on. A proof whose
+sources have not changed is not run again, so an interrupted `make proof` continues where it
+stopped. `--only NAME ...` runs some proofs, `--fresh` forgets the stored results, `--jobs K` runs K
+at the same time (speeds are always measured alone), `--page` only writes the page.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ from typing import Any
 
 from tools.proof import catching, convergence, learning, long_tests
 from tools.proof.page import figures
-from tools.proof.proof import KEPT, ROOT, Proof
+from tools.proof.proof import KEPT, ROOT, FigureProof
 
 FIGURES = ROOT / "docs" / "figures.md"
 
 
-def proofs() -> list[Proof]:
+def proofs() -> list[FigureProof]:
     """All of them, in the order in which people wait for them."""
     return [*catching.proofs(), *convergence.proofs(), *long_tests.proofs(), *learning.proofs()]
 
 
-def kept(proof: Proof) -> dict[str, Any] | None:
+def kept(proof: FigureProof) -> dict[str, Any] | None:
     """What was measured last, of whatever sources."""
     path = KEPT / f"{proof.slug}.json"
     if not path.exists():
@@ -38,7 +37,7 @@ def kept(proof: Proof) -> dict[str, Any] | None:
     return data
 
 
-def prove(proof: Proof) -> dict[str, Any]:
+def prove(proof: FigureProof) -> dict[str, Any]:
     """Measure, judge and keep."""
     begun, sources = time.monotonic(), proof.fingerprint()
     result = proof.measure()
@@ -53,7 +52,7 @@ def prove(proof: Proof) -> dict[str, Any]:
     return data
 
 
-def run(todo: Sequence[Proof], jobs: int) -> bool:
+def run(todo: Sequence[FigureProof], jobs: int) -> bool:
     """Prove these: several at once, but those that measure speed one by one afterwards. False if
     one does not hold."""
     good, done, begun = True, 0, time.monotonic()

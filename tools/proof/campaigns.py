@@ -1,5 +1,6 @@
-"""Campaigns for proofs, and the floors of campaigns themselves: speed, flat memory, the same table
-when killed."""
+"""Campaigns that proofs need, and the required figures of campaigns: speed, constant memory, the
+same table after a kill.
+"""
 
 from __future__ import annotations
 

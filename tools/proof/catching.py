@@ -1,5 +1,6 @@
-"""The catching cell's figures: throws of each regime, disturbed ones, and one seed that gives one
-file."""
+"""Figures of the catching cell: throws in each regime, disturbed throws, and the same file for the
+same seed.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ import tomllib
 from collections.abc import Callable
 from typing import Any
 
-from tools.proof.proof import ROOT, Proof, Result, run_task
+from tools.proof.proof import ROOT, FigureProof, Result, run_task
 
 CHAPTER = "Catching, lock step"
 THROWS = 1000
@@ -123,10 +124,10 @@ def disturbances() -> list[str]:
     return [f"{speed}+{name}" for name in laboratory["disturbances"] for speed in FLOORS]
 
 
-def proofs() -> list[Proof]:
+def proofs() -> list[FigureProof]:
     """Throws first, then what they rest on."""
     main = [
-        Proof(
+        FigureProof(
             regime,
             CHAPTER,
             catching(regime, THROWS),
@@ -138,7 +139,7 @@ def proofs() -> list[Proof]:
         for regime, floor in FLOORS.items()
     ]
     disturbed = [
-        Proof(
+        FigureProof(
             *(
                 name,
                 CHAPTER,
@@ -149,7 +150,7 @@ def proofs() -> list[Proof]:
         )
         for name in disturbances()
     ]
-    same = Proof(
+    same = FigureProof(
         *("one seed, one file", "Lock step", same_file_anywhere, _same),
         "equal files; >= 10x in one process, >= 4x in four",
         SOURCES,

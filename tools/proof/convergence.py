@@ -1,5 +1,4 @@
-"""How surely selectors end on the best action: the study of docs/learning.md, judged by its
-floor."""
+"""How often selectors end on the best action: the study of docs/learning.md against its limits."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from tools.proof.proof import KEPT, Proof, Result, command
+from tools.proof.proof import KEPT, FigureProof, Result, command
 
 SURE = 0.99
 RULE = "nikolic_fu_fast"
@@ -32,13 +31,13 @@ def study() -> Result:
     return found
 
 
-def proofs() -> list[Proof]:
+def proofs() -> list[FigureProof]:
     """One for the study."""
     sources = ("coordinator/learning", "tools/bench/learning.py")
     holds = lambda r: min(r[f"{RULE}, {world}"] for world in ("easy", "middle")) >= SURE  # noqa: E731
     floor = f"fast variant >= {SURE} at gaps .4 and .2"
     return [
-        Proof(
+        FigureProof(
             "convergence of selectors", "Learning, simulated worlds", study, holds, floor, sources
         )
     ]

@@ -1,14 +1,13 @@
-"""Learning, speed of campaigns and forecasts on a whole cell: the floors of docs/campaigns.md and
-docs/forecast.md in full.
+"""Proofs of learning, of the speed of campaigns and of forecasts, on the catching cell: the
+required figures of docs/campaigns.md and docs/forecast.md in full.
 
-    python -m tools.proof.learning                       # all of it (hours); resumes where it
-                                                         stopped
-    python -m tools.proof.learning learn --share 0.1     # a tenth of every size, judged by the same
-                                                         rules python -m tools.proof.learning
-                                                         forecast --regimes A,B,C,B+dim --runs 2000
+    python -m tools.proof.learning                      everything (hours); continues where it
+                                                        stopped
+    python -m tools.proof.learning learn --share 0.1    a tenth of every size, with the same rules
+    python -m tools.proof.learning forecast --regimes A,B,C,B+dim --runs 2000
 
-Every campaign has a folder of its own, so an interrupted proof goes on. Results go to `--folder`,
-tables to `--page`.
+Every campaign has a folder of its own, so an interrupted proof can continue. Results are written to
+`--folder`, tables to `--page`.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from tools.proof.campaigns import FAST, Result, Sizes, campaign, petrobot, rows_of, speed
-from tools.proof.proof import ROOT, Proof
+from tools.proof.proof import ROOT, FigureProof
 
 from petrobot.coordinator.cli.loading import load_directory, load_task
 from petrobot.coordinator.cli.report import compared
@@ -299,7 +298,7 @@ APART = ("coordinator/page", "services/mobile", "sim/track", "sim/rover")
 FULL = ROOT / "reports" / "proof" / "learning"
 
 
-def proofs() -> list[Proof]:
+def proofs() -> list[FigureProof]:
     """The three floors for `make proof`, in full."""
     options = parser().parse_args([])
     floors = {
@@ -320,7 +319,7 @@ def proofs() -> list[Proof]:
         ),
     }
     return [
-        Proof(
+        FigureProof(
             name=name,
             chapter=CHAPTER,
             measure=lambda step=step, line=line: line(_kept(step, options)),  # type: ignore[misc]

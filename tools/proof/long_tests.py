@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tools.proof.proof import Proof, Result, command
+from tools.proof.proof import FigureProof, Result, command
 
 SOURCES = ("coordinator", "services", "sim", "services.toml", "tests")
 
@@ -14,10 +14,10 @@ def marked_proof() -> Result:
     return {"exit": done.returncode, "said": lines[-1].strip("= ") if lines else ""}
 
 
-def proofs() -> list[Proof]:
+def proofs() -> list[FigureProof]:
     """One for the lot."""
     return [
-        Proof(
+        FigureProof(
             "long tests",
             "Tests",
             marked_proof,

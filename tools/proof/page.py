@@ -1,11 +1,11 @@
-"""Writes docs/figures.md: one table a chapter, in it all that was measured and what was not."""
+"""Write docs/figures.md: one table per chapter, with everything that was and was not measured."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tools.proof.proof import Proof
+from tools.proof.proof import FigureProof
 
 HEAD = """# Figures
 
@@ -19,7 +19,7 @@ How faults that were injected on purpose ended: [figures-faults.md](figures-faul
 """
 
 
-def figures(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) -> str:
+def figures(proofs: Sequence[FigureProof], measured: Mapping[str, Mapping[str, Any]]) -> str:
     """The whole page; `measured` holds what is kept of each proof by its name."""
     chapters = list(dict.fromkeys(proof.chapter for proof in proofs))
     parts = [HEAD]
@@ -31,7 +31,7 @@ def figures(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) 
     return "\n".join(parts) + "\n"
 
 
-def _table(proofs: Sequence[Proof], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _table(proofs: Sequence[FigureProof], measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
     columns = list(
         dict.fromkeys(key for p in proofs for key in measured.get(p.name, {}).get("result", {}))
     )

@@ -1,4 +1,4 @@
-"""What a proof is: a figure, how it is measured, when it holds, and the sources that it depends
+"""A proof: a promised figure, how it is measured, when it holds, and the sources that it depends
 on."""
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ Result = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Proof:
-    """One figure.
+class FigureProof:
+    """One promised figure.
 
     `chapter` is its table in docs/figures.md. `sources` are the folders and files whose change
     makes it stale, without those in `apart`. `alone` is true where other work on the machine would

@@ -120,7 +120,8 @@ def _refuse_unmeasured(
                 and (q, names.actions.index(action) + 1) not in measured_runs.contexts
             ):
                 raise ValueError(
-                    f"{primitive}: {action} was never run in {place}, so nothing is known of it; train "
+                    f"{primitive}: {action} was never run in {place}, so nothing is known of "
+                    "it; train "
                     "with --selector random"
                 )
 

@@ -155,7 +155,8 @@ def test_a_manifest_that_was_cut_off_says_what_to_do(conduct: Conduct, size: int
     path = plan_cut_off(whole.folder.parent / "a", size)
     with pytest.raises(
         CampaignError,
-        match=r"campaign.json: .*empty, incomplete.*remove campaign.json and give the command again",
+        match=r"campaign.json: .*empty, incomplete.*remove campaign.json and give the "
+        r"command again",
     ):
         conduct("a")
     path.unlink()
