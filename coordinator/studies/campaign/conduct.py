@@ -43,7 +43,7 @@ AHEAD = 3
 the campaign waits for a slow block."""
 
 
-class WorkerPool(Protocol):
+class BlockPool(Protocol):
     """Anything that runs blocks."""
 
     count: int
@@ -111,7 +111,7 @@ class Campaign:
         blocks = self.plan.blocks
         return self.table.recover(blocks) == len(blocks)
 
-    async def run(self, pool: WorkerPool) -> None:
+    async def run(self, pool: BlockPool) -> None:
         """Run the missing blocks. If it is interrupted at any point, the next `run` in the same
         folder continues. Raises CampaignError."""
         blocks = self.plan.blocks
@@ -132,7 +132,7 @@ class Campaign:
             async for _ in self._results(pool, self._orders(blocks[done:])):
                 pass
 
-    async def _learn(self, pool: WorkerPool, done: int) -> None:
+    async def _learn(self, pool: BlockPool, done: int) -> None:
         """Run batch by batch; what is in the table already is learned again from it."""
         before = self.table.rows()
         for batch in self.plan.batches:
@@ -153,7 +153,7 @@ class Campaign:
         return result_of(self.folder, self.plan, summary, self.policy.state())
 
     async def _results(
-        self, pool: WorkerPool, orders: Iterator[tuple[Block, dict[str, Any]]]
+        self, pool: BlockPool, orders: Iterator[tuple[Block, dict[str, Any]]]
     ) -> AsyncIterator[list[TrialRow]]:
         """Yield the rows of the blocks in order; the rows of a block are in the table before they
         are yielded."""
@@ -177,7 +177,7 @@ class Campaign:
         for block in blocks:
             yield block, {"block": block.to_plain(), "weights": self.policy.weights(block)}
 
-    def _keep(self, pool: WorkerPool, block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
+    def _keep(self, pool: BlockPool, block: Block, result: Mapping[str, Any]) -> list[TrialRow]:
         if "fault" in result:
             raise CampaignError(str(result["fault"]))
         rows = rows_of(block, result)
@@ -196,7 +196,7 @@ class Campaign:
             )
         return rows
 
-    def _note_session(self, pool: WorkerPool) -> None:
+    def _note_session(self, pool: BlockPool) -> None:
         """Write this session so far, so that a session that is killed is recorded, too."""
         self._session["blocks"] += 1
         self._session |= {"wall_s": round(time.monotonic() - self._began, 3), "lost": pool.lost}
