@@ -202,13 +202,11 @@ def losses(model: NetFile) -> list[str]:
 
 def write_tina(model: NetFile) -> str:
     """The TINA text of a net; capacities become inhibitor arcs with the same effect."""
-    from petrobot.coordinator.analysis.net.pack import thresholds
-
     net = model.net
     lines = [f"net {_quoted(model.name or 'net')}"]
     for t, name in enumerate(net.transitions):
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
-        below = sorted(thresholds(net, t).items())
+        below = net.compiled.bars[t]
         if any(k < 1 for _, k in below):
             raise FormatError(
                 "net", f"transition {name}", "its capacity can never be kept", "raise the capacity"

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from petrobot.coordinator.analysis.net.coverability import Coverability, find_pump, settle_bounds
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
-from petrobot.coordinator.analysis.net.pack import thresholds
 from petrobot.coordinator.analysis.net.siphons import controlled_siphons, empty_siphon
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
@@ -270,7 +269,7 @@ def _deadlock_free(
 
 def _never_barred(net: Net) -> str | None:
     """A transition that is enabled in every marking (or one above it in priority is)."""
-    free = (t for t in range(len(net.transitions)) if not net.consume[t] and not thresholds(net, t))
+    free = (t for t in range(len(net.transitions)) if not net.compiled.tested(t))
     return next((net.transitions[t] for t in free), None)
 
 

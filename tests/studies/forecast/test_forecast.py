@@ -238,7 +238,7 @@ def test_a_registered_forecast_stays_as_it_is(
     path.write_text(path.read_text().replace('"runs": 100', '"runs": 101'), encoding="utf-8")
     with pytest.raises(ForecastError, match="was changed"):
         read(path)
-    with pytest.raises(ForecastError, match="no throw of regime B"):
+    with pytest.raises(ForecastError, match="no trial of regime B"):
         register(pair, training, {"B": request[""]}, {})
 
 

@@ -95,7 +95,7 @@ def test_a_doubtful_forecast_is_told_and_not_registered(
     assert main(told) == 1
     shown = capsys.readouterr()
     assert (
-        "DOUBTFUL: throws played with the training's own choices differ from the training's: goal"
+        "DOUBTFUL: trials played with the training's own choices differ from the training's: goal"
         in shown.out
     )
     assert "DOUBTFUL" in shown.err and "--doubtful" in shown.err
@@ -216,4 +216,4 @@ def test_estimates_of_another_task_are_refused(
     assert "it holds estimates of locate, watch; pair has first, second" in capsys.readouterr().err
     own.write_text(ONE_WAY, encoding="utf-8")
     assert main(["forecast", str(own), "--estimates", str(path), *QUICK]) == 0
-    assert "no throws to check against" in capsys.readouterr().out
+    assert "no trials to check against" in capsys.readouterr().out
