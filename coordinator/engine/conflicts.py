@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from petrobot.coordinator.engine.compiled import Exit
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import Claims, Match, eligible_runs, match
 from petrobot.coordinator.task import End
+from petrobot.coordinator.task.compiled_task import CompiledTransition
 from petrobot.coordinator.task.wording import Severity
 
 
@@ -37,15 +37,15 @@ def choose_step(
     return _settle(draft, pulse, sorted(fireable, key=_rank_and_place), list(choices))
 
 
-def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[Exit]:
+def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[CompiledTransition]:
     """The dirty transitions that the pulse may serve and whose input places hold enough: a cheap
     sieve before `match`."""
-    exits, marking = draft.compiled.exits, draft.marking
+    transitions, marking = draft.compiled.transitions, draft.marking
     for t in sorted(draft.dirty):
-        x = exits[t]
+        x = transitions[t]
         if x.pulse and (x.pulse != pulse or (only is not None and x.name not in only)):
             continue
-        for p, w in x.takes:
+        for p, w in x.needs:
             if marking[p] < w:
                 break
         else:
@@ -55,37 +55,35 @@ def _marked(draft: Draft, pulse: str, only: Sequence[str] | None) -> Iterator[Ex
 def _settle(draft: Draft, pulse: str, rest: list[Match], choices: list[str]) -> list[Match] | Draw:
     claims, step = Claims(), list[Match]()
     while rest:
-        rest = [m for old in rest if (m := match(draft, old.exit, pulse, claims))]
+        rest = [m for old in rest if (m := match(draft, old.transition, pulse, claims))]
         if not rest:
             break
         head = _first(draft, pulse, rest, claims)
         rivals = [m for m in _rivals(draft, pulse, head, rest, claims) if _rank(m) == _rank(head)]
         if rivals:
             contest = sorted([head, *rivals], key=_rank_and_place)
-            if all(m.exit.weight is not None for m in contest):
+            if all(m.transition.weight is not None for m in contest):
                 if not choices:
                     return Draw(
-                        tuple(m.exit.name for m in contest),
-                        tuple(m.exit.weight or 0.0 for m in contest),
+                        tuple(m.transition.name for m in contest),
+                        tuple(m.transition.weight or 0.0 for m in contest),
                     )
                 drawn = choices.pop(0)
-                head = next((m for m in contest if m.exit.name == drawn), head)
+                head = next((m for m in contest if m.transition.name == drawn), head)
             else:
                 _report(draft, contest)
         step.append(head)
         claims.add(head)
-        rest = [m for m in rest if m.exit is not head.exit]
+        rest = [m for m in rest if m.transition is not head.transition]
     return step
 
 
 def _rank(m: Match) -> tuple[int, bool]:
-    """Declared priority first; then a run's end before its preemption, unless weights are
-    declared."""
-    return (-m.exit.priority, m.exit.preempts and m.exit.weight is None)
+    return m.transition.rank
 
 
 def _rank_and_place(m: Match) -> tuple[int, bool, int]:
-    return (*_rank(m), m.exit.index)
+    return (*_rank(m), m.transition.index)
 
 
 def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match:
@@ -93,11 +91,11 @@ def _first(draft: Draft, pulse: str, rest: list[Match], claims: Claims) -> Match
     its own."""
     head, passed = rest[0], set[int]()
     while True:
-        passed.add(head.exit.index)
+        passed.add(head.transition.index)
         sooner = (
             m
             for m in rest
-            if m.exit.index not in passed
+            if m.transition.index not in passed
             and _bars(draft, pulse, claims, head, m)
             and not _bars(draft, pulse, claims, m, head)
         )
@@ -111,7 +109,7 @@ def _bars(draft: Draft, pulse: str, claims: Claims, first: Match, then: Match) -
     """Whether `then` could not fire after `first` with the tokens of this step's marking."""
     taken = claims.copy()
     taken.add(first)
-    return match(draft, then.exit, pulse, taken) is None
+    return match(draft, then.transition, pulse, taken) is None
 
 
 def _rivals(
@@ -123,7 +121,7 @@ def _rivals(
     return [
         m
         for m in rest
-        if m.exit is not head.exit
+        if m.transition is not head.transition
         and (
             scarce & _demands(m).keys()
             or (_bars(draft, pulse, claims, head, m) and _bars(draft, pulse, claims, m, head))
@@ -133,8 +131,10 @@ def _rivals(
 
 def _demands(m: Match) -> dict[tuple[int, str], int]:
     """What a match takes, by (place, which tokens of it)."""
-    demands = {(p, ""): w for p, w in m.exit.plain}
-    demands |= {(a.place, a.end.value): a.weight for a in m.exit.actions if a.end is not End.GOING}
+    demands = {(p, ""): w for p, w in m.transition.plain}
+    demands |= {
+        (a.place, a.end.value): a.weight for a in m.transition.actions if a.end is not End.GOING
+    }
     return demands
 
 
@@ -145,16 +145,16 @@ def _scarce(draft: Draft, rest: list[Match], claims: Claims) -> set[tuple[int, s
     for m in rest:
         for key, weight in _demands(m).items():
             asked[key] = asked.get(key, 0) + weight
-        there |= {(p, ""): draft.marking[p] - claims.used.get(p, 0) for p, _ in m.exit.plain}
-        for arc in m.exit.actions:
+        there |= {(p, ""): draft.marking[p] - claims.used.get(p, 0) for p, _ in m.transition.plain}
+        for arc in m.transition.actions:
             there[arc.place, arc.end.value] = len(eligible_runs(draft, arc, claims, heard=False))
     return {key for key, weight in asked.items() if weight > there[key]}
 
 
 def _report(draft: Draft, contest: list[Match]) -> None:
-    names = ", ".join(m.exit.name for m in contest)
+    names = ", ".join(m.transition.name for m in contest)
     text = (
-        f"nothing settles the conflict of {names}; {contest[0].exit.name} fires, being "
+        f"nothing settles the conflict of {names}; {contest[0].transition.name} fires, being "
         "first in the file"
     )
     draft.report(Severity.WARNING, "undecided", text, names)

@@ -96,7 +96,7 @@ class Draft:
 
     def touch_all(self) -> None:
         """Anything may have changed."""
-        self.dirty.update(range(len(self.compiled.exits)))
+        self.dirty.update(range(len(self.compiled.transitions)))
         for timed in self.compiled.timed:
             self.retime.update(timed)
 

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from itertools import product
 from typing import NamedTuple
 
-from petrobot.coordinator.engine.compiled import ActionArc, Exit
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.instructions import CancelRun, DisarmTimer, Fired
 from petrobot.coordinator.engine.state import ACTIVE, LIVE, Phase, Run
 from petrobot.coordinator.task import Counts, End, Status, Value
+from petrobot.coordinator.task.compiled_task import ActionArc, CompiledTransition
 from petrobot.coordinator.task.conditions import ConditionFault
 from petrobot.coordinator.task.wording import Severity
 
@@ -18,7 +18,7 @@ from petrobot.coordinator.task.wording import Severity
 class Match(NamedTuple):
     """A fireable transition and the runs that it takes, by action arc."""
 
-    exit: Exit
+    transition: CompiledTransition
     runs: tuple[tuple[Run, ...], ...]
 
 
@@ -43,7 +43,7 @@ class Claims:
 
     def add(self, match: Match) -> None:
         """Take what the match takes."""
-        x = match.exit
+        x = match.transition
         for p, w in x.plain:
             self.used[p] = self.used.get(p, 0) + w
             self.change[p] = self.change.get(p, 0) - w
@@ -60,7 +60,9 @@ class Claims:
 _NOTHING = Claims()
 
 
-def match(draft: Draft, x: Exit, pulse: str, claims: Claims = _NOTHING) -> Match | None:
+def match(
+    draft: Draft, x: CompiledTransition, pulse: str, claims: Claims = _NOTHING
+) -> Match | None:
     """How the transition can fire beside what was claimed, with the pulse that has just come; None
     if it cannot."""
     if (x.pulse and x.pulse != pulse) or x.never or not _marking_allows(draft, x, claims):
@@ -82,7 +84,7 @@ def match(draft: Draft, x: Exit, pulse: str, claims: Claims = _NOTHING) -> Match
     return None
 
 
-def arcs_satisfied(draft: Draft, x: Exit) -> tuple[Run, ...] | None:
+def arcs_satisfied(draft: Draft, x: CompiledTransition) -> tuple[Run, ...] | None:
     """The runs that the transition would take if its events came now; None while its arcs are not
     satisfied."""
     if not _marking_allows(draft, x, _NOTHING):
@@ -95,7 +97,7 @@ def arcs_satisfied(draft: Draft, x: Exit) -> tuple[Run, ...] | None:
     )
 
 
-def token_enabled(draft: Draft, x: Exit) -> bool:
+def token_enabled(draft: Draft, x: CompiledTransition) -> bool:
     """Whether tokens, inhibitors and room enable the transition in the ordinary sense, whatever its
     runs do."""
     return _marking_allows(draft, x, _NOTHING)
@@ -118,7 +120,7 @@ def eligible_runs(draft: Draft, arc: ActionArc, claims: Claims, heard: bool = Tr
 
 def fire(draft: Draft, fireable: Match, cause: str) -> None:
     """Fire: tokens move at once, preempted runs are asked to stop, new runs are born."""
-    x, before, at = fireable.exit, draft.snapshot(), len(draft.instructions)
+    x, before, at = fireable.transition, draft.snapshot(), len(draft.instructions)
     for p, w in x.plain:
         draft.marking[p] -= w
         draft.touch(p)
@@ -159,24 +161,24 @@ def disarm(draft: Draft, name: str) -> None:
 
 
 def _take_runs(draft: Draft, fireable: Match) -> Iterator[Run]:
-    for arc, runs in zip(fireable.exit.actions, fireable.runs, strict=True):
+    for arc, runs in zip(fireable.transition.actions, fireable.runs, strict=True):
         for run in (draft.find(r.id) or r for r in runs):
             if arc.end is End.GOING:
                 draft.put(run, raised=run.raised.difference(arc.raised))
                 continue
             draft.marking[arc.place] -= 1
             draft.touch(arc.place)
-            cancel(draft, run, arc.counts, f"preempted by {fireable.exit.name}")
+            cancel(draft, run, arc.counts, f"preempted by {fireable.transition.name}")
             yield run
 
 
-def _forget_lost(draft: Draft, fired: Exit) -> None:
+def _forget_lost(draft: Draft, fired: CompiledTransition) -> None:
     """Between taking and giving: timers and latches whose transitions have lost their tokens are
     forgotten."""
     if draft.timers:
         disarm(draft, fired.name)
         for name in list(draft.timers):
-            x = draft.compiled.exits[draft.compiled.net.transition_index[name]]
+            x = draft.compiled.transitions[draft.compiled.net.transition_index[name]]
             if arcs_satisfied(draft, x) is None:
                 disarm(draft, name)
                 draft.retime.add(x.index)
@@ -195,21 +197,17 @@ def forget_flags(draft: Draft) -> None:
 
 def awaited(draft: Draft, event: str) -> bool:
     """Whether tokens enable a transition that waits for the event."""
-    exits = draft.compiled.exits
-    return any(token_enabled(draft, exits[t]) for t in draft.compiled.waiting.get(event, ()))
+    compiled = draft.compiled.transitions
+    return any(token_enabled(draft, compiled[t]) for t in draft.compiled.waiting.get(event, ()))
 
 
-def _marking_allows(draft: Draft, x: Exit, claims: Claims) -> bool:
+def _marking_allows(draft: Draft, x: CompiledTransition, claims: Claims) -> bool:
     marking, used = draft.marking, claims.used
-    for p, w in x.takes:
+    for p, w in x.needs:
         if marking[p] - used.get(p, 0) < w:
             return False
-    for p, k in x.inhibit:
-        if draft.occupied(p) + claims.change.get(p, 0) >= k:
-            return False
-    return not x.room or all(
-        draft.occupied(p) + claims.change.get(p, 0) + gain <= limit for p, gain, limit in x.room
-    )
+    # A bar looks at all that occupies the place, also at runs that have not stopped yet.
+    return all(draft.occupied(p) + claims.change.get(p, 0) < k for p, k in x.bars)
 
 
 def _fits(arc: ActionArc, run: Run) -> bool:
@@ -220,7 +218,9 @@ def _fits(arc: ActionArc, run: Run) -> bool:
     return run.phase in LIVE and (arc.end is End.PREEMPT or arc.end is End.GOING)
 
 
-def _selections(x: Exit, eligible: list[list[Run]]) -> Iterator[tuple[tuple[Run, ...], ...]]:
+def _selections(
+    x: CompiledTransition, eligible: list[list[Run]]
+) -> Iterator[tuple[tuple[Run, ...], ...]]:
     """Which runs to take: the first ones, or every choice where the condition depends on the
     run."""
     if not x.judges_runs:
@@ -235,7 +235,9 @@ def _selections(x: Exit, eligible: list[list[Run]]) -> Iterator[tuple[tuple[Run,
     yield from product(*windows)
 
 
-def _condition_holds(draft: Draft, x: Exit, runs: tuple[tuple[Run, ...], ...]) -> bool:
+def _condition_holds(
+    draft: Draft, x: CompiledTransition, runs: tuple[tuple[Run, ...], ...]
+) -> bool:
     values = draft.variables
     if x.judges_runs:
         values = dict(values)

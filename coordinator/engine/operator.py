@@ -120,7 +120,7 @@ def force_exit(draft: Draft, policy: Policy, command: ForceExit) -> None:
             command.transition,
         )
         return
-    x = draft.compiled.exits[index]
+    x = draft.compiled.transitions[index]
     if draft.mode not in (*MOVING, Mode.PAUSED):
         refuse(draft, f"{x.name} cannot be forced now: the mission run is {draft.mode}", x.name)
         return
@@ -174,11 +174,11 @@ def _forced_runs(draft: Draft, place: str, end: End) -> list[Run]:
 
 def _others_allow(draft: Draft, index: int) -> bool:
     """Whether plain inputs, inhibitors and room allow the forced exit."""
-    x = draft.compiled.exits[index]
-    return arcs_satisfied(draft, replace(x, actions=(), takes=x.plain)) is not None
+    x = draft.compiled.transitions[index]
+    return arcs_satisfied(draft, replace(x, actions=(), needs=x.plain)) is not None
 
 
 def _fire_forced(draft: Draft, forced: Match) -> None:
-    x = forced.exit
+    x = forced.transition
     actions = tuple(replace(a, counts=Counts.NONE, raised=()) for a in x.actions)
     fire(draft, Match(replace(x, actions=actions, flags=()), forced.runs), "ForceExit")

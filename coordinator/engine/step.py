@@ -166,7 +166,7 @@ def _ask(draft: Draft, current: Suspended, draw: Draw) -> None:
 
 def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
     """Pause before a transition with a breakpoint; its step waits."""
-    names = [m.exit.name for m in step]
+    names = [m.transition.name for m in step]
     hit = [n for n in names if n in draft.breakpoints and n not in current.passed]
     if not hit:
         return False
@@ -179,7 +179,7 @@ def _breaks(draft: Draft, current: Suspended, step: list[Match]) -> bool:
 
 def _end_single_step(draft: Draft, current: Suspended, step: list[Match]) -> None:
     """One transition has fired; what its pulse would still serve waits for the next step."""
-    left = tuple(m.exit.name for m in step[1:] if m.exit.pulse)
+    left = tuple(m.transition.name for m in step[1:] if m.transition.pulse)
     if left:
         draft.suspended = Suspended(current.pulse, current.cause, passed=current.passed, only=left)
     draft.mode = Mode.PAUSED
@@ -191,7 +191,10 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
     """Pause after a token entered a place with a breakpoint; give up when firings take no end."""
     places = draft.compiled.net.places
     entered = [
-        places[p] for m in step for p, _, _ in m.exit.produce if places[p] in draft.breakpoints
+        places[p]
+        for m in step
+        for p, _, _ in m.transition.produce
+        if places[p] in draft.breakpoints
     ]
     if entered:
         pause(draft, f"breakpoint at {entered[0]}")
@@ -199,8 +202,10 @@ def _stops_after(draft: Draft, policy: Policy, before: tuple[int, ...], step: li
     limit = draft.compiled.firing_limit if policy.firing_limit is None else policy.firing_limit
     if draft.timeless < limit:
         return False
-    text = f"{draft.timeless} transitions fired without time passing, last {step[-1].exit.name}"
-    draft.report(Severity.ERROR, "timeless", text, step[-1].exit.name)
+    text = (
+        f"{draft.timeless} transitions fired without time passing, last {step[-1].transition.name}"
+    )
+    draft.report(Severity.ERROR, "timeless", text, step[-1].transition.name)
     if policy.firing_limit is None:
         # Continued, it would fire for ever again: not even an operator could do more than edit the
         # task.
@@ -229,7 +234,7 @@ def _explain_waiting(draft: Draft) -> None:
 def _nowhere_to_go(draft: Draft, run: Run) -> bool:
     wanted = End.ERROR if run.status is Status.ERROR else End.NORMAL
     values = draft.variables | verdict_variables(run)
-    for x in draft.compiled.exits:
+    for x in draft.compiled.transitions:
         if (
             not any(a.name == run.place and (a.end is wanted or a.takes_done) for a in x.actions)
             or x.never
@@ -277,7 +282,7 @@ def _end_if_over(draft: Draft, policy: Policy) -> None:
 
 
 def _end_if_dead(draft: Draft, policy: Policy) -> None:
-    if draft.timers or any(token_enabled(draft, x) for x in draft.compiled.exits):
+    if draft.timers or any(token_enabled(draft, x) for x in draft.compiled.transitions):
         return
     text = (
         "no transition can ever fire again in "

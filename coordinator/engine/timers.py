@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from petrobot.coordinator.engine.compiled import Exit
 from petrobot.coordinator.engine.draft import Draft
 from petrobot.coordinator.engine.firing import arcs_satisfied, disarm
 from petrobot.coordinator.engine.instructions import ArmTimer, HoldTimer, ReleaseTimer
 from petrobot.coordinator.engine.state import ACTIVE, Mode, Timer
+from petrobot.coordinator.task.compiled_task import CompiledTransition
 
 
 def refresh_timers(draft: Draft) -> None:
     """Arm and disarm what the changes of this stimulus call for."""
     for t in sorted(draft.retime):
-        x = draft.compiled.exits[t]
+        x = draft.compiled.transitions[t]
         taken = arcs_satisfied(draft, x)
         runs = None if taken is None else tuple(r.id for r in taken)
         timer = draft.timers.get(x.name)
@@ -67,7 +67,7 @@ def hold_timers_of(draft: Draft, run_id: str) -> None:
             draft.emit(HoldTimer(timer.key))
 
 
-def _arm(draft: Draft, x: Exit, runs: tuple[str, ...]) -> None:
+def _arm(draft: Draft, x: CompiledTransition, runs: tuple[str, ...]) -> None:
     draft.timer_order += 1
     timer = Timer(f"{x.name}#{draft.timer_order}", runs)
     draft.timers[x.name] = timer

@@ -24,25 +24,13 @@ def endless(task: Task) -> set[str]:
     ever.
     """
     net = task.net
-    effect = {
-        t: {
-            p: _weight(net.produce[i], p) - _weight(net.consume[i], p)
-            for p in range(len(net.places))
-        }
-        for i, t in enumerate(net.transitions)
-    }
+    changes = dict(zip(net.transitions, net.compiled.changes, strict=True))
     loose = {t.name for t in task.transitions.values() if is_timeless(t)}
     while True:
-        filled = {p for t in loose for p, change in effect[t].items() if change > 0}
+        filled = {p for t in loose for p, change in changes[t] if change > 0}
         finite = {
-            t
-            for t in loose
-            if any(change < 0 and p not in filled for p, change in effect[t].items())
+            t for t in loose if any(change < 0 and p not in filled for p, change in changes[t])
         }
         if not finite:
             return loose
         loose -= finite
-
-
-def _weight(arcs: tuple[tuple[int, int], ...], place: int) -> int:
-    return next((w for p, w in arcs if p == place), 0)

@@ -6,12 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-Marking = tuple[int, ...]
-"""Tokens by place, in place order."""
-
-Arcs = tuple[tuple[int, int], ...]
-"""Pairs (place index, weight), sorted by place, weights >= 1; for inhibitors the weight is the
-threshold."""
+from petrobot.coordinator.task.compiled import Arcs as Arcs
+from petrobot.coordinator.task.compiled import CompiledNet
+from petrobot.coordinator.task.compiled import Marking as Marking
 
 
 class NotEnabled(Exception):  # noqa: N818 - a fact about a marking that callers may ask for
@@ -23,9 +20,9 @@ class Net:
     """An immutable net (P, T, Pre, Post, Inhibit, M0, capacities, priorities).
 
     `consume[t]`, `produce[t]`, `inhibit[t]` are the arcs of transition t. A transition is enabled
-    in M when M(p) >= w for every consumed (p, w), M(p) < k for every inhibitor (p, k), no capacity
-    would be exceeded, and no transition of higher `priority` is enabled (ISO/IEC 15909-1 for the
-    firing rule; priorities as in GSPN).
+    in M when M(p) >= w for every consumed (p, w), M(p) < k for every inhibitor (p, k), no place
+    that gains tokens would exceed its capacity, and no transition of higher `priority` is enabled
+    (ISO/IEC 15909-1 for the firing rule; priorities as in GSPN). `compiled` is that rule in tables.
     """
 
     places: tuple[str, ...]
@@ -36,6 +33,7 @@ class Net:
     initial: Marking
     capacity: tuple[int | None, ...]
     priority: tuple[int, ...]
+    compiled: CompiledNet = field(init=False, repr=False, compare=False)
     place_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
     transition_index: Mapping[str, int] = field(init=False, repr=False, compare=False)
 
@@ -63,6 +61,10 @@ class Net:
                 raise ValueError(
                     "an arc names an unknown place, names it twice or has a weight below 1"
                 )
+        compiled = CompiledNet.of(
+            self.consume, self.produce, self.inhibit, self.capacity, self.priority
+        )
+        object.__setattr__(self, "compiled", compiled)
         object.__setattr__(self, "place_index", {p: i for i, p in enumerate(self.places)})
         object.__setattr__(self, "transition_index", {t: i for i, t in enumerate(self.transitions)})
 
@@ -100,39 +102,21 @@ class Net:
 
     def has_concession(self, marking: Marking, t: int) -> bool:
         """Whether tokens, inhibitors and capacities allow transition t, priorities aside."""
-        if any(marking[p] < w for p, w in self.consume[t]) or any(
-            marking[p] >= k for p, k in self.inhibit[t]
-        ):
-            return False
-        return not any(
-            limit is not None and marking[p] + w - self._weight(self.consume[t], p) > limit
-            for p, w in self.produce[t]
-            if (limit := self.capacity[p]) is not None
-        )
+        return self.compiled.has_concession(marking, t)
 
     def is_enabled(self, marking: Marking, t: int) -> bool:
         """Whether transition t may fire in the marking."""
-        return self.has_concession(marking, t) and not any(
-            self.priority[u] > self.priority[t] and self.has_concession(marking, u)
-            for u in range(len(self.transitions))
-        )
+        return self.compiled.is_enabled(marking, t)
 
     def enabled(self, marking: Marking) -> list[int]:
         """All transitions that may fire in the marking, in transition order."""
-        able = [t for t in range(len(self.transitions)) if self.has_concession(marking, t)]
-        top = max((self.priority[t] for t in able), default=0)
-        return [t for t in able if self.priority[t] == top]
+        return self.compiled.enabled(marking)
 
     def fire(self, marking: Marking, t: int) -> Marking:
         """The marking after transition t. Raises NotEnabled."""
         if not self.is_enabled(marking, t):
             raise NotEnabled(f"{self.transitions[t]} is not enabled in {self.describe(marking)}")
-        after = list(marking)
-        for p, w in self.consume[t]:
-            after[p] -= w
-        for p, w in self.produce[t]:
-            after[p] += w
-        return tuple(after)
+        return self.compiled.after(marking, t)
 
     def replay(self, firings: Iterable[str], marking: Marking | None = None) -> Iterator[Marking]:
         """The markings along a firing sequence of transition names, starting with the given or
@@ -151,7 +135,3 @@ class Net:
             )
             or "(empty)"
         )
-
-    @staticmethod
-    def _weight(arcs: Arcs, place: int) -> int:
-        return next((w for p, w in arcs if p == place), 0)

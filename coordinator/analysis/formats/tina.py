@@ -207,13 +207,11 @@ def write_tina(model: NetFile) -> str:
 
     Raises NetFileError.
     """
-    from petrobot.coordinator.analysis.net.pack import thresholds
-
     net = model.net
     lines = [f"net {_quoted(model.name or 'net')}"]
     for t, name in enumerate(net.transitions):
         label = f" : {_quoted(model.labels[name])}" if name in model.labels else ""
-        below = sorted(thresholds(net, t).items())
+        below = net.compiled.bars[t]
         if any(k < 1 for _, k in below):
             raise NetFileError(
                 "net",

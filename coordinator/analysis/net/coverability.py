@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from petrobot.coordinator.analysis.net.pack import effect, thresholds
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.task.net import Marking, Net
@@ -84,7 +83,7 @@ def coverability(
     known, but not every bound.
     """
     proven = list(bounds) if bounds is not None else place_bounds(net)
-    limits = [thresholds(net, t) for t in range(len(net.transitions))]
+    limits = [dict(bars) for bars in net.compiled.bars]
     restricting = [p for below in limits for p in below]
     unproven = sorted({p for p in restricting if proven[p] is None})
     if unproven:
@@ -145,7 +144,7 @@ def _complemented(net: Net, limits: Sequence[dict[int, int]], bounds: Sequence[i
     consume, produce = [], []
     for t, below in enumerate(limits):
         need, give = dict(net.consume[t]), dict(net.produce[t])
-        for p, change in effect(net, t).items():
+        for p, change in net.compiled.changes[t]:
             if p in number:
                 side = need if change > 0 else give
                 side[number[p]] = abs(change)
@@ -213,10 +212,10 @@ class _Tree:
         return True
 
     def _fire(self, marking: Marking, t: int) -> Marking | None:
-        if any(marking[p] != OMEGA and marking[p] < w for p, w in self.net.consume[t]):
+        if any(marking[p] != OMEGA and marking[p] < w for p, w in self.net.compiled.needs[t]):
             return None
         after = list(marking)
-        for p, change in effect(self.net, t).items():
+        for p, change in self.net.compiled.changes[t]:
             if after[p] != OMEGA:
                 after[p] += change
         return tuple(after)
@@ -320,7 +319,7 @@ def _judged(space: Space, last: int, first: int, grown: set[int]) -> Pump | None
     net, before = space.net, space.path(first)
     pump = space.path(last)[len(before) :]
     fired = [net.transition_index[name] for name in pump]
-    if any(grown & thresholds(net, t).keys() for t in fired):
+    if any(p in grown for t in fired for p, _ in net.compiled.bars[t]):
         return None
     least = min(net.priority[t] for t in fired)
     above = (t for t in range(len(net.transitions)) if net.priority[t] > least)

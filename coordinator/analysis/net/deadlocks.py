@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from petrobot.coordinator.analysis.net.pack import effect, thresholds
 from petrobot.coordinator.task.net import Marking, Net
 
 SIPHON_EFFORT = 5_000
@@ -172,8 +171,8 @@ class _Relations:
     @classmethod
     def of(cls, net: Net) -> _Relations:
         count, places = len(net.transitions), range(len(net.places))
-        change = [effect(net, t) for t in range(count)]
-        limits = tuple(thresholds(net, t) for t in range(count))
+        change = [dict(changes) for changes in net.compiled.changes]
+        limits = tuple(dict(bars) for bars in net.compiled.bars)
         raising = tuple(tuple(t for t in range(count) if change[t].get(p, 0) > 0) for p in places)
         lowering = tuple(tuple(t for t in range(count) if change[t].get(p, 0) < 0) for p in places)
         conflicts: list[set[int]] = [set() for _ in range(count)]

@@ -15,7 +15,6 @@ from petrobot.coordinator.analysis.net.pack import (
     Test,
     TooManyTokens,
     Words,
-    dependents,
 )
 from petrobot.coordinator.task.net import Net
 
@@ -111,7 +110,7 @@ class IntegerEngine:
     def __init__(self, begun: Explored) -> None:
         """Continue a search that any engine began."""
         self._net, self._keep = begun.net, begun.keep_edges
-        self._dependents = dependents(begun.net)
+        self._dependents = begun.net.compiled.dependents()
         self._unaffected = [
             frozenset(range(len(begun.net.transitions))) - frozenset(deps)
             for deps in self._dependents
@@ -175,7 +174,7 @@ class IntegerEngine:
         )
         packed, able = order[i], self._enabled(i)
         targets = []
-        for t in self._top(able) if self._prioritised else able:
+        for t in self._net.compiled.highest(able) if self._prioritised else able:
             after = packed + delta[t]
             number = index.get(after)
             if number is None:
@@ -231,11 +230,6 @@ class IntegerEngine:
                 t for t in passing if t not in self._second or _passes(self._second[t], guarded)
             ]
         return passing
-
-    def _top(self, able: list[int]) -> list[int]:
-        priority = self._net.priority
-        top = max((priority[t] for t in able), default=0)
-        return [t for t in able if priority[t] == top]
 
     def explored(self) -> Explored:
         """Return the search so far."""

@@ -4,9 +4,9 @@ a few mask tests.
 A field of `width` value bits holds the tokens of a place; the guard bit just above it is 0 in every
 stored marking. With all guards G set, `(M | G) - s` leaves the guard of place p set exactly when
 M(p) >= s(p), and no field borrows from the next one. So one subtraction tests all consumed weights
-(guards must stay) and all inhibitors (guards must go) of a transition. Capacities become
-inhibitors: M(p) + out - in <= c is M(p) < c - out + in + 1. A guard that is set after a firing is a
-token count that outgrew its field: the caller widens the field and goes on.
+(guards must stay) and all bars (guards must go) of a transition; `task/compiled.py` has turned
+capacities into bars. A guard that is set after a firing is a token count that outgrew its field: the
+caller widens the field and continues.
 """
 
 from __future__ import annotations
@@ -197,8 +197,8 @@ class Rules:
             able,
             tuple(tests if tests is not None else () for tests in compiled),
             tuple(
-                sum(change << layout.offsets[p] for p, change in effect(net, t).items())
-                for t in range(len(net.transitions))
+                sum(change << layout.offsets[p] for p, change in changes)
+                for changes in net.compiled.changes
             ),
             tuple(tuple(t for t in able if net.priority[t] == level) for level in levels),
         )
@@ -227,64 +227,24 @@ class Rules:
         one by one.
         """
         rows = [[0] * self.layout.words for _ in self.delta]
-        for t, row in enumerate(rows):
-            for p, change in effect(self.net, t).items():
+        for row, changes in zip(rows, self.net.compiled.changes, strict=True):
+            for p, change in changes:
                 row[self.layout.word[p]] += change << self.layout.shift[p]
         wrapped = [[amount % (1 << WORD) for amount in row] for row in rows]
         return np.array(wrapped, dtype=np.uint64).reshape(len(rows), self.layout.words)
 
 
-def effect(net: Net, t: int) -> dict[int, int]:
-    """The change of tokens by place that one firing of transition t makes (zero changes left
-    out)."""
-    change = dict(net.produce[t])
-    for p, w in net.consume[t]:
-        change[p] = change.get(p, 0) - w
-    return {p: c for p, c in change.items() if c}
-
-
-def thresholds(net: Net, t: int) -> dict[int, int]:
-    """Places that must hold fewer tokens than a threshold for t to fire: inhibitors and capacities
-    in one table."""
-    below = dict(net.inhibit[t])
-    consumed = dict(net.consume[t])
-    for p, w in net.produce[t]:
-        limit = net.capacity[p]
-        if limit is not None:
-            room = limit - w + consumed.get(p, 0) + 1
-            below[p] = min(below.get(p, room), room)
-    return below
-
-
-def touched(net: Net, t: int) -> frozenset[int]:
-    """Places whose tokens decide whether t has concession."""
-    return frozenset(dict(net.consume[t])) | frozenset(thresholds(net, t))
-
-
-def dependents(net: Net) -> list[list[int]]:
-    """For each transition, the transitions whose concession its firing can change, in transition
-    order."""
-    watchers: dict[int, set[int]] = {}
-    for t in range(len(net.transitions)):
-        for p in touched(net, t):
-            watchers.setdefault(p, set()).add(t)
-    return [
-        sorted(set().union(*(watchers.get(p, set()) for p in effect(net, t))))
-        for t in range(len(net.transitions))
-    ]
-
-
 def _largest_effect(net: Net) -> list[int]:
     largest = [0] * len(net.places)
-    for t in range(len(net.transitions)):
-        for p, change in effect(net, t).items():
+    for changes in net.compiled.changes:
+        for p, change in changes:
             largest[p] = max(largest[p], change)
     return largest
 
 
 def _compile(net: Net, layout: Layout, t: int) -> tuple[Test, ...] | None:
     """The mask tests of a transition; None if no token count of the layout can enable it."""
-    need, below = dict(net.consume[t]), thresholds(net, t)
+    need, below = dict(net.compiled.needs[t]), dict(net.compiled.bars[t])
     below = {p: k for p, k in below.items() if k < 1 << layout.width[p]}
     if any(k <= 0 for k in below.values()) or any(
         w >= 1 << layout.width[p] for p, w in need.items()

@@ -23,7 +23,6 @@ from petrobot.coordinator.analysis.net.deadlocks import (
     hunt_deadlock,
 )
 from petrobot.coordinator.analysis.net.graph import Graph, Mask
-from petrobot.coordinator.analysis.net.pack import thresholds
 from petrobot.coordinator.analysis.net.space import Space
 from petrobot.coordinator.analysis.net.structure import place_bounds
 from petrobot.coordinator.analysis.net.verdict import PropertyVerdict, Witness
@@ -285,7 +284,7 @@ def _deadlock_free(
 
 def _never_barred(net: Net) -> str | None:
     """Return a transition that is enabled in every marking unless one of higher priority is."""
-    free = (t for t in range(len(net.transitions)) if not net.consume[t] and not thresholds(net, t))
+    free = (t for t in range(len(net.transitions)) if not net.compiled.tested(t))
     return next((net.transitions[t] for t in free), None)
 
 

@@ -17,7 +17,6 @@ from math import gcd
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.net.pack import effect
 from petrobot.coordinator.task.net import Net
 
 EFFORT = 2_000
@@ -45,8 +44,8 @@ class Semiflows:
 def incidence(net: Net) -> NDArray[np.int64]:
     """Return C = Post - Pre, shape (places, transitions)."""
     C = np.zeros((len(net.places), len(net.transitions)), dtype=np.int64)
-    for t in range(len(net.transitions)):
-        for p, change in effect(net, t).items():
+    for t, changes in enumerate(net.compiled.changes):
+        for p, change in changes:
             C[p, t] = change
     return C
 
@@ -54,15 +53,15 @@ def incidence(net: Net) -> NDArray[np.int64]:
 def place_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
     """Return the minimal y >= 0 with y^T C = 0: weighted token sums that no firing changes."""
     rows: list[Vector] = [{} for _ in net.places]
-    for t in range(len(net.transitions)):
-        for p, change in effect(net, t).items():
+    for t, changes in enumerate(net.compiled.changes):
+        for p, change in changes:
             rows[p][t] = change
     return _semiflows(rows, effort)
 
 
 def transition_semiflows(net: Net, effort: int = EFFORT) -> Semiflows:
     """Return the minimal x >= 0 with C x = 0: firing counts that reproduce a marking."""
-    return _semiflows([effect(net, t) for t in range(len(net.transitions))], effort)
+    return _semiflows([dict(changes) for changes in net.compiled.changes], effort)
 
 
 def _semiflows(rows: Sequence[Vector], effort: int) -> Semiflows:
@@ -233,8 +232,8 @@ def lyapunov(net: Net) -> Lyapunov | None:
             total = _combined(total, 1, y, 1)
         return Lyapunov(total, True)
     rows: list[Vector] = [{} for _ in net.places]
-    for t in range(len(net.transitions)):
-        for p, change in effect(net, t).items():
+    for t, changes in enumerate(net.compiled.changes):
+        for p, change in changes:
             rows[p][t] = change
     slack: list[Vector] = [{t: 1} for t in range(len(net.transitions))]
     falling = _semiflows(rows + slack, SMALL_EFFORT)
@@ -265,10 +264,7 @@ def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
         near = [Fraction(float(v)).limit_denominator(largest) for v in y]
         scale = int(np.lcm.reduce([f.denominator for f in near])) if near else 1
         weights = {p: int(f * scale) for p, f in enumerate(near)}
-        drift = [
-            sum(weights[p] * c for p, c in effect(net, t).items())
-            for t in range(len(net.transitions))
-        ]
+        drift = [sum(weights[p] * c for p, c in changes) for changes in net.compiled.changes]
         if all(w > 0 for w in weights.values()) and all(d <= 0 for d in drift):
             return Lyapunov(weights, not any(drift))
     return None
@@ -276,7 +272,7 @@ def _exact(net: Net, y: NDArray[np.float64]) -> Lyapunov | None:
 
 def is_strictly_conservative(net: Net) -> bool:
     """Return whether no firing changes the total number of tokens."""
-    return all(sum(effect(net, t).values()) == 0 for t in range(len(net.transitions)))
+    return all(sum(c for _, c in changes) == 0 for changes in net.compiled.changes)
 
 
 def conflict_sets(net: Net) -> list[tuple[int, ...]]:

@@ -15,8 +15,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.analysis.net.graph import Mask
-from petrobot.coordinator.analysis.net.pack import Tokens, effect, thresholds
+from petrobot.coordinator.analysis.net.pack import Tokens
 from petrobot.coordinator.analysis.time.gspn import Gspn, Values
 from petrobot.coordinator.task.net import Marking, Net
 
@@ -98,10 +99,9 @@ class _Replicas:
         net = gspn.net
         self.gspn, self.net = gspn, net
         self.delta = np.zeros((len(net.places), len(net.transitions)), dtype=np.int64)
-        for t in range(len(net.transitions)):
-            for p, change in effect(net, t).items():
+        for t, changes in enumerate(net.compiled.changes):
+            for p, change in changes:
                 self.delta[p, t] = change
-        self.limits = [sorted(thresholds(net, t).items()) for t in range(len(net.transitions))]
         levels = sorted(set(net.priority), reverse=True)
         self.levels = [
             [t for t, own in enumerate(net.priority) if own == level] for level in levels
@@ -122,21 +122,13 @@ class _Replicas:
             if beaten.all():
                 break
             for t in level:
-                able = self._concession(t) & ~beaten
+                able = concession(self.net.compiled, self.tokens, t) & ~beaten
                 amount[t] = self._amount(t, able)
             some = (amount[level] > 0).any(axis=0)
             if self.net.priority[level[0]] > 0:
                 tangible &= ~some
             beaten |= some
         return amount, tangible
-
-    def _concession(self, t: int) -> Mask:
-        able = np.ones(self.tokens.shape[1], dtype=np.bool_)
-        for p, w in self.net.consume[t]:
-            able &= self.tokens[p] >= w
-        for p, k in self.limits[t]:
-            able &= self.tokens[p] < k
-        return able
 
     def _amount(self, t: int, able: Mask) -> Values:
         rate, servers = self.gspn.rate[t], self.gspn.servers[t]

@@ -5,12 +5,12 @@ Without numba the same code runs in Python: same results, but slow (services/hos
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from petrobot.coordinator.analysis.net.pack import dependents, effect, thresholds
 from petrobot.coordinator.analysis.time.gspn import Gspn
 from petrobot.services.host.numba_kernels import kernel
 
@@ -47,13 +47,9 @@ class Tables(NamedTuple):
     @classmethod
     def of(cls, gspn: Gspn) -> Tables:
         """Return the tables of a GSPN."""
-        net = gspn.net
-        count = range(len(net.transitions))
-        need = [list(net.consume[t]) for t in count]
-        bars = [sorted(thresholds(net, t).items()) for t in count]
-        moves = [sorted(effect(net, t).items()) for t in count]
-        deps = [[(u, 0) for u in touched] for touched in dependents(net)] + [
-            [(u, 0) for u in count]
+        rule = gspn.net.compiled
+        deps = [[(u, 0) for u in touched] for touched in rule.dependents()] + [
+            [(u, 0) for u in range(len(rule.needs))]
         ]
         timed = [r is not None for r in gspn.rate]
         servers = [
@@ -61,17 +57,17 @@ class Tables(NamedTuple):
             for k, on in zip(gspn.servers, timed, strict=True)
         ]
         return cls(
-            *_ragged(need),
-            *_ragged(bars),
-            *_ragged(moves),
+            *_ragged(rule.needs),
+            *_ragged(rule.bars),
+            *_ragged(rule.changes),
             *_ragged(deps)[:2],
             np.array([w if r is None else r for r, w in zip(gspn.rate, gspn.weight, strict=True)]),
             np.array(servers, dtype=np.int64),
-            np.array(net.priority, dtype=np.int64),
+            np.array(rule.priority, dtype=np.int64),
         )
 
 
-def _ragged(rows: list[list[tuple[int, int]]]) -> tuple[Ints, Ints, Ints]:
+def _ragged(rows: Sequence[Sequence[tuple[int, int]]]) -> tuple[Ints, Ints, Ints]:
     flat = [pair for row in rows for pair in row]
     first = np.cumsum([0, *map(len, rows)], dtype=np.int64)
     return (

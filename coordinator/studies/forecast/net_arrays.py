@@ -1,5 +1,5 @@
-"""A task's net as arrays for playing it: arcs, kinds of transitions, conditions on the statuses of
-the runs that they take."""
+"""A compiled task as the forecast plays it: its firing rule, and which statuses of the runs that a
+transition takes its condition admits."""
 
 from __future__ import annotations
 
@@ -11,45 +11,57 @@ import numpy as np
 from petrobot.coordinator.analysis.time.stochastic import is_cause
 from petrobot.coordinator.studies.forecast.history import STATUSES, Vocabulary, reads_variables
 from petrobot.coordinator.task import Counts, End, Kind, Status, Task, Transition
+from petrobot.coordinator.task.compiled import CompiledNet
+from petrobot.coordinator.task.compiled_task import CompiledTransition, compile_transitions
 from petrobot.coordinator.task.conditions import ConditionFault
 
 
 @dataclass(frozen=True)
 class Move:
-    """A transition. Places are indices of the net, runs are numbers of action places."""
+    """A compiled transition with what playing it needs. Runs are numbers of action places."""
 
-    name: str
-    number: int
-    take: tuple[tuple[int, int], ...]
-    """Tokens taken: (place, weight), action places among them."""
-    give: tuple[tuple[int, int], ...]
-    inhibit: tuple[tuple[int, int], ...]
+    transition: CompiledTransition
     normal: tuple[int, ...]
     error: tuple[int, ...]
     going: tuple[int, ...]
-    preempt: tuple[tuple[int, Counts], ...]
+    preempt: tuple[tuple[int, Counts, bool], ...]
+    """(action place, how the run counts, whether a run that has ended is taken, too)."""
     cause: bool
     """Its preemption is a cause by which a run ends, drawn with the run; else it preempts as soon
     as it can fire."""
-    takes_done: bool
-    """It also takes a run that has ended but whose token is still there (its priority is
-    higher)."""
     starts: tuple[int, ...]
     """Action places in which it starts a run."""
     waits: bool
     """For an event or a timer."""
-    after: float | None
     mean_wait: float | None
+    """Declared mean time until all of its events have come (s); None: not declared."""
     allowed: np.ndarray | None
     """Which statuses of the runs it takes (axes: normal, then error) its condition admits; None:
     any."""
-    priority: int
-    weight: float
-    yields: bool
-    """Of equal priority, another one fires first: a run's end goes before its preemption."""
     is_goal: bool
     takes_run: bool
     """It takes a token out of the runs place."""
+
+    @property
+    def name(self) -> str:
+        """Name of the transition."""
+        return self.transition.name
+
+    @property
+    def number(self) -> int:
+        """Index of the transition in the net."""
+        return self.transition.index
+
+    @property
+    def priority(self) -> int:
+        """The engine's rank as one number: the highest fires first."""
+        before, yields = self.transition.rank
+        return -2 * before - yields
+
+    @property
+    def weight(self) -> float:
+        """Share of its firings among those of equal priority that are enabled with it."""
+        return 1.0 if self.transition.weight is None else self.transition.weight
 
 
 @dataclass(frozen=True)
@@ -60,6 +72,8 @@ class Structure:
     vocabulary: Vocabulary
     moves: tuple[Move, ...]
     initial: np.ndarray
+    rule: CompiledNet
+    """The firing rule of the task's net."""
     action_places: tuple[int, ...]
     """Index in the net of each action place."""
     assumptions: tuple[str, ...]
@@ -78,28 +92,31 @@ class Structure:
             _refuse_unknown_preemption(t)
         assumptions: list[str] = []
         moves = tuple(
-            _move(flat, vocabulary, t, i, assumptions)
-            for i, t in enumerate(flat.transitions.values())
+            _move(flat, vocabulary, t, compiled, assumptions)
+            for t, compiled in zip(
+                flat.transitions.values(), compile_transitions(flat), strict=True
+            )
         )
         initial = np.array(flat.net.initial, np.int64)
         if flat.runs_place:
             initial[flat.net.place_index[flat.runs_place]] = 1
         indices = tuple(flat.net.place_index[name] for name in vocabulary.places)
-        return cls(flat, vocabulary, moves, initial, indices, tuple(assumptions))
+        return cls(flat, vocabulary, moves, initial, flat.net.compiled, indices, tuple(assumptions))
 
 
 def _move(
-    flat: Task, vocabulary: Vocabulary, t: Transition, number: int, assumptions: list[str]
+    flat: Task,
+    vocabulary: Vocabulary,
+    t: Transition,
+    compiled: CompiledTransition,
+    assumptions: list[str],
 ) -> Move:
     net = flat.net
-    number_of = {name: q for q, name in enumerate(vocabulary.places)}
+    number_of = {net.place_index[name]: q for q, name in enumerate(vocabulary.places)}
     by_end = {
-        end: tuple(number_of[a.place] for a in t.inputs if a.end is end)
+        end: tuple(number_of[a.place] for a in compiled.actions if a.end is end)
         for end in (End.NORMAL, End.ERROR, End.GOING)
     }
-    preempt = tuple(
-        (number_of[a.place], a.counts or Counts.NONE) for a in t.inputs if a.end is End.PREEMPT
-    )
     if reads_variables(t):
         assumptions.append(
             f"{t.name}: how often its condition holds is taken from the runs that it took"
@@ -107,25 +124,20 @@ def _move(
     waits_known = [flat.events[e].mean_wait for e in t.events]
     means = [mean for mean in waits_known if mean is not None]
     return Move(
-        t.name,
-        number,
-        net.consume[net.transition_index[t.name]],
-        net.produce[net.transition_index[t.name]],
-        net.inhibit[net.transition_index[t.name]],
+        compiled,
         by_end[End.NORMAL],
         by_end[End.ERROR],
         by_end[End.GOING],
-        preempt,
+        tuple(
+            (number_of[a.place], a.counts, a.takes_done)
+            for a in compiled.actions
+            if a.end is End.PREEMPT
+        ),
         is_cause(t),
-        _takes_done(flat, t),
-        tuple(number_of[o.place] for o in t.outputs if o.place in number_of),
+        tuple(number_of[p] for p, _, is_action in compiled.produce if is_action),
         bool(t.events) or t.after is not None,
-        t.after,
         max(means) if means and len(means) == len(waits_known) else None,
         _allowed(t, [vocabulary.places[q] for q in by_end[End.NORMAL] + by_end[End.ERROR]]),
-        t.priority,
-        t.weight if t.weight is not None else 1.0,
-        bool(preempt) and t.weight is None,
         t.name in flat.goal_transitions,
         any(a.place == flat.runs_place for a in t.inputs),
     )
@@ -152,17 +164,6 @@ def _refuse_unknown_preemption(t: Transition) -> None:
             "transition without an event take "
             "that token and the others"
         )
-
-
-def _takes_done(flat: Task, t: Transition) -> bool:
-    """As the engine does: a preemption of declared higher priority also takes what has ended."""
-    places = {a.place for a in t.inputs if a.end is End.PREEMPT}
-    rivals = [
-        u
-        for u in flat.transitions.values()
-        if any(a.place in places and a.end is End.NORMAL for a in u.inputs)
-    ]
-    return bool(places) and t.priority > max((u.priority for u in rivals), default=t.priority)
 
 
 def _allowed(t: Transition, places: list[str]) -> np.ndarray | None:

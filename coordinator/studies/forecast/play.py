@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from petrobot.coordinator.analysis.net.columns import concession
 from petrobot.coordinator.studies.forecast.distributions import Drawer, Mask
 from petrobot.coordinator.studies.forecast.history import CENSORED, STATUSES, Codes, Seen, Values
 from petrobot.coordinator.studies.forecast.net_arrays import ERROR, SUCCESS, Move, Structure
@@ -130,7 +131,7 @@ class Play:
         """Fire what needs no time until nothing does."""
         for _ in range(LONGEST):
             able = np.array([self._enabled(m) for m in self._quick])
-            priority = np.array([2 * m.priority - m.yields for m in self._quick])[:, None]
+            priority = np.array([m.priority for m in self._quick])[:, None]
             highest = np.where(able, priority, np.iinfo(np.int64).min).max(axis=0)
             able &= priority == highest
             some: Mask = np.asarray(able.any(axis=0))
@@ -150,19 +151,15 @@ class Play:
         )
 
     def _enabled(self, m: Move) -> Mask:
-        out = np.ones(len(self._column), np.bool_)
-        for place, weight in m.take:
-            out &= self._tokens[place] >= weight
-        for place, threshold in m.inhibit:
-            out &= self._tokens[place] < threshold
+        out = concession(self._s.rule, self._tokens, m.number)
         for q in m.normal:
             out &= (self._phase[q] == DONE) & (self._status[q] != ERROR) & self._wanted(q, m)
         for q in m.error:
             out &= (self._phase[q] == DONE) & (self._status[q] == ERROR) & self._wanted(q, m)
         for q in m.going:
             out &= self._phase[q] == GOING
-        for q, _ in m.preempt:
-            out &= (self._phase[q] != IDLE) if m.takes_done else (self._phase[q] == GOING)
+        for q, _, takes_done in m.preempt:
+            out &= (self._phase[q] != IDLE) if takes_done else (self._phase[q] == GOING)
         if m.allowed is not None:
             ended = [np.clip(self._status[q], 0, None) for q in m.normal + m.error]
             out &= m.allowed[tuple(ended)]
@@ -173,17 +170,15 @@ class Play:
         return free
 
     def _fire(self, m: Move, columns: Codes) -> None:
-        for place, weight in m.take:
-            self._tokens[place, columns] -= weight
-        for q, counts in m.preempt:
+        for place, change in m.transition.changes:
+            self._tokens[place, columns] += change
+        for q, counts, _ in m.preempt:
             if not m.cause:
                 self._cut(q, m, counts, columns[self._phase[q, columns] == GOING])
-        for q in (*m.normal, *m.error, *(q for q, _ in m.preempt)):
+        for q in (*m.normal, *m.error, *(q for q, _, _ in m.preempt)):
             self._phase[q, columns], self._end[q, columns] = IDLE, np.inf
             ways = self._ways.setdefault(self._s.vocabulary.places[q], {})
             ways[m.name] = ways.get(m.name, 0) + len(columns)
-        for place, weight in m.give:
-            self._tokens[place, columns] += weight
         if m.takes_run:
             self._begun[columns] = self._now[columns]
         self._goals[columns] += m.is_goal
@@ -242,8 +237,8 @@ class Play:
         drawn = self._drawer.wait(move.name, self._replicate[columns])
         if drawn is not None:
             return drawn
-        if move.after is not None:
-            return np.full(len(columns), move.after)
+        if move.transition.after is not None:
+            return np.full(len(columns), move.transition.after)
         if move.mean_wait is None:
             return np.full(len(columns), 1e12)  # its event was never seen to come
         return -move.mean_wait * np.log1p(-self._drawer.chance(len(columns)))

@@ -45,8 +45,8 @@ def semiflows(task: Task) -> tuple[Flow, ...]:
 
 def never_together(net: Net, flows: tuple[Flow, ...], t: int, u: int) -> bool:
     """Whether some semiflow shows that no reachable marking enables both transitions."""
-    need = dict(net.consume[t])
-    for p, w in net.consume[u]:
+    need = dict(net.compiled.needs[t])
+    for p, w in net.compiled.needs[u]:
         need[p] = max(w, need.get(p, 0))
     return any(
         sum(y * need.get(p, 0) for p, y in flow.items())
@@ -57,12 +57,12 @@ def never_together(net: Net, flows: tuple[Flow, ...], t: int, u: int) -> bool:
 
 def _effects(net: Net, place: int) -> dict[int, int]:
     """Net gain of the place by transition, zeros left out."""
-    effects: dict[int, int] = {}
-    for t in range(len(net.transitions)):
-        gain = dict(net.produce[t]).get(place, 0) - dict(net.consume[t]).get(place, 0)
-        if gain:
-            effects[t] = gain
-    return effects
+    return {
+        t: change
+        for t, changes in enumerate(net.compiled.changes)
+        for p, change in changes
+        if p == place
+    }
 
 
 def _combine(
@@ -157,12 +157,10 @@ def _shared(task: Task, t: Transition, u: Transition) -> set[str]:
 def _room(task: Task, t: Transition) -> set[str]:
     """The room that the transition takes up in places of limited capacity."""
     net = task.net
-    index = net.transition_index[t.name]
-    taken = dict(net.consume[index])
     return {
         f"room in {net.places[p]}"
-        for p, w in net.produce[index]
-        if net.capacity[p] is not None and w > taken.get(p, 0)
+        for p, change in net.compiled.changes[net.transition_index[t.name]]
+        if change > 0 and net.capacity[p] is not None
     }
 
 

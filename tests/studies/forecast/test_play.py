@@ -8,12 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from petrobot.coordinator.engine import (
+    ArmTimer,
+    Begin,
+    Engine,
+    Fired,
+    RunEnded,
+    StartRun,
+    TimerFired,
+)
 from petrobot.coordinator.studies.campaign.trials import RunEntry, Trial
 from petrobot.coordinator.studies.forecast.choices import choices_of
 from petrobot.coordinator.studies.forecast.distributions import Drawer, RunDistributions
 from petrobot.coordinator.studies.forecast.history import Training
 from petrobot.coordinator.studies.forecast.net_arrays import Structure
 from petrobot.coordinator.studies.forecast.play import Play, Played
+from petrobot.coordinator.task import Status
 from petrobot.coordinator.task.file import loads
 
 HEAD = """
@@ -481,3 +491,51 @@ out = ["end"]
         Trial(1, 0.0, runs=[entry("a", 1.0, taken="a_done"), entry("b", 2.0, taken="b_done")])
     ]
     assert play(text, throws, n=20).time.tolist() == [2.0] * 20
+
+
+FULL = """
+[places.shelf]
+kind = "control"
+tokens = 1
+capacity = 1
+[transitions.begin]
+in = ["jobs"]
+out = ["a"]
+[transitions.store]
+in = ["a:normal"]
+out = ["shelf", "end"]
+[transitions.full]
+in = ["a:normal"]
+out = ["end"]
+after = 5.0
+[transitions.a_lost]
+in = ["a:error"]
+out = ["end"]
+[transitions.b_done]
+in = ["b:normal"]
+out = ["end"]
+[transitions.b_lost]
+in = ["b:error"]
+out = ["end"]
+"""
+
+
+def test_a_full_place_bars_what_would_fill_it_as_in_the_engine() -> None:
+    """a ends after 1 s and `store` finds the shelf full, so `full` fires 5 s later: in the engine
+    and in every trial of the forecast."""
+    played = play(FULL, [Trial(1, 0.0, runs=[entry("a", 1.0)])], n=200)
+    assert played.ways == {"a": {"full": 200}}
+    assert played.time.tolist() == [6.0] * 200
+    task = loads(
+        HEAD.replace("{task}", 'final = "end == 1"\nruns_place = "jobs"') + FULL, "net.toml"
+    )
+    engine = Engine(task)
+    state, said = engine.handle(engine.initial(), Begin())
+    (run,) = [i.run for i in said if isinstance(i, StartRun)]
+    state, said = engine.handle(state, RunEnded(run, Status.SUCCESS))
+    assert not [i for i in said if isinstance(i, Fired)]
+    (timer,) = [i for i in said if isinstance(i, ArmTimer)]
+    state, said = engine.handle(state, TimerFired(timer.key))
+    assert [i.transition for i in said if isinstance(i, Fired)] == ["full"]
+    marked = dict(zip(task.net.places, state.marking, strict=True))
+    assert marked == {"jobs": 0, "a": 0, "b": 0, "end": 1, "shelf": 1}

@@ -1,0 +1,135 @@
+"""The transitions of a task compiled: the firing rule of its net, and what a task adds to it.
+
+A task's transition also asks how runs ended, for events, for a time and for a condition. The engine
+fires by these tables and the forecast plays by them (docs/semantics.md, section 4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from petrobot.coordinator.task.compiled import Arcs, Changes, Thresholds
+from petrobot.coordinator.task.conditions import Expression
+from petrobot.coordinator.task.elements import (
+    Counts,
+    End,
+    Event,
+    Input,
+    Kind,
+    Scope,
+    Transition,
+)
+from petrobot.coordinator.task.model import Task
+from petrobot.coordinator.task.net import Net
+from petrobot.coordinator.task.validation import is_pulse
+
+
+@dataclass(frozen=True, slots=True)
+class ActionArc:
+    """An arc from an action place to a transition."""
+
+    place: int
+    name: str
+    weight: int
+    end: End
+    counts: Counts
+    takes_done: bool
+    """A preempt arc of declared higher priority also takes a run that has ended but whose token is
+    still there."""
+    raised: tuple[str, ...]
+    """Internal events that the run taken must have raised."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompiledTransition:
+    """A transition with everything that decides whether and how it fires."""
+
+    index: int
+    name: str
+    needs: Arcs
+    """Tokens that must be there, those of runs among them (`CompiledNet.needs`)."""
+    bars: Thresholds
+    """Places that must hold less: inhibitor arcs and capacities (`CompiledNet.bars`). A run that
+    is still stopping counts as there."""
+    changes: Changes
+    """What a firing changes in the marking (`CompiledNet.changes`)."""
+    plain: Arcs
+    """Inputs from resource and control places."""
+    actions: tuple[ActionArc, ...]
+    produce: tuple[tuple[int, int, bool], ...]
+    """(place, weight, is action place)."""
+    pulse: str
+    flags: tuple[str, ...]
+    when: Expression | None
+    judges_runs: bool
+    """Whether its condition reads status or reason of a run that it takes."""
+    after: float | None
+    priority: int
+    preempts: bool
+    weight: float | None
+    never: bool
+    """It waits for an internal event that none of its inputs can raise (`check` refuses this)."""
+
+    @property
+    def rank(self) -> tuple[int, bool]:
+        """Smaller goes first in a conflict: declared priority, then a run's end before its
+        preemption, unless weights are declared (docs/semantics.md, section 6)."""
+        return -self.priority, self.preempts and self.weight is None
+
+
+def compile_transitions(task: Task) -> tuple[CompiledTransition, ...]:
+    """Compile the transitions of a flat, consistent task, in the order of its net."""
+    return tuple(_compiled(task, task.net, t) for t in task.transitions.values())
+
+
+def _compiled(task: Task, net: Net, t: Transition) -> CompiledTransition:
+    index = net.transition_index[t.name]
+    events = [task.events[e] for e in t.events]
+    actions = tuple(
+        _action_arc(task, net, t, a, a.end, events) for a in t.inputs if a.end is not None
+    )
+    heard = {e for a in actions for e in a.raised}
+    plain = tuple((net.place_index[a.place], a.weight) for a in t.inputs if a.end is None)
+    produced = {net.place_index[o.place]: o.weight for o in t.outputs}
+    places = tuple(task.places.values())
+    taken = {a.name for a in actions}
+    return CompiledTransition(
+        index=index,
+        name=t.name,
+        needs=net.compiled.needs[index],
+        bars=net.compiled.bars[index],
+        changes=net.compiled.changes[index],
+        plain=plain,
+        actions=actions,
+        produce=tuple((p, w, places[p].kind is Kind.ACTION) for p, w in sorted(produced.items())),
+        pulse=next((e.name for e in events if is_pulse(e)), ""),
+        flags=tuple(e.name for e in events if e.scope is Scope.EXTERNAL and not is_pulse(e)),
+        when=t.when,
+        judges_runs=t.when is not None and any(n.rpartition(".")[0] in taken for n in t.when.names),
+        after=t.after,
+        priority=t.priority,
+        preempts=any(a.end is End.PREEMPT for a in actions),
+        weight=t.weight,
+        never=any(e.scope is Scope.INTERNAL and e.name not in heard for e in events),
+    )
+
+
+def _action_arc(
+    task: Task, net: Net, t: Transition, arc: Input, end: End, events: list[Event]
+) -> ActionArc:
+    primitive = task.places[arc.place].task
+    rivals = [
+        u
+        for u in task.transitions.values()
+        if any(a.place == arc.place and a.end is End.NORMAL for a in u.inputs)
+    ]
+    return ActionArc(
+        place=net.place_index[arc.place],
+        name=arc.place,
+        weight=arc.weight,
+        end=end,
+        counts=arc.counts or Counts.NONE,
+        takes_done=end is End.PREEMPT
+        and t.priority > max((u.priority for u in rivals), default=t.priority),
+        raised=tuple(e.name for e in events if e.scope is Scope.INTERNAL and e.by == primitive),
+    )

@@ -1,0 +1,232 @@
+"""One firing rule: the engine, the explorers, the simulators and the forecast play the same random
+tasks and find the same enabled transitions and the same successors.
+
+The judge is `allowed` and `successor` below, written from docs/semantics.md, section 4, and not
+from the compiled tables that all of them read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from petrobot.coordinator.analysis.net.columns import concession
+from petrobot.coordinator.analysis.net.explore import ExplorationEngine as Explorer
+from petrobot.coordinator.analysis.net.explore import Explored, IntegerEngine
+from petrobot.coordinator.analysis.net.explore_compiled import NumbaEngine
+from petrobot.coordinator.analysis.net.explore_numpy import NumpyEngine
+from petrobot.coordinator.analysis.net.pack import Layout
+from petrobot.coordinator.analysis.time.gspn import Gspn
+from petrobot.coordinator.analysis.time.simulate import _Replicas
+from petrobot.coordinator.analysis.time.simulate_kernel import Tables, play
+from petrobot.coordinator.engine import (
+    ArmTimer,
+    Begin,
+    Choose,
+    Engine,
+    Fired,
+    Phase,
+    Policy,
+    State,
+)
+from petrobot.coordinator.engine.draft import Draft
+from petrobot.coordinator.engine.firing import arcs_satisfied, token_enabled
+from petrobot.coordinator.studies.forecast.distributions import Drawer
+from petrobot.coordinator.studies.forecast.history import STATUSES
+from petrobot.coordinator.studies.forecast.net_arrays import Structure
+from petrobot.coordinator.studies.forecast.play import DONE, GOING, Play
+from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.net import Marking, Net
+from petrobot.services.host.numba_kernels import plain
+from tests.engine.test_properties import DEVICES, Journal, tasks
+
+EXPLORERS: tuple[Callable[[Explored], Explorer], ...] = (IntegerEngine, NumpyEngine, NumbaEngine)
+COMMON = settings(
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
+
+
+def allowed(net: Net, marking: Sequence[int], t: int, occupied: Sequence[int]) -> bool:
+    """Whether tokens, inhibitor arcs and capacities allow transition t: the sentence of
+    docs/semantics.md, section 4. `occupied` counts runs that are still stopping, too."""
+    pre, post = dict(net.consume[t]), dict(net.produce[t])
+    below = dict(net.inhibit[t])
+    for p, room in enumerate(net.capacity):
+        gain = post.get(p, 0) - pre.get(p, 0)
+        if marking[p] < pre.get(p, 0) or (p in below and occupied[p] >= below[p]):
+            return False
+        if room is not None and gain > 0 and occupied[p] + gain > room:
+            return False
+    return True
+
+
+def successor(net: Net, marking: Sequence[int], t: int) -> Marking:
+    """M - Pre + Post."""
+    pre, post = dict(net.consume[t]), dict(net.produce[t])
+    return tuple(n - pre.get(p, 0) + post.get(p, 0) for p, n in enumerate(marking))
+
+
+def enabled(net: Net, marking: Marking) -> list[int]:
+    """The allowed transitions of the highest priority among them."""
+    able = [t for t in range(len(net.transitions)) if allowed(net, marking, t, marking)]
+    return [t for t in able if all(net.priority[t] >= net.priority[u] for u in able)]
+
+
+def visited(task: Task, data: st.DataObject) -> list[State]:
+    """The states that the engine rests in while it is fed stimuli of the world. Every firing is
+    compared with the judge."""
+    engine, world = Engine(task, DEVICES, Policy(firing_limit=40)), Journal(task)
+    state, said = engine.handle(engine.initial(), Begin({}, {"n": 1}))
+    states, marking = [state], engine.initial().marking
+    for _ in range(data.draw(st.integers(0, 12))):
+        for fired in (i for i in said if isinstance(i, Fired)):
+            t = task.net.transition_index[fired.transition]
+            assert fired.before == marking and allowed(task.net, marking, t, marking)
+            marking = successor(task.net, marking, t)
+            assert fired.after == marking
+        world.state = state
+        world.open |= {i.key: i for i in said if isinstance(i, Choose)}
+        world.timers += [i.key for i in said if isinstance(i, ArmTimer)]
+        state, said = engine.handle(state, data.draw(st.sampled_from(world.stimuli())))
+        states.append(state)
+    return states
+
+
+def engine_agrees(task: Task, states: list[State]) -> None:
+    """The engine's token rule, with runs that are still stopping where they occupy a place."""
+    compiled = Engine(task, DEVICES).compiled
+    for state in states:
+        draft = Draft(compiled, state)
+        occupied = list(state.marking)
+        for run in state.stopping.values():
+            occupied[task.net.place_index[run.place]] += 1
+        for x in compiled.transitions:
+            assert token_enabled(draft, x) == allowed(task.net, state.marking, x.index, occupied)
+
+
+def explorers_agree(net: Net, markings: list[Marking]) -> None:
+    """Each explorer's first step from each marking."""
+    for marking in markings:
+        begun = replace(net, initial=marking)
+        expected = [(t, successor(net, marking, t)) for t in enabled(net, marking)]
+        for make in EXPLORERS:
+            engine = make(Explored.start(begun, Layout.for_net(begun), True))
+            for _ in range(64):  # a field that overflows is widened first, one bit or more each
+                if engine.expanded or not engine.expand(None):
+                    break
+            found = engine.explored()
+            after = found.layout.unpack_many(found.words).tolist()
+            edges = range(int(found.row[0]), int(found.row[1]))
+            steps = [(int(found.label[e]), tuple(after[found.target[e]])) for e in edges]
+            assert steps == expected, make
+
+
+def simulators_agree(net: Net, markings: list[Marking]) -> None:
+    """The simulators with columns and with the compiled loop, on the net with its priorities."""
+    gspn = Gspn.of(net, {})
+    columns = _Replicas(gspn, len(markings))
+    columns.tokens = np.array(markings, dtype=np.int64).T.copy()
+    amounts = columns.amounts()[0]
+    for i, marking in enumerate(markings):
+        possible = enabled(net, marking)
+        assert np.flatnonzero(amounts[:, i]).tolist() == possible
+        for t in possible:
+            moved = np.array(marking) + columns.delta[:, t]
+            assert tuple(moved.tolist()) == successor(net, marking, t)
+        fires, area = np.zeros(len(net.transitions)), np.zeros(len(net.places))
+        start = np.array(marking, dtype=np.int64)
+        random = np.random.default_rng(i)
+        count, _ = plain(play)(start, Tables.of(gspn), random, 1.0, 0.0, 1, fires, area)
+        assert count == (1 if possible else 0)
+        if possible:
+            (t,) = np.flatnonzero(fires).tolist()
+            assert t in possible
+            if not enabled(net, successor(net, marking, t)):  # it rests there until the horizon
+                assert area.tolist() == list(successor(net, marking, t))
+
+
+class Frozen(Play):
+    """A forecast whose runs are set from outside and neither drawn nor counted."""
+
+    def _start(self, q: int, columns: Any) -> None:
+        """No run is drawn."""
+
+    def _cut(self, q: int, m: Any, counts: Any, columns: Any) -> None:
+        """No run is counted."""
+
+    def put(self, states: list[State]) -> None:
+        """One column for each state."""
+        self._tokens = np.array([s.marking for s in states], dtype=np.int64).T.copy()
+        for q, place in enumerate(self._s.vocabulary.places):
+            for i, state in enumerate(states):
+                for run in state.tokens.get(place, ()):
+                    self._phase[q, i] = DONE if run.phase is Phase.DONE else GOING
+                    if run.status is not None:
+                        self._status[q, i] = STATUSES.index(run.status)
+
+    def agrees(self, task: Task, states: list[State]) -> None:
+        """The transitions whose arcs are satisfied are the engine's, and so is each successor."""
+        compiled = Engine(task, DEVICES).compiled
+        for move in self._s.moves:
+            x, before = compiled.transitions[move.number], self._tokens.copy()
+            able = self._enabled(replace(move, allowed=None))
+            unheard = replace(x, actions=tuple(replace(a, raised=()) for a in x.actions), when=None)
+            for i, state in enumerate(states):
+                draft = Draft(compiled, state)
+                assert bool(able[i]) == (arcs_satisfied(draft, unheard) is not None), move.name
+            rows = concession(self._s.rule, before, move.number)
+            assert not (able & ~rows).any()
+            columns = np.flatnonzero(able)
+            phases = self._phase.copy()
+            self._fire(move, columns)
+            for i in columns.tolist():
+                expected = successor(task.net, states[i].marking, move.number)
+                assert tuple(self._tokens[:, i].tolist()) == expected, move.name
+            self._tokens, self._phase = before, phases
+
+
+def forecast_agrees(task: Task, states: list[State]) -> None:
+    """States with one run at a time that has not been asked to stop: what a forecast knows."""
+    try:
+        structure = Structure.of(task)
+    except ValueError:
+        return  # several servers, or a preemption that forecasts refuse
+    fit = [
+        s for s in states if not s.stopping and all(len(runs) <= 1 for runs in s.tokens.values())
+    ]
+    if fit:
+        frozen = Frozen(structure, cast(Drawer, None), {}, np.zeros(len(fit), np.int64))
+        frozen.put(fit)
+        frozen.agrees(task, fit)
+
+
+def all_agree(task: Task, data: st.DataObject) -> None:
+    """Play the task in the engine, and put every marking that it rests in before the others."""
+    states = visited(task, data)
+    engine_agrees(task, states)
+    forecast_agrees(task, states)
+    markings = list(dict.fromkeys(s.marking for s in states))
+    ranked = replace(task.net, priority=tuple(t.priority for t in task.transitions.values()))
+    for net in (task.net, ranked):
+        explorers_agree(net, markings)
+        simulators_agree(net, markings)
+
+
+@settings(COMMON, max_examples=60)
+@given(tasks(), st.data())
+def test_all_that_play_a_task_agree(task: Task, data: st.DataObject) -> None:
+    all_agree(task, data)
+
+
+@pytest.mark.proof
+@settings(COMMON, max_examples=5000)
+@given(tasks(), st.data())
+def test_all_that_play_a_task_agree_at_length(task: Task, data: st.DataObject) -> None:
+    all_agree(task, data)
