@@ -231,9 +231,9 @@ def work_of(name: str) -> Callable[..., Any]:
     if name == "analysis":
         return _analysis
     if name == "form":
-        from petrobot.coordinator.operator import start_order
+        from petrobot.coordinator.operator import start_form
 
-        return start_order.WORKS[name]
+        return start_form.WORKS[name]
     if name in ("run", "runs"):
         from petrobot.coordinator.operator import history as journals
 

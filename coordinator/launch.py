@@ -33,8 +33,10 @@ from petrobot.coordinator.run.recording import (
     replay,
     stages,
 )
-from petrobot.coordinator.run.supervisor import Program, is_local
+from petrobot.coordinator.run.supervisor import Program, Supervisor, is_local
 from petrobot.coordinator.task import Task
+from petrobot.coordinator.task.file.errors import key_lines, line_of
+from petrobot.coordinator.task.wording import nearest
 from petrobot.services.comm.calls.caller import Caller
 from petrobot.services.comm.location_file import Directory, NodeEntry, module_name
 from petrobot.services.comm.lockstep.cell import Delays, LockStepCell
@@ -46,6 +48,7 @@ from petrobot.services.comm.protocol.wire import NEWEST_VERSION, OLDEST_VERSION
 
 NODE_PARTY = "petrobot.services.node.lockstep:LockstepNode"
 SCRIPTED = "petrobot.services.scripted:load"
+LOGS = Path("runs/logs")
 
 Substitutes = Mapping[str, Callable[..., Any]]
 
@@ -64,10 +67,36 @@ class Setting:
     """Where a simulated run sets out, if not at the task's beginning."""
 
 
+class RequestError(ValueError):
+    """A run cannot be made as it was asked for: which part of the request, and what to do."""
+
+
 def load_object(path: str) -> Any:
     """The object at an import path "module:name". Raises ImportError, AttributeError."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module_name(module)), name)
+
+
+def scripted_actions(mock: Path | None, directory: Directory) -> Substitutes | None:
+    """The actions of a script (`--mock`), None without one. Raises RequestError for a file that
+    cannot be used, or that names an action that the cell does not have."""
+    if mock is None:
+        return None
+    try:
+        scripted: Substitutes = load_object(SCRIPTED)(mock)
+    except OSError as fault:
+        raise RequestError(f"{mock}: {fault.strerror}; give a file of scripted actions") from fault
+    except Exception as fault:
+        raise RequestError(str(fault)) from fault
+    for name in scripted:
+        if name not in directory.actions:
+            key = f"actions.{name}"
+            line = line_of(key, key_lines(mock.read_text(encoding="utf-8")))
+            what = f"{directory.source} has no such action{nearest(name, directory.actions)}"
+            raise RequestError(
+                f"{mock}:{line}: {key}: {what}; name one of its actions, or remove it here"
+            )
+    return scripted
 
 
 def with_runs(task: Task, runs: int | None) -> tuple[Task, int]:
@@ -270,3 +299,17 @@ def local_programs(
         )
         for node in local
     ]
+
+
+def local_nodes(
+    directory: Directory,
+    logs: Path = LOGS,
+    *,
+    lockstep: bool = False,
+    mock: Path | None = None,
+    awaited: float = 0.0,
+    respawn: bool = True,
+) -> Supervisor:
+    """Launch the nodes of this host while the context lasts; each writes to its log in `logs`."""
+    programs = local_programs(directory, lockstep=lockstep, mock=mock, awaited=awaited)
+    return Supervisor(programs, logs, respawn=respawn)

@@ -137,6 +137,10 @@ def _dispatch(command: Command, arguments: Sequence[str]) -> int:
         options = parser.parse_args(arguments)
     except SystemExit as leaving:
         return int(leaving.code or 0)
+    if level := getattr(options, "log_level", None):
+        from petrobot.coordinator.cli.options import log_to_stderr
+
+        log_to_stderr(level)
     try:
         return _run(module.run, options)
     except CommandError as fault:

@@ -19,6 +19,7 @@ from petrobot.coordinator.cli.loading import (
     load_directory,
     load_task,
     refuse_misplaced,
+    refuse_script,
     task_path,
     write_json,
 )
@@ -232,7 +233,6 @@ def _print_check(check: dict[str, Any] | None) -> None:
 
 
 def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
-    from petrobot.coordinator.cli.lockstep import substitutes
     from petrobot.coordinator.task.check import check
 
     directory = load_directory(options.services)
@@ -241,7 +241,7 @@ def _refuse_unfit(task: Task, options: argparse.Namespace) -> None:
     if faults:
         lines = "\n".join(f"  {f.key}: {f.text}\n    {f.remedy}" for f in faults)
         raise CommandError(2, f"{task.name} may not run with {directory.source}:\n{lines}")
-    substitutes(options.mock, directory)  # refuses a script for actions that there are not
+    refuse_script(options.mock, directory)
     if not options.cluster:
         refuse_misplaced(directory, everywhere=True, scripted=options.mock is not None)
 

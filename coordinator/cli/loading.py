@@ -133,6 +133,16 @@ def refuse_misplaced(
         raise CommandError(2, "\n".join(faults))
 
 
+def refuse_script(mock: Path | None, directory: Directory) -> None:
+    """Refuse a file of scripted actions that cannot be used with this cell."""
+    from petrobot.coordinator.launch import RequestError, scripted_actions
+
+    try:
+        scripted_actions(mock, directory)
+    except RequestError as fault:
+        raise CommandError(2, str(fault)) from fault
+
+
 def pictures_of(task: Task, result: Mapping[str, Any]) -> dict[str, str]:
     """What the task's own function draws of a mission run's result, SVG by title. Raises
     CommandError when it cannot be had."""

@@ -6,10 +6,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.recorded_runs import Recorded, recorded
+from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.services.host.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from petrobot.coordinator.operator.start_from import Recorded
 
 EXAMPLE = "petrobot log last --format xes --out run.xes"
 

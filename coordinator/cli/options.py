@@ -1,8 +1,10 @@
-"""Parameters of a task as users write them."""
+"""Options that several commands share: parameters of a task, the port of the page, the log level."""
 
 from __future__ import annotations
 
 import argparse
+import logging
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -74,3 +76,39 @@ def named_port(port: int) -> Iterator[None]:
         raise CommandError(
             2, f"port {port}: {fault.strerror or fault}; choose another with --page-port"
         ) from fault
+
+
+# Logging of the coordinator: one logger per package, to standard error.
+
+LOG_LEVELS = ("debug", "info", "warning", "error")
+
+
+def add_log_level_argument(parser: argparse.ArgumentParser, default: str = "warning") -> None:
+    """`--log-level`."""
+    parser.add_argument(
+        "--log-level",
+        choices=LOG_LEVELS,
+        default=default,
+        help="what is logged to standard error; info: links to nodes, runs, restarts, refusals "
+        "(default: %(default)s)",
+    )
+
+
+class _StandardError(logging.Handler):
+    """Writes to standard error as it is now: a progress display may have replaced it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one record."""
+        print(self.format(record), file=sys.stderr, flush=True)
+
+
+def log_to_stderr(level: str) -> None:
+    """Log what the project's loggers say, from this level on."""
+    logger = logging.getLogger("petrobot")
+    logger.setLevel(level.upper())
+    if not any(isinstance(handler, _StandardError) for handler in logger.handlers):
+        handler = _StandardError()
+        handler.setFormatter(
+            logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s", "%H:%M:%S")
+        )
+        logger.addHandler(handler)

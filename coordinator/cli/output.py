@@ -1,22 +1,35 @@
-"""What a run leaves: progress while it goes on, then its result in the terminal, as JSON, beside
-its journal and as a report."""
+"""What a run shows and leaves: progress in the terminal, then its result there, as JSON, beside its
+journal and as a report."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from petrobot.coordinator.cli.loading import pictures_of, write_json
 from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from petrobot.coordinator.operator.session import RunSession
     from petrobot.coordinator.run.mission import Mission
-    from petrobot.coordinator.run.timeline import Timeline
-    from petrobot.coordinator.task import Task
+
+COLOURS = {"success": "green", "failure": "yellow", "error": "red"}
+REFRESH = 0.1
+LONGEST_TABLE = 24
+WIDEST_TABLE = 9
+"""Columns; wider tables are for --json and the report."""
+LAST_ERRORS = "last_errors"
+"""Key of a result under which the actions stand whose errors came last (`Mission.result`): a line
+each instead of a table."""
 
 
 @contextmanager
@@ -25,32 +38,112 @@ def progress(options: argparse.Namespace) -> Iterator[Callable[[Mission, float],
     if options.quiet or options.json == "-":
         yield None
         return
-    from petrobot.coordinator.cli.progress import live_progress
-
     with live_progress() as watch:
         yield watch
 
 
-def give(
-    result: dict[str, Any],
-    task: Task,
-    timeline: Timeline,
-    options: argparse.Namespace,
-    folder: Path | None,
-) -> None:
+@contextmanager
+def live_progress() -> Iterator[Callable[[Mission, float], None]]:
+    """A line that follows the mission run; calls more often than every 0.1 s of wall time cost next
+    to nothing."""
+    shown = 0.0
+    with Live(
+        Text("connecting"), console=Console(stderr=True), auto_refresh=False, transient=True
+    ) as live:
+
+        def watch(mission: Mission, now: float) -> None:
+            nonlocal shown
+            wall = time.monotonic()
+            if wall - shown >= REFRESH:
+                shown = wall
+                live.update(_line(mission, now), refresh=True)
+
+        yield watch
+
+
+def _line(mission: Mission, now: float) -> Text:
+    tally = mission.tally
+    text = Text()
+    text.append(f"{now - mission.begun:7.1f} s  " if mission.begun else "", style="dim")
+    done = sum(cycle.ended is not None for cycle in tally.cycles)
+    text.append(f"run {len(tally.cycles)} of {mission.runs}  ", style="bold")
+    for cycle in tally.cycles[max(0, done - 20) : done]:
+        text.append("\u25cf", style=COLOURS[cycle.status.value])
+    going = sorted({run.place for run in mission.executor.state.runs()})
+    text.append("  " + (" + ".join(going) if going else mission.stage.value))
+    if mission.lost:
+        text.append(f"  away: {', '.join(mission.lost)}", style="red")
+    return text
+
+
+def print_result(result: Mapping[str, Any]) -> None:
+    """The result: lists of tables as tables, everything else in one line each."""
+    console = Console()
+    for key, value in result.items():
+        if (
+            key != LAST_ERRORS
+            and isinstance(value, list)
+            and value
+            and all(isinstance(row, Mapping) for row in value)
+            and len(value[0]) <= WIDEST_TABLE
+        ):
+            console.print(_table(key, value))
+    plain = Table.grid(padding=(0, 2))
+    for key, value in result.items():
+        if isinstance(value, bool | int | float | str):
+            plain.add_row(Text(key, style="dim"), _cell(key, value))
+        elif key == LAST_ERRORS:
+            for row in value:
+                plain.add_row(Text("error", style="dim"), Text(_error(row), style=COLOURS["error"]))
+    console.print(plain)
+
+
+def _error(row: Mapping[str, Any]) -> str:
+    """One action that ended in ERROR, in a line."""
+    place = f" on {row['node']}" if row["node"] else ""
+    why = ": ".join(filter(None, (row["cause"], row["text"])))
+    return (
+        f"{row['run']}, {row['action'] or 'no action'}{place} for "
+        f"{row['primitive_task']}: {why or 'it does not say why'}"
+    )
+
+
+def _table(title: str, rows: list[Mapping[str, Any]]) -> Table:
+    left_out = max(0, len(rows) - LONGEST_TABLE)
+    table = Table(
+        title=title,
+        title_justify="left",
+        caption=f"{left_out} more in --json" if left_out else None,
+    )
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    for column in columns:
+        numeric = all(isinstance(row.get(column), int | float | None) for row in rows)
+        table.add_column(column, justify="right" if numeric else "left")
+    for row in rows[:LONGEST_TABLE]:
+        table.add_row(*(_cell(column, row.get(column)) for column in columns))
+    return table
+
+
+def _cell(key: str, value: Any) -> Text:
+    if value is None:
+        return Text("-", style="dim")
+    if isinstance(value, bool):
+        return Text("yes" if value else "no")
+    if isinstance(value, float):
+        return Text(f"{value:.4g}")
+    return Text(str(value), style=COLOURS.get(str(value), "") if key == "status" else "")
+
+
+def give(session: RunSession, options: argparse.Namespace) -> None:
     """Write the result where it was asked for and beside the journal, print it, leave the
     report."""
-    if folder is not None:
-        from petrobot.coordinator.run.folder import RESULT
-
-        write_json(str(folder / RESULT), result)
+    result = session.result()
+    session.keep_result()
     if options.json:
         write_json(options.json, result)
     if options.json != "-":
-        from petrobot.coordinator.cli.progress import print_result
-
         print_result(result)
-        if folder is None and result["status"] != "success":
+        if session.folder is None and result["status"] != "success":
             print(
                 "not kept; with --journal runs, `petrobot log` and `petrobot report` show "
                 "what led there",
@@ -60,8 +153,9 @@ def give(
         from petrobot.coordinator.drawing import draw
         from petrobot.coordinator.studies.report import report_html
 
+        task = session.mission.executor.task
         write_json(str(options.report / "result.json"), result)
         page = options.report / "index.html"
         net = draw(task, error_branches=True)
-        write_whole(page, report_html(result, timeline, net, pictures_of(task, result)))
+        write_whole(page, report_html(result, session.timeline, net, pictures_of(task, result)))
         print(f"report: {page}")

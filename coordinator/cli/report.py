@@ -17,7 +17,7 @@ from petrobot.services.host.whole_file import make_folder, write_whole
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from petrobot.coordinator.cli.recorded_runs import Recorded
+    from petrobot.coordinator.operator.start_from import Recorded
     from petrobot.coordinator.run.recording import Step
     from petrobot.coordinator.studies.campaign.plan import CampaignPlan
     from petrobot.coordinator.studies.campaign.rows import TrialRow

@@ -8,37 +8,39 @@ import asyncio
 import os
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.learning_options import add_learning_arguments, opened, saved
 from petrobot.coordinator.cli.loading import (
     add_services_argument,
     cell_path,
     load_directory,
     load_task,
     refuse_misplaced,
+    task_path,
 )
-from petrobot.coordinator.cli.lockstep import substitutes
-from petrobot.coordinator.cli.options import add_page_port_argument, named_port, pairs, parameter_of
-from petrobot.coordinator.cli.output import give, progress
+from petrobot.coordinator.cli.options import (
+    add_log_level_argument,
+    add_page_port_argument,
+    named_port,
+    pairs,
+    parameter_of,
+)
 from petrobot.coordinator.cli.recorded_runs import (
     add_journal_arguments,
     journal_folder,
-    new_store,
+    recorded,
     tidy,
 )
-from petrobot.coordinator.cli.start_from import add_departing_arguments, depart
-from petrobot.services.host.command_line import whole
+from petrobot.services.host.command_line import probability, whole
 
 if TYPE_CHECKING:
-    from petrobot.coordinator.launch import Setting
-    from petrobot.coordinator.run.mission import Mission
-    from petrobot.coordinator.run.realtime import RealtimeMission
-    from petrobot.coordinator.run.timeline import Timeline
+    from petrobot.coordinator.learning.session import LearningSetting
+    from petrobot.coordinator.operator.session import RunRequest, RunSession
+    from petrobot.coordinator.operator.start_from import Recorded
     from petrobot.coordinator.task import Task
     from petrobot.services.comm.location_file import Directory
 
@@ -47,6 +49,31 @@ SEED = 1
 MOST_STATES, LONGEST = 20_000, 1.0
 """Markings and seconds that are spent on a task's state space before it runs."""
 EXAMPLE = "petrobot run catch_ball --mode lockstep --runs 20 --seed 1 --json out.json"
+SELECTORS = (
+    "nikolic_fu",
+    "nikolic_fu_fast",
+    "tracking",
+    "reward_inaction",
+    "discretised_pursuit",
+    "ucb1",
+    "thompson",
+    "fixed",
+    "round_robin",
+)
+"""Names for --help without importing numpy; a test compares them with the selectors that there
+are."""
+
+
+REFUSED = {
+    "task": "the task comes from the run",
+    "runs": "how many runs are left is in the marking",
+    "learn": "a run from the middle of another teaches nothing",
+    "use": "the choices are those of the run",
+    "services": "the cell is that of the run",
+    "join": "it has a cell of its own",
+    "up": "it has a cell of its own",
+}
+"""Options that do not go with --from, and why."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -113,6 +140,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_journal_arguments(parser)
     add_page_arguments(parser)
+    add_log_level_argument(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress in the terminal")
     add_services_argument(parser)
     parser.set_defaults(folder=None)
@@ -128,60 +156,203 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
     add_page_port_argument(parser)
 
 
+def add_learning_arguments(parser: argparse.ArgumentParser) -> None:
+    """Whether, where and how a command learns."""
+    parser.add_argument(
+        "--learn",
+        metavar="FILE",
+        type=Path,
+        help="learn which actions are best, and keep it in this estimates file",
+    )
+    parser.add_argument(
+        "--selector",
+        choices=SELECTORS,
+        metavar="NAME",
+        help=f"who chooses: {', '.join(SELECTORS)} (with --learn)",
+    )
+    parser.add_argument(
+        "--target",
+        type=probability,
+        metavar="R",
+        help="choose among actions that reach this reliability (with --learn)",
+    )
+    parser.add_argument(
+        "--context",
+        action="append",
+        metavar="NAME|CONDITION",
+        help="learn apart for each value of a parameter or variable, or for a condition "
+        "(default: regime, if there is one)",
+    )
+    parser.add_argument(
+        "--frozen",
+        action="store_true",
+        help="choose the best that was learned, and learn nothing (with --learn)",
+    )
+
+
+def add_departing_arguments(parser: argparse.ArgumentParser) -> None:
+    """`--from`, `--going`."""
+    parser.add_argument(
+        "--from",
+        dest="departs",
+        metavar="RUN[:RECORD]",
+        help="simulate the task of a recorded run from the state after one of its records "
+        "(`petrobot log` numbers them; "
+        "0, the default, is its beginning), in lock step, in a run folder of its own",
+    )
+    parser.add_argument(
+        "--going",
+        action="append",
+        default=[],
+        metavar="[PLACE=]END",
+        help="with --from: what becomes of the runs that went on then: again (begin anew, "
+        "the default), success, failure or "
+        "error[:CAUSE]; of one place, or of all",
+    )
+
+
 def run(options: argparse.Namespace) -> int:
     """Check the task, run it, print and write the result."""
-    from petrobot.coordinator.launch import mission_id
-    from petrobot.coordinator.run.journal import JournalError
-    from petrobot.coordinator.run.mission import MissionError
-    from petrobot.services.comm.location_file import DirectoryError
-
     if options.departs is not None:
-        return depart(options)
+        return conduct(_from_record(options), options, "lockstep")
     if options.task is None:
         raise CommandError(2, "give a task, or with --from a recorded run")
     if options.going:
         raise CommandError(2, "--going goes with --from")
-    options.mode, options.seed = (
-        options.mode or MODES[0],
-        SEED if options.seed is None else options.seed,
-    )
+    options.mode = options.mode or MODES[0]
+    options.seed = SEED if options.seed is None else options.seed
+    lockstep = options.mode == "lockstep"
     task = load_task(options.task)
-    options.services = cell_path(options.services, options.task, task)
-    directory = load_directory(options.services)
-    if options.join and (options.mode != "lockstep" or options.processes != 0):
+    directory = load_directory(cell_path(options.services, options.task, task))
+    if options.join and (not lockstep or options.processes != 0):
         raise CommandError(
             2, "--join is for --mode lockstep --processes 0: nodes in real time are joined always"
         )
     _refuse_unfit(task, directory)
-    if (options.mode == "lockstep" or options.up) and not options.join:
-        refuse_misplaced(
-            directory, everywhere=options.mode == "lockstep", scripted=options.mock is not None
-        )
-    substitutes(options.mock, directory)  # refuses a script for actions that there are not
-    setting = _setting(task, directory, options)
+    if (lockstep or options.up) and not options.join:
+        refuse_misplaced(directory, everywhere=lockstep, scripted=options.mock is not None)
+    request = _request(task, directory, options)
     _warn(task, options)
-    begun = time.perf_counter()
+    if not lockstep:
+        _refuse_stopped(directory)
+    text = task_path(options.task).read_text(encoding="utf-8")
+
+    def make() -> RunSession:
+        from petrobot.coordinator.operator.session import prepare
+
+        return prepare(request, task, text, directory)
+
+    return conduct(make, options, options.mode)
+
+
+def conduct(
+    make: Callable[[], RunSession],
+    options: argparse.Namespace,
+    mode: str,
+    *,
+    resumed: bool = False,
+) -> int:
+    """Make a session, lead it to its end, print and write its result; gives the exit code.
+
+    `resumed`: a supervisor that resumes whatever ends must be able to rely on 2 for damage alone.
+    """
+    from petrobot.coordinator.cli.output import give
+    from petrobot.coordinator.launch import RequestError
+    from petrobot.coordinator.learning.estimates_file import EstimatesError
+    from petrobot.coordinator.operator.session import interruptible
+    from petrobot.coordinator.operator.start_from import DepartureError
+    from petrobot.coordinator.run.journal import JournalError
+    from petrobot.coordinator.run.mission import MissionError
+    from petrobot.coordinator.run.realtime import UnreachableError
+    from petrobot.coordinator.run.recording import ReplayError
+    from petrobot.coordinator.run.supervisor import LaunchError
+    from petrobot.services.comm.location_file import DirectoryError
+    from petrobot.services.comm.lockstep.cell import CellError
+
+    made: list[RunSession] = []
+
+    async def lead() -> None:
+        with interruptible():  # importing a simulated cell may take seconds
+            made.append(make())
+        await (_lead_lockstep if mode == "lockstep" else _lead_realtime)(made[0], options)
+
     try:
-        if options.mode == "lockstep":
-            with saved(options.learning) as learned:
-                mission, timeline = _run_lockstep(directory, setting, options)
-        else:
-            _refuse_stopped(directory)
-            options.identity = mission_id(task)
-            with saved(options.learning) as learned:
-                mission, timeline = asyncio.run(_run_realtime(directory, setting, options))
+        asyncio.run(lead())
     except MissionError as fault:
-        raise CommandError(2 if fault.bad_input else 1, str(fault)) from fault
-    except DirectoryError as fault:
-        raise CommandError(2, str(fault)) from fault
+        raise CommandError(2 if fault.bad_input and not resumed else 1, str(fault)) from fault
+    except (CellError, UnreachableError, LaunchError) as fault:
+        raise CommandError(3, str(fault)) from fault
     except JournalError as fault:
-        raise CommandError(
-            1 if options.folder is not None and options.folder.exists() else 2, str(fault)
-        ) from fault
-    result = {**mission.result(options.mode, time.perf_counter() - begun), **learned}
-    give(result, task, timeline, options, options.folder)
-    tidy(options)
-    return 0 if result["status"] == "success" else 1
+        raise CommandError(1 if made and not resumed else 2, str(fault)) from fault
+    except (RequestError, DepartureError, EstimatesError, ReplayError, DirectoryError) as fault:
+        raise CommandError(2, str(fault)) from fault
+    [session] = made
+    give(session, options)
+    if not resumed:
+        tidy(options, session.folder)
+    return 0 if session.result()["status"] == "success" else 1
+
+
+async def _lead_lockstep(session: RunSession, options: argparse.Namespace) -> None:
+    from petrobot.coordinator.cli.output import progress
+
+    with progress(options) as watch:
+        await session.lead(watch)
+
+
+async def _lead_realtime(session: RunSession, options: argparse.Namespace) -> None:
+    """Lead it over its nodes, and launch those of this host first if asked to."""
+    from petrobot.coordinator.cli.output import progress
+    from petrobot.coordinator.launch import local_nodes
+
+    directory = session.mission.executor.directory
+    try:
+        up = getattr(options, "up", False)
+        async with local_nodes(directory, mock=options.mock) if up else nullcontext():
+            await session.connect()
+            async with _page(session, options):
+                with progress(options) as watch:
+                    await session.lead(watch)
+    finally:
+        await session.abandon()  # does nothing if it was led
+
+
+@asynccontextmanager
+async def _page(session: RunSession, options: argparse.Namespace) -> AsyncIterator[None]:
+    """Serve the operator's page, or with --no-page the operator's protocol alone, while the run is
+    active."""
+    from petrobot.coordinator.cli.loading import OWN, SHIPPED
+    from petrobot.coordinator.operator.door_file import Door
+    from petrobot.coordinator.operator.history import JournalHistory
+    from petrobot.coordinator.operator.station import offered
+    from petrobot.coordinator.page.server import start_page
+
+    operation = session.operate()
+    directory, callers = session.mission.executor.directory, session.mission.callers
+    assert session.folder is not None
+    with named_port(options.page_port):
+        page = await start_page(
+            operation,
+            tasks_folder=OWN,
+            shipped=SHIPPED,
+            port=options.page_port,
+            offers=lambda: offered(
+                directory, lambda action, node: callers[node].up and action in callers[node].offers
+            ),
+            history=JournalHistory(session.folder.parent),
+            page=not options.no_page,
+        )
+    if not options.no_page:
+        print(f"page: {page.url}", file=sys.stderr, flush=True)
+    services = str(directory.source.resolve())
+    session.door = Door(session.identity, page.base, page.token, os.getpid(), services)
+    try:
+        yield
+    finally:
+        await page.close()
+
+
+# --- what is asked for ------------------------------------------------------------------------
 
 
 def _refuse_unfit(task: Task, directory: Directory) -> None:
@@ -225,14 +396,9 @@ def _refuse_stopped(directory: Directory) -> None:
         raise CommandError(2, text)
 
 
-def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> Setting:
-    from petrobot.coordinator.launch import Setting
-    from petrobot.coordinator.run.interfaces import FirstAlternative
+def _request(task: Task, directory: Directory, options: argparse.Namespace) -> RunRequest:
+    from petrobot.coordinator.operator.session import JOINED, LAUNCHED, ONE_PROCESS, RunRequest
 
-    given = dict(pairs("--set", options.set))
-    if options.regime is not None:
-        given["regime"] = options.regime
-    parameters = {name: parameter_of(task, name, text) for name, text in given.items()}
     chosen = dict(pairs("--use", options.use))
     for primitive, action in chosen.items():
         known = task.primitive_tasks.get(primitive)
@@ -245,142 +411,98 @@ def _setting(task: Task, directory: Directory, options: argparse.Namespace) -> S
             raise CommandError(
                 2, f"--use {primitive}={action}: {directory.source} places no action {action}"
             )
-    options.learning = opened(task, directory, chosen, options)
-    learning = {} if options.learning is None else {"learning": options.learning.beginning()}
-    options.chosen_by = {"chosen": chosen, **learning}
-    selector = FirstAlternative(chosen) if options.learning is None else options.learning.selector
-    return Setting(task, parameters, options.runs, options.seed, selector)
-
-
-# --- lock step --------------------------------------------------------------------------------
-
-
-def _run_lockstep(
-    directory: Directory, setting: Setting, options: argparse.Namespace
-) -> tuple[Mission, Timeline]:
-    from petrobot.coordinator.cli.lockstep import begin
-    from petrobot.services.comm.lockstep.cell import CellError
-
-    with progress(options) as watch:
-        try:
-            return begin(directory, setting, options, watch)
-        except CellError as fault:
-            raise CommandError(3, str(fault)) from fault
-
-
-# --- real time --------------------------------------------------------------------------------
-
-
-async def _run_realtime(
-    directory: Directory, setting: Setting, options: argparse.Namespace
-) -> tuple[Mission, Timeline]:
-    from petrobot.coordinator.launch import realtime_mission
-    from petrobot.coordinator.run.timeline import Timeline
-
-    timeline = Timeline()
-    identity: str = options.identity
-    folder = journal_folder(options)
-    assert folder is not None
-    options.folder = folder / identity
-    now = asyncio.get_running_loop().time()
-    store = new_store(
-        directory, setting, options, options.folder, identity, now, **options.chosen_by
+    nodes = JOINED if options.join else LAUNCHED if options.processes == 0 else ONE_PROCESS
+    return RunRequest(
+        options.mode,
+        options.runs,
+        options.seed,
+        _parameters(task, options),
+        chosen,
+        _learning(options),
+        pace=0.0,
+        folder=journal_folder(options),
+        durable=options.durable,
+        mock=options.mock,
+        nodes=nodes,
     )
-    mission = realtime_mission(directory, setting, identity, store)
-    mission.executor.observers.append(timeline)
-    await drive(directory, mission, options)
-    return mission, timeline
 
 
-async def drive(
-    directory: Directory,
-    mission: Mission,
-    options: argparse.Namespace,
-    begin: Callable[[float], None] | None = None,
-) -> None:
-    """Run a mission in real time over its nodes, launching those of this host first if asked to."""
-    from petrobot.coordinator.run.realtime import RealtimeMission, UnreachableError, credentials_of
-    from petrobot.coordinator.run.supervisor import LaunchError
-    from petrobot.services.comm.protocol.security import KeyFileError
-
-    try:
-        async with _nodes(directory, options):
-            shell = RealtimeMission(mission, directory, credentials_of(directory))
-            try:
-                await shell.connect()
-                async with _page(shell, options):
-                    with progress(options) as watch:
-                        await _watched(shell.run(begin), mission, watch)
-            finally:
-                await shell.close()
-    except (UnreachableError, LaunchError) as fault:
-        raise CommandError(3, str(fault)) from fault
-    except KeyFileError as fault:
-        raise CommandError(2, str(fault)) from fault
+def _parameters(task: Task, options: argparse.Namespace) -> Mapping[str, Any]:
+    given = dict(pairs("--set", options.set))
+    if options.regime is not None:
+        given["regime"] = options.regime
+    return {name: parameter_of(task, name, text) for name, text in given.items()}
 
 
-@asynccontextmanager
-async def _page(shell: RealtimeMission, options: argparse.Namespace) -> AsyncIterator[None]:
-    """The operator's page, or with --no-page his protocol alone, while the mission run goes on."""
-    from petrobot.coordinator.cli.loading import SHIPPED
-    from petrobot.coordinator.cli.serve import OWN_TASKS
-    from petrobot.coordinator.operator.commands import Operation
-    from petrobot.coordinator.operator.door_file import Door, door_open
-    from petrobot.coordinator.operator.history import JournalHistory
-    from petrobot.coordinator.operator.station import offered
-    from petrobot.coordinator.page.server import start_page
-    from petrobot.coordinator.run.interfaces import FirstAlternative
+def _learning(options: argparse.Namespace) -> LearningSetting | None:
+    """How the run learns; None if it does not, and then no estimates file is read."""
+    if options.learn is None:
+        for name in ("selector", "target", "context", "frozen"):
+            if getattr(options, name):
+                raise CommandError(
+                    2, f"--{name} needs --learn FILE: without it nothing is learned or read"
+                )
+        return None
+    from petrobot.coordinator.learning.selectors import DEFAULT
+    from petrobot.coordinator.learning.session import LearningSetting
 
-    selector = shell.mission.executor.selector
-    assert isinstance(selector, FirstAlternative)
-    operation = Operation(shell, selector)
-    history = JournalHistory(options.folder.parent)
-    callers, directory = shell.mission.callers, shell.mission.executor.directory
-    with named_port(options.page_port):
-        page = await start_page(
-            operation,
-            tasks_folder=OWN_TASKS,
-            shipped=SHIPPED,
-            port=options.page_port,
-            offers=lambda: offered(
-                directory, lambda action, node: callers[node].up and action in callers[node].offers
-            ),
-            history=history,
-            page=not options.no_page,
+    contexts = None if options.context is None else tuple(part for part in options.context if part)
+    return LearningSetting(
+        options.learn, options.selector or DEFAULT, options.target, contexts, frozen=options.frozen
+    )
+
+
+# --- from a recorded run ----------------------------------------------------------------------
+
+
+def _from_record(options: argparse.Namespace) -> Callable[[], RunSession]:
+    """What makes a simulated run that starts at a point of a recorded one."""
+    for name, why in REFUSED.items():
+        if getattr(options, name):
+            raise CommandError(
+                2, f"--from goes with no {'--' if name != 'task' else ''}{name}: {why}"
+            )
+    if options.mode == "realtime" or options.processes != 1:
+        raise CommandError(
+            2, "--from simulates in one process: a real cell does not stand where a marking says"
         )
-    if not options.no_page:
-        print(f"page: {page.url}", file=sys.stderr, flush=True)
-    executor = shell.mission.executor
-    door = Door(
-        executor.mission,
-        page.base,
-        page.token,
-        os.getpid(),
-        str(executor.directory.source.resolve()),
-    )
-    try:
-        with door_open(options.folder, door):
-            yield
-    finally:
-        await page.close()
-        await operation.close()
+    name, record = _named(options.departs)
+    found: Recorded = recorded(name)
+
+    def make() -> RunSession:
+        from petrobot.coordinator.operator.session import RecordedPoint, RunRequest, prepare_from
+        from petrobot.coordinator.run.folder import DEFAULT
+
+        run = found.journal.path.parent.name
+        request = RunRequest(
+            "lockstep",
+            seed=options.seed,
+            parameters=_parameters(found.task, options),
+            pace=0.0,
+            start=RecordedPoint(run, record, _going(options.going)),
+            folder=options.journal or DEFAULT,
+            durable=options.durable,
+            mock=options.mock,
+        )
+        return prepare_from(request, found)
+
+    return make
 
 
-def _nodes(directory: Directory, options: argparse.Namespace) -> AbstractAsyncContextManager[Any]:
-    if not getattr(options, "up", False):
-        return nullcontext()
-    from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.run.supervisor import Supervisor
+def _named(text: str) -> tuple[str, int]:
+    run, colon, record = text.rpartition(":")
+    if not colon:
+        return text, 0
+    if not record.isascii() or not record.isdigit():
+        raise CommandError(2, f"--from {text}: write RUN:RECORD, the record as a number")
+    return run, int(record)
 
-    return Supervisor(local_programs(directory, mock=options.mock), Path("runs/logs"), notice=print)
 
+def _going(texts: list[str]) -> dict[str, str] | str:
+    from petrobot.coordinator.operator.start_from import AGAIN
 
-async def _watched(
-    running: Any, mission: Mission, watch: Callable[[Mission, float], None] | None
-) -> None:
-    task = asyncio.ensure_future(running)
-    while not task.done():
-        if watch is not None:
-            watch(mission, asyncio.get_running_loop().time())
-        await asyncio.wait({task}, timeout=0.1)
-    await task
+    if any("=" not in text for text in texts):
+        if len(texts) > 1:
+            raise CommandError(2, "--going: give one END for all, or PLACE=END for each")
+        return texts[0]
+    return dict(text.split("=", 1) for text in texts) if texts else AGAIN

@@ -7,14 +7,23 @@ import argparse
 import asyncio
 import os
 import signal
-from contextlib import AbstractAsyncContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import SHIPPED, add_services_argument, load_directory
-from petrobot.coordinator.cli.lockstep import substitutes
-from petrobot.coordinator.cli.options import add_page_port_argument, named_port
+from petrobot.coordinator.cli.loading import (
+    OWN,
+    SHIPPED,
+    add_services_argument,
+    load_directory,
+    refuse_script,
+)
+from petrobot.coordinator.cli.options import (
+    add_log_level_argument,
+    add_page_port_argument,
+    named_port,
+)
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.station import Station
@@ -22,7 +31,6 @@ if TYPE_CHECKING:
     from petrobot.services.comm.location_file import Directory
 
 EXAMPLE = "petrobot serve --up"
-OWN_TASKS = Path("tasks")
 ESTIMATES = Path("estimates")
 
 
@@ -33,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tasks",
         metavar="FOLDER",
         type=Path,
-        default=OWN_TASKS,
+        default=OWN,
         help="your own tasks, made when first needed; those that come with petrobot are "
         "offered, too (%(default)s)",
     )
@@ -56,6 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--journal", metavar="FOLDER", type=Path, help="where runs are kept (default: runs)"
     )
+    add_log_level_argument(parser, "info")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -65,11 +74,12 @@ def run(options: argparse.Namespace) -> int:
             2, "--mock is for nodes that are launched here: give --up, too, or `petrobot up --mock`"
         )
     directory = load_directory(options.services)
-    substitutes(options.mock, directory)  # refuses a script for actions that there are not
+    refuse_script(options.mock, directory)
     return asyncio.run(_serve(directory, options))
 
 
 async def _serve(directory: Directory, options: argparse.Namespace) -> int:
+    from petrobot.coordinator.launch import local_nodes
     from petrobot.coordinator.operator.station import Station
     from petrobot.coordinator.page.task_store import TaskStore
     from petrobot.coordinator.run.folder import DEFAULT
@@ -82,7 +92,11 @@ async def _serve(directory: Directory, options: argparse.Namespace) -> int:
     credentials_of(directory)  # keys that cannot be used are told before anything is launched
     runs = options.journal or DEFAULT
     try:
-        async with _nodes(directory, runs, options):
+        async with (
+            local_nodes(directory, runs / "logs", mock=options.mock)
+            if options.up
+            else nullcontext()
+        ):
             station = Station(
                 directory, TaskStore(options.tasks, SHIPPED), runs, options.mock, options.estimates
             )
@@ -128,14 +142,3 @@ def _doors(directory: Directory, page: Page) -> Any:
     return lambda run: Door(
         run, page.base, page.token, os.getpid(), str(directory.source.resolve())
     )
-
-
-def _nodes(
-    directory: Directory, runs: Path, options: argparse.Namespace
-) -> AbstractAsyncContextManager[Any]:
-    if not options.up:
-        return nullcontext()
-    from petrobot.coordinator.launch import local_programs
-    from petrobot.coordinator.run.supervisor import Supervisor
-
-    return Supervisor(local_programs(directory, mock=options.mock), runs / "logs", notice=print)

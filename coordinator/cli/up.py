@@ -10,8 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
-from petrobot.coordinator.cli.lockstep import substitutes
+from petrobot.coordinator.cli.loading import (
+    add_services_argument,
+    load_directory,
+    refuse_misplaced,
+    refuse_script,
+)
+from petrobot.coordinator.cli.options import add_log_level_argument
 from petrobot.services.host.command_line import number
 
 if TYPE_CHECKING:
@@ -46,13 +51,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
     parser.add_argument("--no-respawn", action="store_true", help="leave a node that died dead")
+    add_log_level_argument(parser, "info")
 
 
 def run(options: argparse.Namespace) -> int:
     """Launch and watch."""
     directory = load_directory(options.services)
     refuse_misplaced(directory, scripted=options.mock is not None)
-    substitutes(options.mock, directory)  # refuses a script for actions that there are not
+    refuse_script(options.mock, directory)
     return asyncio.run(_up(directory, options))
 
 
@@ -71,7 +77,7 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     respawn = not (
         options.no_respawn or options.lockstep
     )  # a member that died has left its cell for good
-    supervisor = Supervisor(programs, options.logs, respawn=respawn, notice=print)
+    supervisor = Supervisor(programs, options.logs, respawn=respawn)
     try:
         async with supervisor:
             for name, process in supervisor.process_ids().items():

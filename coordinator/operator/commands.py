@@ -9,20 +9,27 @@ goes straight to the nodes.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from typing import Any, Protocol
 
 from petrobot.coordinator.engine import (
     Abort,
     AddTokens,
+    CancelRun,
     ForceExit,
+    HoldRun,
     Instruction,
     Override,
     Pause,
     RaiseEvent,
+    ReleaseRun,
     RemoveTokens,
     Report,
     Resume,
+    RunHeld,
+    RunRecorded,
     SetBreakpoints,
     State,
     Step,
@@ -38,6 +45,8 @@ from petrobot.coordinator.run.journal import JournalError
 from petrobot.coordinator.run.mission import Mission, Stage
 from petrobot.coordinator.run.realtime import credentials_of
 from petrobot.services.comm.calls.caller import CallProgress
+
+_log = logging.getLogger(__package__)
 
 ANSWERS = 1.5
 """Seconds that nodes have to answer a pause."""
@@ -86,6 +95,9 @@ class Operation:
         self.feed = feed or Feed()
         self.controls = controls or Controls(self.feed)
         self._refusals: list[str] = []
+        self._holding: dict[str, str] = {}
+        """Runs that were asked to hold and have not answered, each with its node."""
+        self._all_held = asyncio.Event()
         self._stopping: asyncio.Task[None] | None = None
         self._live = mode == "realtime"
         began = shell.now()
@@ -114,18 +126,33 @@ class Operation:
     # --- an observer of the executor ----------------------------------------------------------
 
     def instruction(self, now: float, instruction: Instruction) -> None:
-        """Keep what the engine refuses, for the answer to the command."""
+        """Keep what the engine refuses, for the answer to the command; and which runs are asked to
+        hold."""
         if isinstance(instruction, Report) and instruction.key in REFUSED:
             self._refusals.append(instruction.text)
+        elif isinstance(instruction, HoldRun):
+            self._holding[instruction.run] = self._node_of(instruction.run)
+        elif isinstance(instruction, ReleaseRun | CancelRun | RunRecorded):
+            self._holding.pop(instruction.run, None)
 
     def stimulus(self, now: float, stimulus: Stimulus) -> None:
-        """Nothing to keep."""
+        """Note that a run has answered whether it holds."""
+        if isinstance(stimulus, RunHeld):
+            self._holding.pop(stimulus.run, None)
 
     def progress(self, now: float, run: str, notice: CallProgress) -> None:
         """Nothing to keep."""
 
     def settled(self, now: float, state: State) -> None:
-        """Nothing to keep."""
+        """Let a pause answer once every run has."""
+        if self._holding:
+            self._all_held.clear()
+        else:
+            self._all_held.set()
+
+    def _node_of(self, run: str) -> str:
+        action = next(r.action for r in self.executor.state.runs() if r.id == run)
+        return self.executor.directory.where(action)
 
     # --- the port -----------------------------------------------------------------------------
 
@@ -148,24 +175,23 @@ class Operation:
         if carry_out is None:
             return refusal("unknown", f"no command {verb!r} for a mission run that goes on")
         try:
-            return await carry_out(who, data)
+            answer = await carry_out(who, data)
         except (KeyError, TypeError, ValueError) as fault:
-            return refusal("bad_data", f"{verb}: {fault}")
+            answer = refusal("bad_data", f"{verb}: {fault}")
+        if not answer["ok"]:
+            _log.info("refused %s of %s: %s", verb, who, answer["text"])
+        return answer
 
     # --- commands that are stimuli ------------------------------------------------------------
 
     async def _do_pause(self, who: str, data: Mapping[str, Any]) -> Answer:
         answer = self._order(Pause(f"by {who}"))
         if answer["ok"]:
-            await self._until(lambda: not self._holding(), ANSWERS)
+            with suppress(TimeoutError):
+                async with asyncio.timeout(ANSWERS):
+                    await self._all_held.wait()
             self._complete_pause()
         return {**answer, "nodes": dict((self.feed.state["paused"] or {}).get("nodes", {}))}
-
-    def _holding(self) -> list[str]:
-        """Nodes that have been asked to hold a run and have not answered."""
-        return [
-            run["node"] for run in self.feed.state["runs"].values() if run["state"] == "holding"
-        ]
 
     def _complete_pause(self) -> None:
         """Say of every node with devices how it is: `lost` if it did not answer, `idle` if it had
@@ -173,7 +199,7 @@ class Operation:
         paused = self.feed.state["paused"]
         if paused is None:
             return
-        directory, late = self.executor.directory, self._holding()
+        directory, late = self.executor.directory, set(self._holding.values())
         owners = {device.node for device in directory.devices.values() if device.driver}
         nodes = {
             node: "lost" if node in self.mission.lost else "idle"
@@ -276,8 +302,3 @@ class Operation:
         told = await order_all(directory, credentials_of(directory), CLEAR)
         still = [f"{one.node}: {one.why or 'no answer'}" for one in told if not one.answered]
         return refusal("unreachable", "; ".join(still)) if still else {"ok": True}
-
-    async def _until(self, ready: Callable[[], bool], timeout: float) -> None:
-        deadline = asyncio.get_running_loop().time() + timeout
-        while not ready() and asyncio.get_running_loop().time() < deadline:
-            await asyncio.sleep(0.02)

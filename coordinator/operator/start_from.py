@@ -11,7 +11,7 @@ run's own beginning.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,18 +27,56 @@ from petrobot.coordinator.engine import (
     point_from_plain,
     to_plain,
 )
-from petrobot.coordinator.launch import Setting, lockstep_id
+from petrobot.coordinator.launch import Setting, with_runs
 from petrobot.coordinator.learning.session import fixed_by_user, session_of
-from petrobot.coordinator.run.folder import JOURNAL, header
 from petrobot.coordinator.run.interfaces import FirstAlternative, Observer
-from petrobot.coordinator.run.journal import Journal, JournalWriter
-from petrobot.coordinator.run.recording import STIMULUS, JournalStore, clock_reading, replay
+from petrobot.coordinator.run.journal import Journal, JournalError, read_journal
+from petrobot.coordinator.run.recording import STIMULUS, Step, replay
 from petrobot.coordinator.task import Kind, Status, Task
+from petrobot.coordinator.task.file import loads
+from petrobot.services.comm.location_file import Directory, parse
 
 AGAIN = "again"
 """A run that went on begins anew."""
 ENDS = (AGAIN, *(status.value for status in Status))
 """What may become of a run that went on; an end may be followed by a colon and a cause."""
+
+
+HEADER = ("mission", "mode", "task", "services", "services_path", "seed", "runs", "parameters")
+"""What a journal's header must say for its run to be derived again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recorded mission run and what it ran with."""
+
+    journal: Journal
+    task: Task
+    directory: Directory
+    engine: Engine
+
+    def steps(self) -> Iterator[Step]:
+        """Derive every stimulus again."""
+        return replay(self.journal, self.engine)
+
+
+def read_recorded(path: Path) -> Recorded:
+    """Read a journal, and build task, cell and engine of its run from the texts in its header.
+
+    Raises JournalError (also for a file that is not the journal of a mission run), TaskFileError,
+    DirectoryError, OSError.
+    """
+    journal = read_journal(path)
+    then = journal.header
+    for key in HEADER:
+        if key not in then:
+            raise JournalError(
+                f"{path}: its header has no {key!r}; it is not the journal of a mission run"
+            )
+    task, _ = with_runs(loads(then["task"], f"{path} (task)"), then["runs"])
+    directory = parse(then["services"], Path(then["services_path"]))
+    devices = {a.name: a.device for a in directory.actions.values() if a.device}
+    return Recorded(journal, task, directory, Engine(task, devices))
 
 
 class DepartureError(ValueError):
@@ -136,33 +174,6 @@ def _bring(selector: Observer, journal: Journal, engine: Engine, record: int) ->
         for instruction in step.instructions:
             selector.instruction(step.time, instruction)
         selector.settled(step.time, step.state)
-
-
-def departed_store(
-    journal: Journal,
-    setting: Setting,
-    departure: Departure,
-    folder: Path,
-    more: Mapping[str, Any] | None = None,
-) -> JournalStore:
-    """The new run's journal in its own folder; its header says from which run and record it came.
-    Raises JournalError."""
-    then = journal.header
-    given: dict[str, Any] = {
-        "services_path": then["services_path"],
-        "seed": setting.seed,
-        "runs": setting.runs,
-        "parameters": {**setting.task.parameters, **setting.parameters},
-        "clock": clock_reading(0.0),
-        "durable": False,
-        "mock": then.get("mock", ""),
-        "cell": "launched",
-        "chosen": dict(then.get("chosen", {})),
-        "from": departure.plain(),
-        **(more or {}),
-    }
-    first = header(lockstep_id(setting), then["task"], then["services"], "lockstep", given)
-    return JournalStore(JournalWriter(folder / JOURNAL, first), 0.0, durable=bool(given["durable"]))
 
 
 def point_of(engine: Engine, state: State, words: Mapping[str, str]) -> Point:

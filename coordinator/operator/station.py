@@ -1,128 +1,56 @@
 """A coordinator that stays: one page over any number of mission runs, idle until the operator
 starts one.
 
-Implements `coordinator.operator.port.MissionPort`. The feed and who holds the controls outlive each run,
-which a `MissionRun` or a `SimulatedRun` leads. What is idle is looked after here: which nodes are
-up, breakpoints and choices for the next run, and the emergency stop.
+Implements `coordinator.operator.port.MissionPort`. The feed and the holder of the controls outlive
+each run, which a `RunSession` leads. While no run is active, the station looks after the rest: which
+nodes are up, breakpoints and choices for the next run, and the emergency stop.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from petrobot.coordinator.background import BackgroundProcess
-from petrobot.coordinator.engine import Engine
-from petrobot.coordinator.launch import (
-    SCRIPTED,
-    Setting,
-    Substitutes,
-    load_object,
-    lockstep_id,
-    mission_id,
-    with_runs,
-)
 from petrobot.coordinator.learning.estimates_file import EstimatesError
 from petrobot.coordinator.operator.controls import Answer, Controls, refusal
 from petrobot.coordinator.operator.door_file import Door
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP, order_all
 from petrobot.coordinator.operator.feed import Feed
-from petrobot.coordinator.operator.history import task_of
-from petrobot.coordinator.operator.live_run import MissionRun
 from petrobot.coordinator.operator.net_state import picture
 from petrobot.coordinator.operator.observation import shown_selectors
 from petrobot.coordinator.operator.run_state import Narrator
-from petrobot.coordinator.operator.simulated_run import SimulatedRun
-from petrobot.coordinator.operator.start_from import departed_store, departing, departure
-from petrobot.coordinator.operator.start_order import LOCKSTEP, StartOrder, read_depart, read_start
+from petrobot.coordinator.operator.session import (
+    LOCKSTEP,
+    RunRequest,
+    RunSession,
+    prepare,
+    prepare_from,
+)
+from petrobot.coordinator.operator.start_form import read_depart, read_start
+from petrobot.coordinator.operator.start_from import read_recorded
 from petrobot.coordinator.page.task_store import StoreError, TaskStore, TaskText
-from petrobot.coordinator.run.folder import JOURNAL, header
+from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.interfaces import FirstAlternative
-from petrobot.coordinator.run.journal import JournalError, JournalWriter, read_journal
+from petrobot.coordinator.run.journal import JournalError
+from petrobot.coordinator.run.mission import MissionError
 from petrobot.coordinator.run.node_status import ask_all
 from petrobot.coordinator.run.realtime import UnreachableError, credentials_of
-from petrobot.coordinator.run.recording import JournalStore, ReplayError, clock_reading
+from petrobot.coordinator.run.recording import ReplayError
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import TaskFileError, loads
-from petrobot.services.comm.location_file import Directory, DirectoryError, parse
+from petrobot.services.comm.location_file import Directory, DirectoryError
 
-# Makes the mission runs of a station: over the nodes, in lock step, or in lock step from a point of a recorded run.
+_log = logging.getLogger(__package__)
 
 FAULTS = (JournalError, ReplayError, TaskFileError, DirectoryError, EstimatesError, OSError)
 """What a start may break on beside ValueError and KeyError: files that are not what they should
 be."""
-
-
-@dataclass(frozen=True)
-class Starting:
-    """What every run of one station is made of; `estimates` is where it keeps what is learned."""
-
-    directory: Directory
-    runs: Path
-    mock: Path | None = None
-    estimates: Path = Path("estimates")
-
-    def live(self, task: Task, text: str, order: StartOrder) -> MissionRun:
-        """A run in real time, not connected yet; for the station's own loop."""
-        return MissionRun(self.directory, task, text, order, self.runs, self.mock)
-
-    def simulated(self, task: Task, text: str, order: StartOrder) -> SimulatedRun:
-        """A run in lock step, with the laboratory loaded; for a thread of its own."""
-        learn = order.learn
-        session = (
-            None if learn is None else learn.session(task, self.directory, order.mode, order.seed)
-        )
-        selector = FirstAlternative() if session is None else session.selector
-        setting = Setting(task, order.parameters, order.runs, order.seed, selector)
-        given = {
-            "services_path": str(self.directory.source.resolve()),
-            "seed": setting.seed,
-            "runs": with_runs(task, order.runs)[1],
-            "parameters": {**task.parameters, **order.parameters},
-            "clock": clock_reading(0.0),
-            "durable": False,
-            "mock": str(self.mock.resolve()) if self.mock else "",
-            "cell": "launched",
-            "chosen": {},
-            **({} if session is None else {"learning": session.beginning()}),
-        }
-        services = self.directory.source.read_text(encoding="utf-8")
-        first = header(lockstep_id(setting), text, services, order.mode, given)
-        store = JournalStore(JournalWriter(self.runs / mission_id(task) / JOURNAL, first), 0.0)
-        return SimulatedRun(
-            self.directory, setting, store, order.pace, session, self._scripted(self.mock)
-        )
-
-    def departed(self, data: Mapping[str, Any]) -> tuple[Task, SimulatedRun]:
-        """A run in lock step from a point of a recorded one, and its task; for a thread of its
-        own."""
-        name = str(data["from"].get("run", "")) if isinstance(data["from"], Mapping) else ""
-        if name not in {path.parent.name for path in self.runs.glob(f"*/{JOURNAL}")}:
-            raise ValueError(f"from.run: there is no run {name!r}")
-        journal = read_journal(self.runs / name / JOURNAL)
-        task = task_of(journal)
-        order = read_depart(task, data)
-        directory = parse(journal.header["services"], Path(journal.header["services_path"]))
-        engine = Engine(task, {a.name: a.device for a in directory.actions.values() if a.device})
-        point = departure(journal, engine, name, order.record, order.going)
-        setting = departing(journal, task, engine, point, order.seed, order.parameters)
-        store = departed_store(journal, setting, point, self.runs / mission_id(task))
-        mock = journal.header.get("mock")
-        scripted = self._scripted(Path(mock) if mock else None)
-        return task, SimulatedRun(directory, setting, store, order.pace, None, scripted, point)
-
-    def _scripted(self, mock: Path | None) -> Substitutes | None:
-        if mock is None:
-            return None
-        try:
-            scripted: Substitutes = load_object(SCRIPTED)(mock)
-        except Exception as fault:
-            raise ValueError(f"{mock}: {fault}") from fault
-        return scripted
 
 
 LOOK, PATIENCE = 2.0, 1.5
@@ -132,19 +60,6 @@ LAST_WORDS = 10.0
 FAULTS_TOLD = 3
 OVER = frozenset({"success", "failure", "error", "aborted", "stopped"})
 """States of a mission run that has ended."""
-
-
-class Run(Protocol):
-    """A mission run that goes on, whatever leads it."""
-
-    async def command(self, who: str, verb: str, data: Mapping[str, Any]) -> Answer:
-        """Carry out a command."""
-
-    def abort(self, reason: str) -> None:
-        """Give it up, whoever holds the controls."""
-
-    async def finish(self) -> None:
-        """Lead it to its end and leave everything in good order."""
 
 
 class Station:
@@ -164,12 +79,12 @@ class Station:
         self.controls = Controls(self.feed)
         self.door: Callable[[str], Door] | None = None
         self._tasks = tasks
-        self._starting_by = Starting(directory, runs, mock, estimates)
+        self._runs, self._mock, self._estimates = runs, mock, estimates
         self._loaded = self._revision = ""
         self._stops: set[str] = set()
         self._choices: dict[str, str] = {}
         self._nodes: Mapping[str, Any] = {}
-        self._run: Run | None = None
+        self._run: RunSession | None = None
         self._apart = BackgroundProcess()
         self._starting = self._stopped = False
         self._going: asyncio.Task[None] | None = None
@@ -183,9 +98,9 @@ class Station:
         self._looking.cancel()
         await asyncio.gather(self._looking, self._apart.close(), return_exceptions=True)
         going, run = self._going, self._run
-        if going is None or run is None:
+        if going is None or run is None or run.operation is None:
             return
-        run.abort("petrobot is told to end")
+        run.operation.abort("petrobot is told to end")
         _, late = await asyncio.wait({going}, timeout=LAST_WORDS)
         for task in late:
             task.cancel()
@@ -212,11 +127,12 @@ class Station:
             return await self._guarded(
                 self._start if verb == "start" else self._load, verb, who, data
             )
-        if verb == "estop" and isinstance(self._run, SimulatedRun):
-            await self._run.command(who, verb, data)
-            return await self._estop(who, data)  # whoever presses it means the real devices, too
-        if self._run is not None:
-            return await self._run.command(who, verb, data)
+        if self._run is not None and self._run.operation is not None:
+            simulated = self._run.mode == LOCKSTEP
+            answer = await self._run.operation.command(who, verb, data)
+            if verb == "estop" and simulated:
+                return await self._estop(who, data)  # the operator means the real devices, too
+            return answer
         idle: dict[str, Callable[[str, Mapping[str, Any]], Awaitable[Answer]]] = {
             "breakpoint": self._breakpoint,
             "override_selector": self._override,
@@ -235,11 +151,12 @@ class Station:
         data: Mapping[str, Any],
     ) -> Answer:
         try:
-            return await carry_out(who, data)
-        except (KeyError, TypeError, ValueError) as fault:
-            return refusal("bad_data", f"{verb}: {fault}")
-        except FAULTS as fault:
-            return refusal("bad_data", f"{verb}: {fault}")
+            answer = await carry_out(who, data)
+        except (KeyError, TypeError, ValueError, *FAULTS) as fault:
+            answer = refusal("bad_data", f"{verb}: {fault}")
+        if not answer["ok"]:
+            _log.info("refused %s of %s: %s", verb, who, answer["text"])
+        return answer
 
     def offers(self) -> Sequence[Mapping[str, Any]]:
         """Every action that services.toml places, and whether its node is up and says that it
@@ -251,7 +168,7 @@ class Station:
 
     async def form(self, name: str) -> Mapping[str, Any]:
         """What may be asked for when a task is started. Raises RefusedError."""
-        given = {**self._tasks.folders, "name": name, "estimates": str(self._starting_by.estimates)}
+        given = {**self._tasks.folders, "name": name, "estimates": str(self._estimates)}
         said: dict[str, Any] = json.loads(await self._apart.do("form", given))
         return said
 
@@ -327,28 +244,37 @@ class Station:
         if name != self._loaded:
             self._forget(name)
         self._revision = text.revision
-        order = read_start(task, data, self._starting_by.estimates)
-        if order.mode == LOCKSTEP:
-            return self._simulated(
-                await asyncio.to_thread(self._starting_by.simulated, task, text.text, order)
-            )
-        return await self._live(task, text.text, order)
+        request = self._own(read_start(task, data, self._estimates))
+        if request.mode == LOCKSTEP:
+            run = await asyncio.to_thread(prepare, request, task, text.text, self.directory)
+        else:
+            run = prepare(request, task, text.text, self.directory)
+        try:
+            await run.connect()
+        except UnreachableError as fault:
+            await run.abandon()
+            return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
+        return self._follow(run)
 
     async def _departed(self, data: Mapping[str, Any]) -> Answer:
         """A simulated run from a point of a recorded one."""
-        task, run = await asyncio.to_thread(self._starting_by.departed, data)
-        name = (
-            task.name if task.name in self._tasks.names() else ""
-        )  # its file may be gone, or called otherwise
+        run = await asyncio.to_thread(self._prepared_from, data)
+        task = run.mission.executor.task.name
+        name = task if task in self._tasks.names() else ""  # its file may be gone or renamed
         if name != self._loaded:
             self._forget(name)
-        return self._simulated(run)
+        return self._follow(run)
 
-    def _simulated(self, run: SimulatedRun) -> Answer:
-        run.lead(self.feed, self.controls, self.door, self._stops, self._choices)
-        self._tell_file()
-        self._follow(run)
-        return {"ok": True, "run": run.identity}
+    def _prepared_from(self, data: Mapping[str, Any]) -> RunSession:
+        name = str(data["from"].get("run", "")) if isinstance(data["from"], Mapping) else ""
+        if name not in {path.parent.name for path in self._runs.glob(f"*/{JOURNAL}")}:
+            raise ValueError(f"from.run: there is no run {name!r}")
+        found = read_recorded(self._runs / name / JOURNAL)
+        return prepare_from(self._own(read_depart(found.task, data), mock=False), found)
+
+    def _own(self, request: RunRequest, *, mock: bool = True) -> RunRequest:
+        """A request with what every run of this station has in common."""
+        return replace(request, folder=self._runs, mock=self._mock if mock else None)
 
     async def _faults(self, text: TaskText) -> Answer | None:
         """Why a task may not run: what the check finds."""
@@ -362,36 +288,34 @@ class Station:
         more = f"; and {len(faults) - FAULTS_TOLD} more" if len(faults) > FAULTS_TOLD else ""
         return {**refusal("faults", f"{text.name} may not run: {told}{more}"), "findings": faults}
 
-    async def _live(self, task: Task, text: str, order: StartOrder) -> Answer:
-        run = self._starting_by.live(task, text, order)
-        try:
-            await run.connect()
-        except UnreachableError as fault:
-            run.discard()
-            return {**refusal("unreachable", str(fault)), "nodes": list(fault.nodes)}
-        run.lead(self.feed, self.controls, self.door, self._stops, self._choices)
+    def _follow(self, run: RunSession) -> Answer:
+        """Let operators see and steer a run, and lead it to its end."""
+        run.operate(self.feed, self.controls, starts=True, stops=self._stops, choices=self._choices)
+        run.door = self.door(run.identity) if self.door is not None else None
         self._tell_file()
-        self._follow(run)
-        return {"ok": True, "run": run.identity}
-
-    def _follow(self, run: Run) -> None:
         self._run = run
         self._going = asyncio.get_running_loop().create_task(self._to_its_end(run))
+        return {"ok": True, "run": run.identity}
 
-    async def _to_its_end(self, run: Run) -> None:
+    async def _to_its_end(self, run: RunSession) -> None:
         try:
-            await run.finish()
+            try:
+                await run.lead()
+            except MissionError as fault:
+                self._tell_error(str(fault), str(fault))
+            await asyncio.to_thread(run.keep_result)
+            self.feed.emit("result", result=run.result())
         except Exception as fault:  # a run that breaks must not take the station with it
             reason = f"{type(fault).__name__}: {fault}"
-            self.feed.emit("mission", mission={"state": "error", "reason": reason})
-            notice = {
-                "level": "error",
-                "text": f"the mission run broke: {reason}",
-                "at": self.feed.state["time"],
-            }
-            self.feed.emit("notice", notice=notice)
+            _log.exception("run %s broke", run.identity)
+            self._tell_error(reason, f"the mission run broke: {reason}")
         finally:
             self._run = self._going = None
+
+    def _tell_error(self, reason: str, text: str) -> None:
+        self.feed.emit("mission", mission={"state": "error", "reason": reason})
+        notice = {"level": "error", "text": text, "at": self.feed.state["time"]}
+        self.feed.emit("notice", notice=notice)
 
     def _narrator(self, task: Task) -> Narrator:
         return Narrator(
@@ -485,6 +409,11 @@ class Station:
             )
             if self.feed.state["nodes"].get(name) != state:
                 self.feed.emit("node", name=name, node=state)
+                if answer["up"]:
+                    _log.info("node %s is up at %s", name, answer["address"])
+                else:
+                    why = f" ({state['text']})" if state["text"] else ""
+                    _log.warning("waiting for node %s at %s%s", name, answer["address"], why)
 
 
 def _prepared(text: TaskText) -> Task:

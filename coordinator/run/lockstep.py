@@ -28,7 +28,7 @@ class CoordinatorParty:
         self.name = NAME
         self.mission = mission
         self._directory = directory
-        self._watch = watch
+        self.watch = watch
         self._begin = begin or mission.start
         self._now = 0.0
         self._nodes: dict[str, str] = {}
@@ -71,8 +71,8 @@ class CoordinatorParty:
             caller.up for caller in mission.callers.values()
         ):
             self._begin(now)
-        if self._watch is not None:
-            self._watch(now)
+        if self.watch is not None:
+            self.watch(now)
 
     def drain(self) -> Sequence[Envelope]:
         """What was sent since the last call, in order."""

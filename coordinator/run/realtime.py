@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from petrobot.services.comm.calls.caller import Notice, PeerBack, PeerLost
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.location_file import Directory
 from petrobot.services.comm.tls.credentials import COORDINATOR, Credentials, credentials
+
+_log = logging.getLogger(__package__)
 
 # How punctual the coordinator's own event loop is: its host's load, seen by one who only wants to wake up in time.
 
@@ -216,8 +219,10 @@ class RealtimeMission:
             for notice in notices:
                 if isinstance(notice, PeerLost):
                     self._lost_at[node] = self._loop.time()
+                    _log.info("link to node %s lost: %s", node, notice.reason)
                 elif isinstance(notice, PeerBack):
                     self._lost_at.pop(node, None)
+                    _log.info("link to node %s is up", node)
             if not self._closed:
                 self._guarded(lambda now: self.mission.take(now, node, notices))
 

@@ -7,16 +7,19 @@ import asyncio
 import contextlib
 import ctypes
 import functools
+import logging
 import os
 import signal
 import socket
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, BinaryIO
 
 from petrobot.services.host.whole_file import make_folder
+
+_log = logging.getLogger(__package__)
 
 PR_SET_PDEATHSIG = 1  # prctl(2): a child ends with its parent, also when that is killed
 FIRST_PAUSE = 0.25
@@ -87,12 +90,10 @@ class Supervisor:
         logs: Path,
         *,
         respawn: bool = True,
-        notice: Callable[[str], None] | None = None,
     ) -> None:
         make_folder(logs)
         self._children = [_Child(program, logs / f"{program.name}.log") for program in programs]
         self._respawn = respawn
-        self._notice = notice or (lambda _: None)
         self._stopping = False
         self._over = asyncio.Event()
 
@@ -154,10 +155,12 @@ class Supervisor:
     async def _until_ready(self, child: _Child, timeout: float) -> None:
         ready = asyncio.create_task(child.ready.wait())
         assert child.task is not None
+        _log.info("waiting for node %s; its log is %s", child.program.name, child.log)
         done, _ = await asyncio.wait(
             {ready, child.task}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED
         )
         if ready in done:
+            _log.info("node %s is ready", child.program.name)
             return
         ready.cancel()
         if child.task in done and isinstance(fault := child.task.exception(), OSError):
@@ -181,7 +184,7 @@ class Supervisor:
                 if loop.time() - started > STABLE_AFTER
                 else min(2 * pause, LONGEST_PAUSE)
             )
-            self._notice(f"node {child.program.name} died; starting it again in {pause:g} s")
+            _log.warning("node %s died; starting it again in %g s", child.program.name, pause)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._over.wait()
@@ -195,6 +198,9 @@ class Supervisor:
                     stdin=asyncio.subprocess.DEVNULL,
                     stdout=end,
                     stderr=log,
+                    # Ctrl-C in a terminal is for its whole process group: a node that shared ours
+                    # would end before we stop it, and look as if it had died.
+                    process_group=0,
                     preexec_fn=functools.partial(_end_with, os.getpid()),
                 )
                 end.close()

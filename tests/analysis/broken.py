@@ -12,7 +12,7 @@ from pathlib import Path
 
 from petrobot.coordinator.analysis.net.space import SearchLimits
 from petrobot.coordinator.analysis.report import Analysis, analyse
-from petrobot.coordinator.cli.witnesses import picture, refused
+from petrobot.coordinator.cli.analyse import picture, refused
 from petrobot.coordinator.task import End, Kind, Task, Transition
 from petrobot.coordinator.task.file import load
 

@@ -14,7 +14,7 @@ from petrobot.coordinator.analysis.net.ordinary import OrdinaryView
 from petrobot.coordinator.analysis.net.robot import one_run_each
 from petrobot.coordinator.analysis.net.space import SearchLimits, explore
 from petrobot.coordinator.cli import main
-from petrobot.coordinator.cli.witnesses import draw_witnesses, refused
+from petrobot.coordinator.cli.analyse import draw_witnesses, refused
 from petrobot.coordinator.drawing import Overlay, draw
 from petrobot.coordinator.task import Kind, Task
 from petrobot.coordinator.task.file import dumps, load

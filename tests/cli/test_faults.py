@@ -98,11 +98,11 @@ def petrobot(
         ),
         (
             "campaign work.toml --mock no.toml",
-            "no.toml: No such file or directory; give --mock a file of scripted",
+            "no.toml: No such file or directory; give a file of scripted",
         ),
         (
             "campaign work.toml --mock mock.toml",
-            "(did you mean 'recover'?); name one of its actions, or drop it here",
+            "(did you mean 'recover'?); name one of its actions, or remove it here",
         ),
         (
             "forecast --compare a b",

@@ -206,10 +206,11 @@ async def test_watch_tells_what_happens_until_the_end(petrobot: Terminal) -> Non
     """As lines for people, and as JSON lines; its exit code is the run's."""
     path = petrobot.folder / "changes.jsonl"
     watching = asyncio.create_task(petrobot("watch", "--json", str(path)))
-    await petrobot.until(lambda: path.exists() and path.stat().st_size > 0)
+    await petrobot.until(lambda: petrobot.operation.feed.watched)
     await petrobot.working()
     petrobot.arm.arrive()
     await petrobot.until(lambda: petrobot.tokens("arm_free") == 1)
+    assert path.read_text() == "", "the file is written in one piece, at the end"
     await petrobot("abort")
     assert (await watching).code == 1
     changes = [json.loads(line) for line in path.read_text().splitlines()]

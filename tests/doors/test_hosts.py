@@ -268,9 +268,7 @@ async def test_a_guarded_cell_works_and_keeps_its_secrets(tmp_path: Path, how: s
                 token["page token"] = json.loads(path.read_text())["token"]
             await beat(0.01)
 
-    async with Supervisor(
-        local_programs(cell.directory), tmp_path / "logs", respawn=False, notice=cell.said.append
-    ):
+    async with Supervisor(local_programs(cell.directory), tmp_path / "logs", respawn=False):
         options = ("--journal", "runs", "--report", "report", "--json", "out.json", "--no-page")
         running = asyncio.ensure_future(
             asyncio.to_thread(cell.petrobot, "run", "sweeping.toml", *options)

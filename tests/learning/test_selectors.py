@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from petrobot.coordinator.cli.learning_options import SELECTORS
+from petrobot.coordinator.cli.run import SELECTORS
 from petrobot.coordinator.learning.batch import SUMS, Batch, Response, drawn, restricted
 from petrobot.coordinator.learning.estimate import Observation, Tally
 from petrobot.coordinator.learning.objective import Question

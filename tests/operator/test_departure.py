@@ -3,6 +3,7 @@ itself, from anywhere it ends."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,25 +15,22 @@ from hypothesis import strategies as st
 
 from petrobot.coordinator.cli import main
 from petrobot.coordinator.engine import Engine, Phase
-from petrobot.coordinator.launch import Setting, lockstep_cell, lockstep_id
-from petrobot.coordinator.operator.start_from import (
-    ENDS,
-    DepartureError,
-    departed_store,
-    departing,
-    departure,
+from petrobot.coordinator.operator.session import (
+    RecordedPoint,
+    RunRequest,
+    RunSession,
+    prepare_from,
 )
+from petrobot.coordinator.operator.start_from import ENDS, DepartureError, read_recorded
 from petrobot.coordinator.run.folder import JOURNAL
 from petrobot.coordinator.run.journal import Journal, read_journal
-from petrobot.coordinator.run.recording import JournalStore, replay
+from petrobot.coordinator.run.recording import replay
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import load
 from petrobot.services.comm.location_file import Directory, parse
-from petrobot.services.scripted import load as script_of
 from tests.run.test_runfolder import SCRIPT, SERVICES
 
 TASK = Path(__file__).parents[1] / "chaos" / "shuttle.toml"
-TICKS = 20_000
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +76,20 @@ def parts(cell: Path) -> tuple[Journal, Task, Directory, Engine]:
     return read_journal(the_run(cell) / JOURNAL), task, directory, Engine(task)
 
 
-def simulate(
-    cell: Path, directory: Directory, setting: Setting, store: JournalStore
-) -> dict[str, Any]:
-    """Run to the end in this process."""
-    lab, party = lockstep_cell(directory, setting, script_of(cell / "mock.toml"), None, store)
-    assert lab.run(lambda: party.over, TICKS), "it has no end"
-    store.writer.close()
-    return party.mission.result("lockstep", 0.0)
+def simulate(cell: Path, run: Path, seed: int, record: int = 0, **start: Any) -> RunSession:
+    """A run from a record of `run`, led to its end in this process."""
+    request = RunRequest(
+        "lockstep",
+        seed=seed,
+        pace=0.0,
+        start=RecordedPoint("then", record, **start),
+        folder=cell / "runs",
+        mock=cell / "mock.toml",
+    )
+    session = prepare_from(request, read_recorded(run / JOURNAL))
+    asyncio.run(asyncio.wait_for(session.lead(), 60.0))
+    session.keep_result()
+    return session
 
 
 def plain(journal: Journal) -> list[tuple[str, Any]]:
@@ -102,19 +106,15 @@ def plain(journal: Journal) -> list[tuple[str, Any]]:
 @given(seed=st.integers(0, 2**31))
 def test_from_the_beginning_with_the_same_seed_it_is_the_run_itself(cell: Path, seed: int) -> None:
     """Record by record, for any seed."""
-    _, task, directory, engine = parts(cell)
-    then, number = the_run(cell), len(list((cell / "runs").iterdir()))
-    first = departure(read_journal(then / JOURNAL), engine, "then", 0)
+    then = the_run(cell)
     made = []
-    for turn in range(2):
-        journal = read_journal(then / JOURNAL)
-        setting = departing(journal, task, engine, first, seed)
-        folder = cell / "runs" / f"same-{seed}-{number}-{turn}"
-        simulate(cell, directory, setting, departed_store(journal, setting, first, folder))
-        then = folder
-        made.append(plain(read_journal(folder / JOURNAL)))
+    for _ in range(2):
+        session = simulate(cell, then, seed)
+        assert session.folder is not None
+        then = session.folder
+        made.append(plain(read_journal(then / JOURNAL)))
+        assert session.mission.executor.mission.endswith(f"/{seed}")
     assert made[0] == made[1]
-    assert lockstep_id(setting).endswith(f"/{seed}")
 
 
 def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
@@ -152,7 +152,7 @@ def test_the_run_itself_comes_from_the_command_line(cell: Path) -> None:
 def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> None:
     """Whatever becomes of the runs that went on; the first marking is that of the record, and
     replay derives it all again."""
-    journal, task, directory, engine = parts(cell)
+    journal, task, _, engine = parts(cell)
     last = journal.records[-1].number
     record = data.draw(st.integers(0, last - 1), label="record")
     steps = [step for step in replay(journal, engine) if step.number <= record]
@@ -164,16 +164,12 @@ def test_from_any_record_it_reaches_an_end(cell: Path, data: st.DataObject) -> N
     going = {place: data.draw(st.sampled_from(ENDS), label=place) for place in live}
     seed = data.draw(st.integers(0, 99), label="seed")
     try:
-        point = departure(journal, engine, "then", record, going)
+        session = simulate(cell, the_run(cell), seed, record, going=going)
     except DepartureError:
         assert record > max(r.number for r in journal.records if r.kind == "stimulus")
         return
-    setting = departing(journal, task, engine, point, seed)
-    number = len(list((cell / "runs").iterdir()))
-    folder = cell / "runs" / f"any-{number}"
-    result = simulate(cell, directory, setting, departed_store(journal, setting, point, folder))
-    assert result["status"] == "success"
-    made = read_journal(folder / JOURNAL)
+    assert session.result()["status"] == "success" and session.folder is not None
+    made = read_journal(session.folder / JOURNAL)
     assert made.header["from"]["record"] == record
     derived = list(replay(made, Engine(task)))
     begun = next(step for step in derived if step.stimulus.__class__.__name__ == "Begin")

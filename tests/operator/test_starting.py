@@ -18,13 +18,8 @@ from petrobot.coordinator.cli import main
 from petrobot.coordinator.operator import station
 from petrobot.coordinator.operator.emergency_stop import CLEAR, STOP
 from petrobot.coordinator.operator.history import opened
-from petrobot.coordinator.operator.simulated_run import SimulatedRun
-from petrobot.coordinator.operator.start_order import (
-    StartOrder,
-    read_depart,
-    read_start,
-    start_form,
-)
+from petrobot.coordinator.operator.session import RunRequest
+from petrobot.coordinator.operator.start_form import read_depart, read_start, start_form
 from petrobot.coordinator.operator.station import Station
 from petrobot.coordinator.page.task_store import TaskStore
 from petrobot.coordinator.run.folder import JOURNAL, RESULT
@@ -114,7 +109,7 @@ def test_the_form_has_types_defaults_and_the_authors_words(tmp_path: Path) -> No
 
 def test_everything_that_the_command_line_takes_is_read(tmp_path: Path) -> None:
     """All fields at once, and none."""
-    assert read_start(MOVING, {}, tmp_path) == StartOrder()
+    assert read_start(MOVING, {}, tmp_path) == RunRequest()
     learn = {
         "file": "mine",
         "selector": "thompson",
@@ -127,8 +122,8 @@ def test_everything_that_the_command_line_takes_is_read(tmp_path: Path) -> None:
     assert (order.mode, order.runs, order.seed, order.pace) == ("lockstep", 7, 4, 10.0)
     assert order.parameters == {"speed": 1.0, "quiet": True, "regime": "wild"}
     assert type(order.parameters["speed"]) is float
-    assert order.learn is not None and order.learn.path == tmp_path / "mine.db"
-    assert (order.learn.selector, order.learn.contexts, order.learn.frozen) == (
+    assert order.learning is not None and order.learning.path == tmp_path / "mine.db"
+    assert (order.learning.selector, order.learning.contexts, order.learning.frozen) == (
         "thompson",
         ("regime",),
         True,
@@ -209,13 +204,14 @@ def test_whatever_comes_is_an_order_or_a_refusal(data: dict[str, Any], tmp_path:
     else:
         assert order.runs is None or order.runs >= 1
         assert all(type(v) is type(MOVING.parameters[k]) for k, v in order.parameters.items())
-        assert order.learn is None or order.learn.path.parent == tmp_path
+        assert order.learning is None or order.learning.path.parent == tmp_path
     if "from" in data:
         try:
             depart = read_depart(MOVING, data)
         except ValueError:
             return
-        assert isinstance(depart.run, str) and depart.record >= 0
+        assert depart.start is not None
+        assert isinstance(depart.start.run, str) and depart.start.record >= 0
 
 
 # ---- in lock step, live
@@ -270,8 +266,8 @@ async def test_a_run_in_lock_step_is_steered(cell: Simulated) -> None:
     assert answer["ok"], answer
     await cell.until(lambda: cell.state["paused"] is not None)
     run = cell.station._run
-    assert isinstance(run, SimulatedRun) and run._operation is not None
-    shell = run._operation.shell
+    assert run is not None and run.operation is not None
+    shell = run.operation.shell
     await cell.until(lambda: cell.state["time"] == shell.now())
     time, fired = cell.state["time"], cell.state["mission"]["firings"]
     for _ in range(20):
@@ -329,8 +325,10 @@ async def test_a_run_in_lock_step_learns(cell: Simulated, tmp_path: Path) -> Non
     a frozen one adds nothing."""
     learn = {"file": "mine", "selector": "thompson"}
     _, first = await cell.simulate(runs=6, learn=learn)
-    assert first["learned"] == {
-        "file": "mine.db",
+    learned = dict(first["learned"])
+    assert sum(learned.pop("probabilities")["look"].values()) == pytest.approx(1.0, abs=1e-3)
+    assert learned == {
+        "file": str(tmp_path / "estimates" / "mine.db"),
         "selector": "thompson",
         "context": "",
         "runs_counted": 12,

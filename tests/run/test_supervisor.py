@@ -35,23 +35,25 @@ def gone(process: int) -> bool:
     return False
 
 
-async def until_said(said: list[str], count: int) -> None:
-    """Wait for so many notices."""
+def deaths(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """What was logged of programs that died."""
+    return [text for text in caplog.messages if " died; " in text]
+
+
+async def until_died(caplog: pytest.LogCaptureFixture, count: int) -> None:
+    """Wait for so many deaths."""
     async with asyncio.timeout(60.0):
-        while len(said) < count:
+        while len(deaths(caplog)) < count:
             await beat(0.01)
 
 
 async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor(
-    tmp_path: Path,
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    said: list[str] = []
-    async with Supervisor(
-        [program("a", STEADY), program("b", STEADY)], tmp_path, notice=said.append
-    ) as keeper:
+    async with Supervisor([program("a", STEADY), program("b", STEADY)], tmp_path) as keeper:
         before = keeper.process_ids()
         os.kill(before["a"], signal.SIGKILL)
-        await until_said(said, 1)
+        await until_died(caplog, 1)
         async with asyncio.timeout(60.0):
             while keeper.process_ids().get("a", before["a"]) == before["a"]:
                 await beat(0.01)
@@ -61,12 +63,13 @@ async def test_a_killed_program_is_started_again_and_all_end_with_the_supervisor
     assert all(gone(process) for process in last)
 
 
-async def test_one_that_keeps_dying_is_started_more_and_more_slowly(tmp_path: Path) -> None:
+async def test_one_that_keeps_dying_is_started_more_and_more_slowly(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """The pause doubles with each early death, so that a broken node does not eat the host."""
-    said: list[str] = []
-    async with Supervisor([program("a", BRIEF)], tmp_path, notice=said.append):
-        await until_said(said, 3)
-    pauses = [float(text.rpartition(" in ")[2].removesuffix(" s")) for text in said[:3]]
+    async with Supervisor([program("a", BRIEF)], tmp_path):
+        await until_died(caplog, 3)
+    pauses = [float(text.rpartition(" in ")[2].removesuffix(" s")) for text in deaths(caplog)[:3]]
     assert pauses == [0.5, 1.0, 2.0]
 
 
@@ -94,6 +97,12 @@ async def test_one_that_does_not_come_up_is_named_with_the_end_of_its_log(tmp_pa
     )
 
 
+async def test_ctrl_c_in_a_terminal_ends_no_node_before_its_launcher_does(tmp_path: Path) -> None:
+    """The signal goes to the launcher's process group; a node in it would seem to have died."""
+    async with Supervisor([program("a", STEADY)], tmp_path) as keeper:
+        assert os.getpgid(keeper.process_ids()["a"]) != os.getpgid(0)
+
+
 async def test_those_that_others_need_are_ready_first(tmp_path: Path) -> None:
     """The laboratory's bus must be there before the node that opens it starts."""
     mark = tmp_path / "there"
@@ -109,18 +118,19 @@ async def test_one_that_does_not_end_when_asked_is_killed(tmp_path: Path) -> Non
     assert gone(process)
 
 
-async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(tmp_path: Path) -> None:
+async def test_what_a_dead_program_has_left_running_does_not_hide_its_death(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Its child holds its output open, and goes on talking."""
     talker = "while echo alive; do sleep 0.05; done"
     leaver = (
         f"import subprocess; print(subprocess.Popen(['sh', '-c', {talker!r}]).pid, "
         f"flush=True); {STEADY}"
     )
-    said: list[str] = []
     try:
-        async with Supervisor([program("a", leaver)], tmp_path, notice=said.append) as keeper:
+        async with Supervisor([program("a", leaver)], tmp_path) as keeper:
             os.kill(keeper.process_ids()["a"], signal.SIGKILL)
-            await until_said(said, 1)
+            await until_died(caplog, 1)
             async with asyncio.timeout(60.0):
                 while keeper.starts("a") < 2 or not keeper.process_ids():
                     await beat(0.01)

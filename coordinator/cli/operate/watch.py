@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import io
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.operate import hand
 from petrobot.services.host.json_text import json_text
+from petrobot.services.host.whole_file import write_whole
 
 if TYPE_CHECKING:
     from petrobot.coordinator.operator.client import OperatorClient
@@ -40,9 +42,15 @@ def run(options: argparse.Namespace) -> int:
     """Watch; 0 when the run ends in success, 1 when it ends otherwise."""
     if options.json in (None, "-"):
         return asyncio.run(_watch(options, sys.stdout))
+    path, lines = Path(options.json), io.StringIO()
     try:
-        with Path(options.json).open("w", encoding="utf-8") as file:
-            return asyncio.run(_watch(options, file))
+        with path.open("a", encoding="utf-8") as file:  # refused now if it cannot be written
+            if not path.is_file():  # a pipe or a terminal: every line at once
+                return asyncio.run(_watch(options, file))
+        try:
+            return asyncio.run(_watch(options, lines))
+        finally:
+            write_whole(path, lines.getvalue())
     except OSError as fault:
         raise CommandError(2, f"{options.json}: {fault.strerror or fault}") from fault
 

@@ -1,9 +1,9 @@
-"""What an operator says when he starts a run from the page: read from plain data, refused with a
-word, and offered as a form.
+"""The form with which an operator starts a run on the page: offered with types and defaults, read
+from plain data, refused with the field that is wrong.
 
 The page can ask for what `petrobot run` can: real time or lock step, number of runs, seed, the
 task's own parameters, learning into an estimates file; and, in lock step, a point of a recorded run
-to set out from.
+to start from.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,17 +21,20 @@ from tomlkit.items import Item
 from petrobot.coordinator.background import RefusedError
 from petrobot.coordinator.learning.learner import usual_contexts
 from petrobot.coordinator.learning.selectors import DEFAULT, RULES
-from petrobot.coordinator.learning.session import LearningSession, LearningSetting
+from petrobot.coordinator.learning.session import LearningSetting
+from petrobot.coordinator.operator.session import (
+    LOCKSTEP,
+    MODES,
+    REALTIME,
+    SEED,
+    RecordedPoint,
+    RunRequest,
+)
 from petrobot.coordinator.operator.start_from import AGAIN
 from petrobot.coordinator.page.task_store import StoreError, TaskStore
 from petrobot.coordinator.task import Task
 from petrobot.coordinator.task.file import loads
-from petrobot.services.comm.location_file import Directory
-from petrobot.services.host.whole_file import make_folder
 
-REALTIME, LOCKSTEP = "realtime", "lockstep"
-MODES: Final = (REALTIME, LOCKSTEP)
-SEED: Final = 1
 LONGEST_TEXT: Final = 10_000
 MOST_RUNS: Final = 1_000_000
 LARGEST_SEED: Final = 2**63 - 1
@@ -45,59 +47,9 @@ _KNOWN: Final = frozenset(
 )
 
 
-@dataclass(frozen=True)
-class Learn:
-    """Learning that was asked for, as `--learn`, `--selector`, `--target`, `--context` and
-    `--frozen` do."""
-
-    path: Path
-    selector: str = DEFAULT
-    target: float | None = None
-    contexts: tuple[str, ...] | None = None
-    frozen: bool = False
-
-    def session(self, task: Task, directory: Directory, mode: str, seed: int) -> LearningSession:
-        """Open it. Raises EstimatesError, ValueError."""
-        declared = (
-            {a.name: a.compute_time for a in directory.actions.values()}
-            if mode == LOCKSTEP
-            else None
-        )
-        given = LearningSetting(
-            self.path, self.selector, self.target, self.contexts, {}, self.frozen, declared
-        )
-        return LearningSession(task, given, seed)
-
-
-@dataclass(frozen=True)
-class StartOrder:
-    """How a run is to be started."""
-
-    mode: str = REALTIME
-    runs: int | None = None
-    """None: as many as the task file says."""
-    seed: int = SEED
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    learn: Learn | None = None
-    pace: float = 1.0
-    """In lock step: simulated seconds a second at most; 0: as fast as it goes."""
-
-
-@dataclass(frozen=True)
-class DepartOrder:
-    """A simulated run from a point of a recorded one; None: as the recorded run had it."""
-
-    run: str
-    record: int
-    going: Mapping[str, str] | str = AGAIN
-    seed: int | None = None
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    pace: float = 1.0
-
-
-def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> StartOrder:
-    """What a client asked for. Raises ValueError that names the field, what is wrong with it, and
-    what would do."""
+def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> RunRequest:
+    """What a client asked for; `estimates` is the folder of estimates files. Raises ValueError that
+    names the field, what is wrong with it, and what would do."""
     _refuse_unknown(data)
     mode = data.get("mode") or REALTIME
     if mode not in MODES:
@@ -107,18 +59,19 @@ def read_start(task: Task, data: Mapping[str, Any], estimates: Path) -> StartOrd
         if not task.runs_place:
             raise ValueError(f"runs: {task.name} counts no runs (it names no runs_place)")
         runs = _whole("runs", runs, 1, MOST_RUNS)
-    return StartOrder(
+    return RunRequest(
         mode,
         runs,
         SEED if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED),
         read_parameters(task, _with_regime(data)),
-        None if data.get("learn") is None else _learn(data["learn"], estimates),
-        _pace(data.get("pace")),
+        learning=None if data.get("learn") is None else _learn(data["learn"], estimates),
+        pace=_pace(data.get("pace")),
     )
 
 
-def read_depart(task: Task, data: Mapping[str, Any]) -> DepartOrder:
-    """A start with `from`: {run, record, going}. Raises ValueError."""
+def read_depart(task: Task, data: Mapping[str, Any]) -> RunRequest:
+    """A start with `from`: {run, record, going}; without a seed, that of the recorded run. Raises
+    ValueError."""
     _refuse_unknown(data)
     source = data["from"]
     if not isinstance(source, Mapping) or not isinstance(source.get("run"), str):
@@ -140,13 +93,12 @@ def read_depart(task: Task, data: Mapping[str, Any]) -> DepartOrder:
         raise ValueError(f"from.going: {_shown(going)} is no word and no object of words by place")
     seed = None if data.get("seed") is None else _whole("seed", data["seed"], 0, LARGEST_SEED)
     record = _whole("from.record", source.get("record", 0), 0, 2**53)
-    return DepartOrder(
-        source["run"],
-        record,
-        going,
-        seed,
-        read_parameters(task, _with_regime(data)),
-        _pace(data.get("pace")),
+    return RunRequest(
+        LOCKSTEP,
+        seed=seed,
+        parameters=read_parameters(task, _with_regime(data)),
+        pace=_pace(data.get("pace")),
+        start=RecordedPoint(source["run"], record, going),
     )
 
 
@@ -168,18 +120,6 @@ def read_parameters(task: Task, given: Mapping[str, Any]) -> dict[str, Any]:
             raise ValueError(f"parameter {name}: {_shown(value)} is no text of Unicode")
         made[name] = value
     return made
-
-
-def learned_of(session: LearningSession, *, interrupted: bool) -> dict[str, Any]:
-    """Save what a run learned; what its result says of it. Raises EstimatesError."""
-    make_folder(session.setting.path.parent)
-    counted = session.save(interrupted=interrupted)
-    told = {
-        "file": session.setting.path.name,
-        "selector": session.setting.selector,
-        "context": session.selector.context,
-    }
-    return {"learned": {**told, "runs_counted": counted}}
 
 
 def start_form(task: Task, text: str, estimates: Path) -> dict[str, Any]:
@@ -260,7 +200,7 @@ def _with_regime(data: Mapping[str, Any]) -> dict[str, Any]:
     )
 
 
-def _learn(given: Any, folder: Path) -> Learn:
+def _learn(given: Any, folder: Path) -> LearningSetting:
     if not isinstance(given, Mapping):
         raise ValueError("learn: {file, selector, target, contexts, frozen} is needed")
     name, selector = given.get("file"), given.get("selector") or DEFAULT
@@ -285,12 +225,12 @@ def _learn(given: Any, folder: Path) -> Learn:
     if type(frozen) is not bool:
         raise ValueError(f"learn.frozen: {_shown(frozen)} is neither true nor false")
     parts = None if contexts is None else tuple(c for c in contexts if c.strip())
-    return Learn(
+    return LearningSetting(
         folder / f"{name}{SUFFIX}",
         selector,
         None if target is None else float(target),
         parts,
-        frozen,
+        frozen=frozen,
     )
 
 
