@@ -20,6 +20,8 @@ SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; they are known by their bare names."""
 SHIPPED_CELL = (Path(__file__).parents[2] / "services.toml").resolve()
 """The location file that comes with petrobot: that of the catching cell."""
+NODE_LOGS = Path("runs/logs")
+"""Where the commands that start nodes keep their logs, a file each."""
 OWN = Path("tasks")
 """Where the operator's page saves tasks: beside what one works on."""
 
@@ -33,6 +35,16 @@ def add_services_argument(parser: argparse.ArgumentParser) -> None:
         help="the location file (default: the one that the task names in `services`, where "
         "there is a task that does, "
         "else services.toml here, else the one that comes with petrobot)",
+    )
+
+
+def add_log_level_argument(parser: argparse.ArgumentParser) -> None:
+    """`--log-level LEVEL`, of the nodes that a command starts."""
+    parser.add_argument(
+        "--log-level",
+        choices=("debug", "info", "warning", "error"),
+        default="info",
+        help="what nodes log (default: %(default)s; debug: every message, too)",
     )
 
 

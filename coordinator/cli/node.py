@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 
 from petrobot.coordinator.cli.exec import become
-from petrobot.coordinator.cli.loading import add_services_argument, services_path
+from petrobot.coordinator.cli.loading import (
+    add_log_level_argument,
+    add_services_argument,
+    services_path,
+)
 
 EXAMPLE = "petrobot node vision --services services.toml"
 
@@ -14,8 +18,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("name", help="the node's name in services.toml")
     add_services_argument(parser)
+    add_log_level_argument(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Become the node."""
-    become("petrobot.services", options.name, "--services", str(services_path(options.services)))
+    become(
+        "petrobot.services",
+        options.name,
+        "--services",
+        str(services_path(options.services)),
+        "--log-level",
+        options.log_level,
+    )

@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
-from petrobot.coordinator.cli.loading import add_services_argument, load_directory, refuse_misplaced
+from petrobot.coordinator.cli.loading import (
+    NODE_LOGS,
+    add_log_level_argument,
+    add_services_argument,
+    load_directory,
+    refuse_misplaced,
+)
 from petrobot.coordinator.cli.lockstep import substitutes
 from petrobot.services.host.command_line import number
 
@@ -26,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--logs",
         type=Path,
-        default=Path("runs/logs"),
+        default=NODE_LOGS,
         help="folder of the nodes' logs (%(default)s)",
     )
     parser.add_argument(
@@ -45,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mock", metavar="FILE", type=Path, help="replace actions by scripted ones"
     )
+    add_log_level_argument(parser)
     parser.add_argument("--no-respawn", action="store_true", help="leave a node that died dead")
 
 
@@ -61,7 +68,11 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     from petrobot.coordinator.run.supervisor import LaunchError, Supervisor
 
     programs = local_programs(
-        directory, lockstep=options.lockstep, mock=options.mock, awaited=options.await_coordinator
+        directory,
+        lockstep=options.lockstep,
+        mock=options.mock,
+        awaited=options.await_coordinator,
+        log_level=options.log_level,
     )
     if not programs:
         raise CommandError(2, f"{directory.source}: none of its nodes has an address of this host")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import signal
 import socket
@@ -20,6 +21,8 @@ from petrobot.services.host.parent_death import STOP_ROUTINE, until_ended
 from petrobot.services.worker.keeper import KILL_ORDER
 from petrobot.services.worker.pipe import Counter, counter_memory, pipe_pair
 from petrobot.services.worker.process import BORN, Setup
+
+_log = logging.getLogger(__name__)
 
 NONE = -1
 LEAVE_LIMIT = 4.0
@@ -114,6 +117,8 @@ class Child:
 
     def post(self, items: list[Any]) -> None:
         """Send it a list; what does not fit now is sent when it reads."""
+        if _log.isEnabledFor(logging.DEBUG):  # kind and id alone: the rest may hold tickets
+            _log.debug("to %d: %s", self._worker, items[:2])
         self.pipe.post(items)
         if self.pipe.unsent and not self.pipe.closed:
             self._loop.add_writer(self.pipe.socket, self._flush)
@@ -173,6 +178,8 @@ class Child:
             if items and items[0] == BORN:
                 self._worker = items[1]
             else:
+                if _log.isEnabledFor(logging.DEBUG):
+                    _log.debug("from %d: %s", self._worker, items[:2])
                 self._heard(self, items)
         if self.pipe.closed and not self._let_go:
             self._close_pipe()

@@ -4,6 +4,7 @@ memory, timers and calls."""
 from __future__ import annotations
 
 import inspect
+import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -41,7 +42,12 @@ from petrobot.services.device import PICTURE
 from petrobot.services.node.emergency_stops import NEVER, EmergencyStops
 from petrobot.services.node.inline_host import InlinePlace, Place
 from petrobot.services.node.memory import Memory, event_name
-from petrobot.services.worker.callables import check_arguments, describe, from_outside
+from petrobot.services.worker.callables import (
+    check_arguments,
+    describe,
+    from_outside,
+    log_fault,
+)
 from petrobot.services.worker.context import RunContext, checked_result
 from petrobot.services.worker.execution import Hung
 from petrobot.services.worker.outlets import Outlets
@@ -60,6 +66,8 @@ from petrobot.services.worker.runs import (
     Stop,
     Told,
 )
+
+_log = logging.getLogger(__name__)
 
 # Timers of a node: external pulse events on an absolute grid.
 
@@ -135,6 +143,7 @@ def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink
         ) as fault:  # a service may raise SystemExit or its like: that must not end the node
             if from_outside(fault):
                 raise
+            log_fault(_log, fault, "call %s of service %s raised", call.id, service.name)
             return Outcome(
                 call.id,
                 Status.ERROR,
@@ -371,11 +380,13 @@ class Node:
             deadline = action.deadline
         self._stop_places(now, self._stops.look(now))
         if key in self._stops:
+            _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
             self.callee.finish(
                 now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO
             )
             return
         self._at[call.id] = key
+        _log.info("run %s of %s started", call.id, call.service)
         self.places[key].take(
             now, Begin(call.id, call.service, call.arguments, deadline, call.seed)
         )
@@ -383,6 +394,8 @@ class Node:
     def _command(self, now: float, order: Commanded) -> None:
         command = order.command
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
+        level = logging.DEBUG if command.verb in ("status", PICTURE) else logging.INFO
+        _log.log(level, "%s orders %s of %s", order.peer, command.verb, command.target or "all")
         if command.verb not in VERBS:
             self.callee.answer(
                 now,
@@ -464,6 +477,7 @@ class Node:
         for caller in self.callers.values():
             caller.cancel_children(now, end.id, "its run is over")
         executed = Executed(end.executed)
+        _log.info("run %s ended: %s %s %s", end.id, end.status, end.cause, end.text)
         self.callee.finish(
             now,
             end.id,

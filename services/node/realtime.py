@@ -4,10 +4,10 @@ and the clock."""
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import secrets
 import signal
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -31,6 +31,8 @@ from petrobot.services.node.worker_pool import WorkerPool
 from petrobot.services.worker.process import Setup
 from petrobot.services.worker.remote import IN_EMERGENCY
 
+_log = logging.getLogger(__name__)
+
 
 class NodeShell:
     """A running node. Between `start` and `close` it serves; its loop does protocol and quick
@@ -45,7 +47,10 @@ class NodeShell:
         self._name = name
         self._loop = asyncio.get_running_loop()
         self._tickets = _tickets(directory, name)
-        self._setup = Setup(str(directory.source), text, name, "", mock, memory, self._tickets)
+        level = logging.getLogger().getEffectiveLevel()
+        self._setup = Setup(
+            str(directory.source), text, name, "", mock, memory, self._tickets, level
+        )
         self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Place] = {**self._workers}
@@ -259,14 +264,16 @@ async def serve(
     await shell.start()
     host, port = shell.server.address
     if not shell.latch.kept:
-        places = " and ".join(str(path.parent) for path in shell.latch.paths)
-        print(
-            f"node {name}: an emergency stop could not be kept in {places}; name a folder in "
-            f"${STATE}",
-            file=sys.stderr,
+        folders = " and ".join(str(path.parent) for path in shell.latch.paths)
+        _log.warning(
+            "node %s: an emergency stop could not be kept in %s; name a folder in $%s",
+            name,
+            folders,
+            STATE,
         )
     if stopped := shell.node.stopped_in_emergency():
-        print(f"node {name}: {', '.join(stopped)}: {IN_EMERGENCY}", file=sys.stderr, flush=True)
+        _log.warning("node %s: %s: %s", name, ", ".join(stopped), IN_EMERGENCY)
     print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
     await over.wait()
+    _log.info("node %s ends", name)
     await shell.close()

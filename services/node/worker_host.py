@@ -9,6 +9,7 @@ unknown; a dead process is started again, at once and then with a growing pause.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -46,6 +47,8 @@ from petrobot.services.worker.runs import (
     flat,
     record,
 )
+
+_log = logging.getLogger(__name__)
 
 SILENT = 0.1
 """Seconds without an answer after which a worker counts as hanging, so that its device is stopped
@@ -283,6 +286,9 @@ class WorkerPlace:
                 )  # user code did, or a copy of it
             self._changed()
 
+    def _name(self) -> str:
+        return self._setup.device or "actions"
+
     def _take_words(self, child: Child, items: list[Any]) -> None:
         if items[0] == READY:
             self._take_ready(child, items[1])
@@ -317,6 +323,7 @@ class WorkerPlace:
                 self._start_due()
         elif self._move(Happening.READY):
             self._worker, self._given, self.failed, self._died = child, 0, "", ""
+            _log.info("process %d of %s is ready", child.pid, self._name())
             self._post_waiting(self._clock())
 
     def _post_waiting(self, now: float) -> None:
@@ -395,6 +402,8 @@ class WorkerPlace:
         if child is not None and child.code == LINK_LOST:
             pause = max(pause, DRIVER_GONE)
         self._restart_at = now + pause
+        why = self.failed or self._died
+        _log.warning("%s: %s; starting it again in %g s", self._name(), why, pause)
         self._changed()
 
     # --- runs ---------------------------------------------------------------------------------
@@ -519,6 +528,7 @@ class WorkerPlace:
         child = self._owner if self._stage is Stage.DRIVER_STARTS else self._worker
         self._started = now  # once more, should even the kill come to nothing
         if child is not None:
+            _log.warning("%s: not ready after %g s: killed", self._name(), START_LIMIT)
             child.kill(f"it was not ready after {START_LIMIT:g} s, and was killed")
 
     def _chase(self, now: float, run: _Watched) -> None:
@@ -531,6 +541,7 @@ class WorkerPlace:
         patience = GRACE + STOP_LIMIT + MARGIN if run.pong else GRACE
         if since >= patience and not run.killed and self._worker is not None:
             run.killed = True
+            _log.warning("run %s did not end: its process is killed", run.begin.id)
             self._worker.kill()
 
     def due(self) -> float | None:

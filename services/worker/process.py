@@ -65,6 +65,8 @@ class Setup:
     """Limit of the address space (bytes), 0 for none."""
     tickets: Mapping[str, str] = field(default_factory=dict)
     """What opens each stream that this node receives."""
+    log_level: int = logging.INFO
+    """Least level of what is logged."""
 
     def items(self) -> Mapping[str, Any]:
         """As plain data."""
@@ -229,6 +231,7 @@ def serve(
     """Be what the node says. Faults of the driver go back to it as text."""
     node.post([BORN, os.getpid()])
     setup = _first(node)
+    logging.getLogger().setLevel(setup.log_level)
     if link is None and setup.device:
         outlive(os.getppid(), STOP_ROUTINE)
     if setup.memory:
@@ -266,13 +269,14 @@ def serve(
         sys.exit(1)
 
 
-def log_to_stderr() -> None:
-    """Write what the modules of services log to the process's standard error, which is its node's
-    log."""
+def log_to_stderr(level: int = logging.INFO) -> None:
+    """Write log records of this level and above to the process's standard error, which is its
+    node's log."""
     logging.basicConfig(
-        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s",
-        level=logging.INFO,
+        format="%(asctime)s %(levelname)s %(name)s, process %(process)d: %(message)s", level=level
     )
+    # A compiler that a kernel needs: it logs each of its steps at DEBUG.
+    logging.getLogger("numba").setLevel(max(level, logging.INFO))
 
 
 def main(arguments: list[str]) -> None:

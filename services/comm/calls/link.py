@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import logging
 import secrets
 import socket
 import time
@@ -25,6 +26,8 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.security import NONCE_BYTES, Keys
 from petrobot.services.comm.protocol.wire import Connection, ProtocolError, Side, State
+
+_log = logging.getLogger(__name__)
 
 READ_BUFFER = 1 << 16
 """Bytes read at once. What is in them is taken apart before another link is read: so many empty
@@ -202,6 +205,9 @@ class Link(asyncio.BufferedProtocol):
         except ProtocolError as fault:
             self._refuse(now, fault)
             return
+        if _log.isEnabledFor(logging.DEBUG):  # kinds and ids alone: results may hold tickets
+            named = [f"{type(one).__name__} {getattr(one, 'id', '')}" for one in messages]
+            _log.debug("received %d bytes: %s", nbytes, ", ".join(named))
         self._unheard += nbytes
         if messages or self._unheard >= HEARD:
             self._heart.heard = now

@@ -13,6 +13,7 @@ Services answered on the spot (`Offer.inline`) never leave the loop; everything 
 from __future__ import annotations
 
 import asyncio
+import logging
 import ssl
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -34,6 +35,8 @@ from petrobot.services.comm.protocol.wire import ProtocolError, Side, State
 from petrobot.services.comm.tls.credentials import may_speak_as, name_on
 from petrobot.services.comm.tls.expiry import DAY, look_again
 from petrobot.services.comm.tls.listener import Admission, TlsListener
+
+_log = logging.getLogger(__name__)
 
 OnOrders = Callable[[float, list[Order]], None]
 AT_ONCE = 16
@@ -349,6 +352,7 @@ class Server:
         self._opening.pop(link, None)
         older = self._links.get(link.peer)
         self._links[link.peer] = link
+        _log.info("link of %s (%s) is up", link.peer, link.address)
         if older is not None:
             older.cut("a newer connection of its name took its place")
 
@@ -367,6 +371,8 @@ class Server:
 
     def gone(self, link: _ServerLink, now: float) -> None:
         """A connection is over."""
+        level = logging.INFO if link.peer else logging.DEBUG  # strangers must not fill the log
+        _log.log(level, "link of %s (%s) is lost: %s", link.peer, link.address, link.reason)
         if link in self._opening:
             self.failed(link.address)
         self._all.discard(link)
