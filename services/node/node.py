@@ -348,11 +348,21 @@ class Node:
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only what comes in can
         matter."""
-        times = [self._stops.due if self._stops.due < NEVER else None]
-        times += [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
-        times += [caller.due() for caller in self.callers.values()]
-        times += [place.due() for place in self.places.values()]
-        return min((t for t in times if t is not None), default=None)
+        # A plain loop: this is asked twice for each run, and lists of times cost as much as the rest.
+        soonest = self._stops.due
+        for command in self._commands.values():
+            soonest = min(soonest, command.due)
+        parts: tuple[Callee | Timers | Caller | Place, ...] = (
+            self.callee,
+            self._timers,
+            *self.callers.values(),
+            *self.places.values(),
+        )
+        for part in parts:
+            due = part.due()
+            if due is not None and due < soonest:
+                soonest = due
+        return soonest if soonest < NEVER else None
 
     def close(self, now: float) -> None:
         """Stop routines of all devices, and let them go."""
@@ -378,7 +388,8 @@ class Node:
         deadline = call.deadline
         if deadline is None and action is not None:
             deadline = action.deadline
-        self._stop_places(now, self._stops.look(now))
+        if key not in (LOOP, GENERAL):  # a look opens files; what has no device needs none
+            self._stop_places(now, self._stops.look(now))
         if key in self._stops:
             _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
             self.callee.finish(

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from petrobot.services.action import Status
-from petrobot.services.comm.calls.callee import Order
+from petrobot.services.comm.calls.callee import Order, StartRun
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.latch import STATE, latch_of
 from petrobot.services.comm.calls.listening import listening, refuse_unusable
@@ -25,8 +25,8 @@ from petrobot.services.comm.tls.credentials import credentials
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
 from petrobot.services.node.emergency_stops import BEAT, BEAT_EVERY
 from petrobot.services.node.inline_host import Place
-from petrobot.services.node.node import GENERAL, Node, stream_service
-from petrobot.services.node.worker_host import START_LIMIT, WorkerPlace
+from petrobot.services.node.node import GENERAL, LOOP, Node, stream_service
+from petrobot.services.node.worker_host import START_LIMIT, Hosting, WorkerPlace
 from petrobot.services.node.worker_pool import WorkerPool
 from petrobot.services.worker.process import Setup
 from petrobot.services.worker.remote import IN_EMERGENCY
@@ -84,15 +84,15 @@ class NodeShell:
         return [*devices, GENERAL] if general else devices
 
     def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
-        setup, clock = replace(self._setup, device=device), self._loop.time
 
         def wanted(stream: str) -> None:
             self._find_stream(device, stream)
 
+        setup = replace(self._setup, device=device)
+        hosting = Hosting(setup, self._loop.time, self._heard, wanted)
         if device == GENERAL:
-            most = self._directory.nodes[self._name].workers
-            return WorkerPool(setup, clock=clock, changed=self._changed, wanted=wanted, most=most)
-        return WorkerPlace(setup, clock=clock, changed=self._changed, wanted=wanted)
+            return WorkerPool(hosting, self._directory.nodes[self._name].workers)
+        return WorkerPlace(hosting)
 
     # --- life ---------------------------------------------------------------------------------
 
@@ -167,7 +167,10 @@ class NodeShell:
 
     def _obey(self, now: float, orders: list[Order]) -> None:
         self.node.obey(now, orders)
-        self._changed()
+        if self.node.places[LOOP].idle and all(type(order) is StartRun for order in orders):
+            self._arm()  # workers have been told; what they answer brings the next step
+        else:
+            self._changed()
 
     def _take_notices(self, now: float, notices: list[Notice]) -> None:
         self.node.take_notices(now, notices)
@@ -178,6 +181,12 @@ class NodeShell:
         self._change.set()
         if self._soon is None:
             self._soon = self._loop.call_soon(self._step)
+
+    def _heard(self) -> None:
+        """A process has said all that it had to say, or has ended: step now, since a turn of the
+        loop more costs as much as the step."""
+        self._change.set()
+        self._step()
 
     def _step(self) -> None:
         if self._soon is not None:
@@ -192,12 +201,19 @@ class NodeShell:
         self._arm()
 
     def _arm(self) -> None:
+        """Have a step taken when one is due. A timer that is set for an earlier time stays: most
+        runs end long before their deadlines, and a step too many then costs less than a timer for
+        each run."""
         due = self.node.due()
+        if due is None or (self._timer is not None and self._timer.when() <= due):
+            return
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
-        if due is not None:
-            self._timer = self._loop.call_at(max(due, self._loop.time()), self._step)
+        self._timer = self._loop.call_at(due, self._step_when_due)
+
+    def _step_when_due(self) -> None:
+        self._timer = None
+        self._step()
 
     # --- other nodes --------------------------------------------------------------------------
 

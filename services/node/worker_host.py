@@ -141,27 +141,36 @@ class _Watched:
     killed: bool = False
 
 
-Spawn = Callable[[Setup, Callable[[Child, list[Any]], None], Callable[[Child], None], Any], Child]
+Spawn = Callable[
+    [Setup, Callable[[Child, list[list[Any]]], None], Callable[[Child], None], Any], Child
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Hosting:
+    """What a node gives to a host of runs: a `WorkerPlace`, or a `WorkerPool` of them."""
+
+    setup: Setup
+    clock: Callable[[], float]
+    """The node's monotonic clock (s)."""
+    changed: Callable[[], None]
+    """Called when a process has sent something or has ended."""
+    wanted: Callable[[str], None]
+    """Called with the name of a stream whose receiver's address an action wants."""
+    spawn: Spawn = Child
+    """Starts a process; tests start none."""
 
 
 class WorkerPlace:
-    """Implements `services.place.Place` with processes. `changed` is called when something came
-    from one of them."""
+    """Implements `inline_host.Place` with the processes of one device, or with one process of
+    actions that need none."""
 
-    def __init__(
-        self,
-        setup: Setup,
-        *,
-        clock: Callable[[], float],
-        changed: Callable[[], None],
-        wanted: Callable[[str], None],
-        spawn: Spawn = Child,
-    ) -> None:
-        self._setup = setup
-        self._clock = clock
-        self._changed = changed
-        self._wanted = wanted
-        self._spawn = spawn
+    def __init__(self, hosting: Hosting) -> None:
+        self._setup = hosting.setup
+        self._clock = hosting.clock
+        self._changed = hosting.changed
+        self._wanted = hosting.wanted
+        self._spawn = hosting.spawn
         self._stage = Stage.DOWN
         self._owner: Child | None = None
         """Process of the device's driver; None without a device."""
@@ -274,17 +283,16 @@ class WorkerPlace:
         self._stage = stage
         return True
 
-    def _heard(self, child: Child, items: list[Any]) -> None:
-        """A process of this place says something; what a former one has said last counts no
-        more."""
-        if child is self._owner or child is self._worker:
-            try:
-                self._take_words(child, items)
-            except (ValueError, TypeError, IndexError, KeyError, AttributeError):
-                child.kill(
-                    "it wrote into its pipe what is no record, and was killed"
-                )  # user code did, or a copy of it
-            self._changed()
+    def _heard(self, child: Child, received: list[list[Any]]) -> None:
+        """Take what a process has sent; the last words of a former process do not count."""
+        for items in received:
+            if child is self._owner or child is self._worker:
+                try:
+                    self._take_words(child, items)
+                except (ValueError, TypeError, IndexError, KeyError, AttributeError):
+                    # The user's code has written into the pipe, or a copy of the process has.
+                    child.kill("it wrote into its pipe what is no record, and was killed")
+        self._changed()
 
     def _name(self) -> str:
         return self._setup.device or "actions"
@@ -404,7 +412,6 @@ class WorkerPlace:
         self._restart_at = now + pause
         why = self.failed or self._died
         _log.warning("%s: %s; starting it again in %g s", self._name(), why, pause)
-        self._changed()
 
     # --- runs ---------------------------------------------------------------------------------
 
@@ -466,7 +473,6 @@ class WorkerPlace:
             )
         self._lost, self._halt_due = [], None
         self._release_if_over()
-        self._changed()
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
@@ -545,27 +551,33 @@ class WorkerPlace:
             self._worker.kill()
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s)."""
-        times = [
-            self._restart_at,
-            self._halt_due,
-            self._started + START_LIMIT if self._stage in STARTING else None,
-        ]
+        """When `advance` has something to do, or there is something to report, at the latest
+        (s)."""
+        if self._reports:
+            return self._clock()
+        soonest = math.inf
+        if self._restart_at is not None:
+            soonest = self._restart_at
+        if self._halt_due is not None:
+            soonest = min(soonest, self._halt_due)
+        if self._stage in STARTING:
+            soonest = min(soonest, self._started + START_LIMIT)
         for run in self._runs.values():
-            if run.posted is None:
-                times.append(self._wait_limit(run))
-            elif run.stop is None:
-                times.append(
-                    run.limit if run.limit < math.inf and self._frozen_since is None else None
-                )
-            elif not run.killed:
-                waits = (
-                    [GRACE + STOP_LIMIT + MARGIN]
-                    if run.pong
-                    else [SILENT] * (not run.halted) + [GRACE]
-                )
-                times.append(run.stopped_at + min(waits))
-        return min((t for t in times if t is not None), default=None)
+            due = self._due_of(run)
+            if due < soonest:
+                soonest = due
+        return soonest if soonest < math.inf else None
+
+    def _due_of(self, run: _Watched) -> float:
+        if run.posted is None:
+            return self._wait_limit(run)
+        if run.stop is None:
+            return run.limit if self._frozen_since is None else math.inf
+        if run.killed:
+            return math.inf
+        if run.pong:
+            return run.stopped_at + GRACE + STOP_LIMIT + MARGIN
+        return run.stopped_at + (GRACE if run.halted else SILENT)
 
     # --- operator -----------------------------------------------------------------------------
 

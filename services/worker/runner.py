@@ -142,6 +142,8 @@ class Runner:
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only something that comes
         in can matter."""
+        if not self._runs:  # nor is a stream open
+            return None
         held = self._held_since is not None
         times = [] if held else [self._outlets.due()]
         times += [run.due() for run in self._runs.values() if not held or run.phase in _AFTER]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from petrobot.services.action import Context, Result, success
+from petrobot.services.action import Cancelled, Context, Result, success
 from petrobot.services.comm.location_file import parse
 from petrobot.services.worker.callables import CHAIN, LONGEST, log_fault
 from tests.node.conftest import Bench
@@ -53,8 +53,8 @@ def test_an_exception_while_a_cancelled_action_cleans_up_is_logged(
     async def hold(ctx: Context) -> Result:
         try:
             await ctx.sleep(10.0)
-        finally:
-            raise OSError("the valve does not answer")
+        except Cancelled:
+            raise OSError("the valve does not answer") from None
         return success()
 
     b = bench(hold=hold, device=True)
