@@ -279,7 +279,12 @@ def resumed_mission(
 
 
 def local_programs(
-    directory: Directory, *, lockstep: bool = False, mock: Path | None = None, awaited: float = 0.0
+    directory: Directory,
+    *,
+    lockstep: bool = False,
+    mock: Path | None = None,
+    awaited: float = 0.0,
+    log_level: str = "info",
 ) -> list[Program]:
     """The command lines of the nodes whose address is this host's, the laboratory first.
 
@@ -290,12 +295,12 @@ def local_programs(
     )
     options = ["--services", str(directory.source), *(["--lockstep"] if lockstep else [])]
     options += ["--await-coordinator", str(awaited)] if lockstep and awaited else []
-    scripted = ["--mock", str(mock)] if mock else []
+    own = ["--log-level", log_level, *(["--mock", str(mock)] if mock else [])]
     return [
         Program(node.name, [sys.executable, "-m", "petrobot.sim", *options], first=True)
         if node.sim
         else Program(
-            node.name, [sys.executable, "-m", "petrobot.services", node.name, *options, *scripted]
+            node.name, [sys.executable, "-m", "petrobot.services", node.name, *options, *own]
         )
         for node in local
     ]

@@ -1,10 +1,11 @@
 """Launches one node of services.toml on this host: `python -m petrobot.services NAME [--services
-FILE] [--lockstep]`."""
+FILE]`."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -29,6 +30,12 @@ from petrobot.services.scripted import ScriptError
 from petrobot.services.scripted import load as load_script
 from petrobot.services.worker.process import log_to_stderr
 
+LOG_LEVELS = {
+    "debug": logging.DEBUG,
+    "info": logging.INFO,
+    "warning": logging.WARNING,
+    "error": logging.ERROR,
+}
 EXAMPLE = "example:\n  python -m petrobot.services vision --services services.toml"
 
 
@@ -55,6 +62,13 @@ def parser() -> argparse.ArgumentParser:
     )
     commands.add_argument(
         "--mock", metavar="FILE", default="", help="replace the actions that this file scripts"
+    )
+    commands.add_argument(
+        "--log-level",
+        choices=LOG_LEVELS,
+        default="info",
+        help="log what is at least so grave, to standard error (default: %(default)s; debug: "
+        "every message, too)",
     )
     return commands
 
@@ -89,7 +103,7 @@ def read(path: Path, name: str) -> tuple[Directory, str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node; gives the exit code."""
     options = parser().parse_args(arguments)
-    log_to_stderr()
+    log_to_stderr(LOG_LEVELS[options.log_level])
     try:
         directory, text = read(options.services, options.name)
         if options.mock:

@@ -14,6 +14,8 @@ NAMED = re.compile(
 )
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)(?:#[^)]*)?\)")
 LONGEST_PAGE = 300
+LONGER = {"protocol.md": 350}
+"""A reference for those who write the other end: it is searched, not read."""
 
 
 @cache
@@ -64,4 +66,5 @@ def test_links_lead_to_files() -> None:
 def test_no_page_is_too_long() -> None:
     """A page that is longer should be two."""
     lengths = {page.name: len(page.read_text(encoding="utf-8").splitlines()) for page in PAGES}
-    assert {name: n for name, n in lengths.items() if n > LONGEST_PAGE} == {}
+    long = {name: n for name, n in lengths.items() if n > LONGER.get(name, LONGEST_PAGE)}
+    assert long == {}

@@ -20,6 +20,8 @@ SHIPPED = Path(__file__).parents[1] / "tasks"
 """Tasks that come with petrobot; they are known by their bare names."""
 SHIPPED_CELL = (Path(__file__).parents[2] / "services.toml").resolve()
 """The location file that comes with petrobot: that of the catching cell."""
+NODE_LOGS = Path("runs/logs")
+"""Where the commands that start nodes keep their logs, a file each."""
 OWN = Path("tasks")
 """Where the operator's page saves tasks: beside what one works on."""
 

@@ -1,14 +1,16 @@
-"""Print a recorded run for people, or export it: JSON lines, XES for process mining, MCAP for
-Foxglove."""
+"""Print a recorded run, or the log of a node; export a run: JSON lines, XES for process mining,
+MCAP for Foxglove."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
+from petrobot.coordinator.cli.loading import NODE_LOGS, add_services_argument, load_directory
 from petrobot.coordinator.cli.recorded_runs import recorded
 from petrobot.services.host.whole_file import write_whole
 
@@ -20,7 +22,17 @@ EXAMPLE = "petrobot log last --format xes --out run.xes"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
-    parser.add_argument("run", help="a run's id or folder, or `last`")
+    parser.add_argument(
+        "run", help="a run's id or folder, or `last`; or a node of services.toml, for its own log"
+    )
+    add_services_argument(parser)
+    parser.add_argument(
+        "--logs",
+        metavar="FOLDER",
+        type=Path,
+        default=NODE_LOGS,
+        help="folder of the nodes' logs (default: %(default)s)",
+    )
     parser.add_argument(
         "--format", choices=("text", "jsonl", "xes"), default="text", help="default: %(default)s"
     )
@@ -40,6 +52,10 @@ def run(options: argparse.Namespace) -> int:
     from petrobot.coordinator.run.journal import JournalError
     from petrobot.coordinator.run.recording import ReplayError
 
+    if (log := _node_log(options)) is not None:
+        with log.open(encoding="utf-8", errors="replace") as lines:
+            _write(options.out, (line.rstrip("\n") for line in lines))
+        return 0
     found = recorded(options.run)
     try:
         if options.mcap is not None:
@@ -60,6 +76,32 @@ def run(options: argparse.Namespace) -> int:
         )
         raise CommandError(2, text) from fault
     return 0
+
+
+def _node_log(options: argparse.Namespace) -> Path | None:
+    """The log of the node that is named; None where the name is that of a run, or of no node."""
+    from petrobot.coordinator.run.folder import NoRunError, journal_of
+
+    with contextlib.suppress(NoRunError):
+        journal_of(options.run)
+        return None
+    try:
+        directory = load_directory(options.services)
+    except CommandError:
+        if options.services is not None:
+            raise
+        return None  # a broken location file must not hide that there is no such run
+    if options.run not in directory.nodes:
+        return None
+    path: Path = options.logs / f"{options.run}.log"
+    if not path.is_file():
+        host = directory.nodes[options.run].host
+        raise CommandError(
+            2,
+            f"{path}: node {options.run} has no log here; it is written on the node's own host "
+            f"({host}) by `petrobot up`, `run` or `serve`: give its folder with --logs",
+        )
+    return path
 
 
 def _write_mcap(path: Path, found: Recorded) -> None:

@@ -6,6 +6,7 @@ import argparse
 
 from petrobot.coordinator.cli.exec import become
 from petrobot.coordinator.cli.loading import add_services_argument, services_path
+from petrobot.coordinator.cli.options import add_log_level_argument
 
 EXAMPLE = "petrobot node vision --services services.toml"
 
@@ -14,8 +15,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's options."""
     parser.add_argument("name", help="the node's name in services.toml")
     add_services_argument(parser)
+    add_log_level_argument(parser, "info")
 
 
 def run(options: argparse.Namespace) -> int:
     """Become the node."""
-    become("petrobot.services", options.name, "--services", str(services_path(options.services)))
+    become(
+        "petrobot.services",
+        options.name,
+        "--services",
+        str(services_path(options.services)),
+        "--log-level",
+        options.log_level,
+    )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from petrobot.coordinator.cli import CommandError
 from petrobot.coordinator.cli.loading import (
+    NODE_LOGS,
     add_services_argument,
     load_directory,
     refuse_misplaced,
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--logs",
         type=Path,
-        default=Path("runs/logs"),
+        default=NODE_LOGS,
         help="folder of the nodes' logs (%(default)s)",
     )
     parser.add_argument(
@@ -67,7 +68,11 @@ async def _up(directory: Directory, options: argparse.Namespace) -> int:
     from petrobot.coordinator.run.supervisor import LaunchError, Supervisor
 
     programs = local_programs(
-        directory, lockstep=options.lockstep, mock=options.mock, awaited=options.await_coordinator
+        directory,
+        lockstep=options.lockstep,
+        mock=options.mock,
+        awaited=options.await_coordinator,
+        log_level=options.log_level,
     )
     if not programs:
         raise CommandError(2, f"{directory.source}: none of its nodes has an address of this host")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import signal
 import socket
@@ -21,6 +22,8 @@ from petrobot.services.worker.keeper import KILL_ORDER
 from petrobot.services.worker.pipe import Counter, counter_memory, pipe_pair
 from petrobot.services.worker.process import BORN, Setup
 
+_log = logging.getLogger(__name__)
+
 NONE = -1
 LEAVE_LIMIT = 4.0
 """Seconds that a process has to end in good order."""
@@ -33,14 +36,14 @@ worker by the kernel."""
 
 
 class Child:
-    """A running process of `services.worker` under its keeper. `heard(child, items)` receives each
-    list that it sends; `ended(child)` is called once, when neither it nor anything that it has
-    started runs any more."""
+    """A running process of `services.worker` under its keeper. `heard(child, received)` receives
+    the lists that it has sent, all that came at once; `ended(child)` is called once, when neither
+    it nor anything that it has started runs any more."""
 
     def __init__(
         self,
         setup: Setup,
-        heard: Callable[[Child, list[Any]], None],
+        heard: Callable[[Child, list[list[Any]]], None],
         ended: Callable[[Child], None],
         link: socket.socket | None = None,
     ) -> None:
@@ -114,6 +117,8 @@ class Child:
 
     def post(self, items: list[Any]) -> None:
         """Send it a list; what does not fit now is sent when it reads."""
+        if _log.isEnabledFor(logging.DEBUG):  # kind and id alone: the rest may hold tickets
+            _log.debug("to %d: %s", self._worker, items[:2])
         self.pipe.post(items)
         if self.pipe.unsent and not self.pipe.closed:
             self._loop.add_writer(self.pipe.socket, self._flush)
@@ -169,11 +174,13 @@ class Child:
             received = []
             self._close_pipe()
             self.kill("it wrote into its pipe what is no record, and was killed")
-        for items in received:
-            if items and items[0] == BORN:
-                self._worker = items[1]
-            else:
-                self._heard(self, items)
+        if received and not self._worker and received[0] and received[0][0] == BORN:
+            self._worker = received.pop(0)[1]
+        if received:
+            if _log.isEnabledFor(logging.DEBUG):
+                named = ", ".join(str(items[:2]) for items in received)
+                _log.debug("from %d: %s", self._worker, named)
+            self._heard(self, received)
         if self.pipe.closed and not self._let_go:
             self._close_pipe()
             self._limit(PIPE_LIMIT, lambda: self.kill("it closed its pipe, and was killed"))

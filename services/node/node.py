@@ -4,6 +4,7 @@ memory, timers and calls."""
 from __future__ import annotations
 
 import inspect
+import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -40,7 +41,12 @@ from petrobot.services.host.emergency_latch import Latch
 from petrobot.services.node.emergency_stops import NEVER, EmergencyStops
 from petrobot.services.node.inline_host import InlinePlace, Place
 from petrobot.services.node.memory import Memory, event_name
-from petrobot.services.worker.callables import check_arguments, describe, from_outside
+from petrobot.services.worker.callables import (
+    check_arguments,
+    describe,
+    from_outside,
+    log_fault,
+)
 from petrobot.services.worker.context import RunContext, checked_result
 from petrobot.services.worker.execution import Hung
 from petrobot.services.worker.outlets import Outlets
@@ -59,6 +65,8 @@ from petrobot.services.worker.runs import (
     Stop,
     Told,
 )
+
+_log = logging.getLogger(__name__)
 
 # Timers of a node: external pulse events on an absolute grid.
 
@@ -134,6 +142,7 @@ def inline_service(service: ServiceEntry, raised: EventSink, judged: VerdictSink
         ) as fault:  # a service may raise SystemExit or its like: that must not end the node
             if from_outside(fault):
                 raise
+            log_fault(_log, fault, "call %s of service %s raised", call.id, service.name)
             return Outcome(
                 call.id,
                 Status.ERROR,
@@ -338,11 +347,21 @@ class Node:
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only what comes in can
         matter."""
-        times = [self._stops.due if self._stops.due < NEVER else None]
-        times += [self.callee.due(), self._timers.due(), *(c.due for c in self._commands.values())]
-        times += [caller.due() for caller in self.callers.values()]
-        times += [place.due() for place in self.places.values()]
-        return min((t for t in times if t is not None), default=None)
+        # A plain loop: this is asked twice for each run, and lists of times cost as much as the rest.
+        soonest = self._stops.due
+        for command in self._commands.values():
+            soonest = min(soonest, command.due)
+        parts: tuple[Callee | Timers | Caller | Place, ...] = (
+            self.callee,
+            self._timers,
+            *self.callers.values(),
+            *self.places.values(),
+        )
+        for part in parts:
+            due = part.due()
+            if due is not None and due < soonest:
+                soonest = due
+        return soonest if soonest < NEVER else None
 
     def close(self, now: float) -> None:
         """Stop routines of all devices, and let them go."""
@@ -368,13 +387,16 @@ class Node:
         deadline = call.deadline
         if deadline is None and action is not None:
             deadline = action.deadline
-        self._stop_places(now, self._stops.look(now))
+        if key not in (LOOP, GENERAL):  # a look opens files; what has no device needs none
+            self._stop_places(now, self._stops.look(now))
         if key in self._stops:
+            _log.info("run %s of %s refused: %s", call.id, call.service, EMERGENCY_STOP)
             self.callee.finish(
                 now, call.id, Status.ERROR, {}, EMERGENCY_STOP, IN_EMERGENCY, Executed.NO
             )
             return
         self._at[call.id] = key
+        _log.info("run %s of %s started", call.id, call.service)
         self.places[key].take(
             now, Begin(call.id, call.service, call.arguments, deadline, call.seed)
         )
@@ -382,6 +404,8 @@ class Node:
     def _command(self, now: float, order: CommandOrder) -> None:
         command = order.command
         keys = [k for k in self.places if k != LOOP and command.target in ("", k or self.name)]
+        level = logging.DEBUG if command.verb in ("status", PICTURE) else logging.INFO
+        _log.log(level, "%s orders %s of %s", order.peer, command.verb, command.target or "all")
         if command.verb not in VERBS:
             self.callee.answer(
                 now,
@@ -463,6 +487,7 @@ class Node:
         for caller in self.callers.values():
             caller.cancel_children(now, end.id, "its run is over")
         executed = Executed(end.executed)
+        _log.info("run %s ended: %s %s %s", end.id, end.status, end.cause, end.text)
         self.callee.finish(
             now,
             end.id,

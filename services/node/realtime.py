@@ -4,16 +4,16 @@ and the clock."""
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import secrets
 import signal
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from petrobot.services.action import Status
-from petrobot.services.comm.calls.callee import Order
+from petrobot.services.comm.calls.callee import Order, StartOrder
 from petrobot.services.comm.calls.caller import Notice
 from petrobot.services.comm.calls.client import Client
 from petrobot.services.comm.calls.server import Server
@@ -25,11 +25,13 @@ from petrobot.services.host.emergency_latch import STATE, latch_of
 from petrobot.services.host.parent_death import GOOD_ORDER, outlive, wanted_with_parent
 from petrobot.services.node.emergency_stops import BEAT, BEAT_EVERY
 from petrobot.services.node.inline_host import Place
-from petrobot.services.node.node import GENERAL, Node, stream_service
-from petrobot.services.node.worker_host import START_LIMIT, WorkerPlace
+from petrobot.services.node.node import GENERAL, LOOP, Node, stream_service
+from petrobot.services.node.worker_host import START_LIMIT, Hosting, WorkerPlace
 from petrobot.services.node.worker_pool import WorkerPool
 from petrobot.services.worker.process import Setup
 from petrobot.services.worker.remote import IN_EMERGENCY
+
+_log = logging.getLogger(__name__)
 
 
 class NodeShell:
@@ -45,7 +47,10 @@ class NodeShell:
         self._name = name
         self._loop = asyncio.get_running_loop()
         self._tickets = _tickets(directory, name)
-        self._setup = Setup(str(directory.source), text, name, "", mock, memory, self._tickets)
+        level = logging.getLogger().getEffectiveLevel()
+        self._setup = Setup(
+            str(directory.source), text, name, "", mock, memory, self._tickets, level
+        )
         self._credentials = credentials(directory, name)
         self._workers = {device: self._worker_place(device) for device in self._devices()}
         places: dict[str, Place] = {**self._workers}
@@ -79,15 +84,15 @@ class NodeShell:
         return [*devices, GENERAL] if general else devices
 
     def _worker_place(self, device: str) -> WorkerPlace | WorkerPool:
-        setup, clock = replace(self._setup, device=device), self._loop.time
 
         def wanted(stream: str) -> None:
             self._find_stream(device, stream)
 
+        setup = replace(self._setup, device=device)
+        hosting = Hosting(setup, self._loop.time, self._heard, wanted)
         if device == GENERAL:
-            most = self._directory.nodes[self._name].workers
-            return WorkerPool(setup, clock=clock, changed=self._changed, wanted=wanted, most=most)
-        return WorkerPlace(setup, clock=clock, changed=self._changed, wanted=wanted)
+            return WorkerPool(hosting, self._directory.nodes[self._name].workers)
+        return WorkerPlace(hosting)
 
     # --- life ---------------------------------------------------------------------------------
 
@@ -162,7 +167,10 @@ class NodeShell:
 
     def _obey(self, now: float, orders: list[Order]) -> None:
         self.node.obey(now, orders)
-        self._changed()
+        if self.node.places[LOOP].idle and all(type(order) is StartOrder for order in orders):
+            self._arm()  # workers have been told; what they answer brings the next step
+        else:
+            self._changed()
 
     def _take_notices(self, now: float, notices: list[Notice]) -> None:
         self.node.take_notices(now, notices)
@@ -173,6 +181,12 @@ class NodeShell:
         self._change.set()
         if self._soon is None:
             self._soon = self._loop.call_soon(self._step)
+
+    def _heard(self) -> None:
+        """A process has said all that it had to say, or has ended: step now, since a turn of the
+        loop more costs as much as the step."""
+        self._change.set()
+        self._step()
 
     def _step(self) -> None:
         if self._soon is not None:
@@ -187,12 +201,19 @@ class NodeShell:
         self._arm()
 
     def _arm(self) -> None:
+        """Have a step taken when one is due. A timer that is set for an earlier time stays: most
+        runs end long before their deadlines, and a step too many then costs less than a timer for
+        each run."""
         due = self.node.due()
+        if due is None or (self._timer is not None and self._timer.when() <= due):
+            return
         if self._timer is not None:
             self._timer.cancel()
-            self._timer = None
-        if due is not None:
-            self._timer = self._loop.call_at(max(due, self._loop.time()), self._step)
+        self._timer = self._loop.call_at(due, self._step_when_due)
+
+    def _step_when_due(self) -> None:
+        self._timer = None
+        self._step()
 
     # --- other nodes --------------------------------------------------------------------------
 
@@ -259,14 +280,16 @@ async def serve(
     await shell.start()
     host, port = shell.server.address
     if not shell.latch.kept:
-        places = " and ".join(str(path.parent) for path in shell.latch.paths)
-        print(
-            f"node {name}: an emergency stop could not be kept in {places}; name a folder in "
-            f"${STATE}",
-            file=sys.stderr,
+        folders = " and ".join(str(path.parent) for path in shell.latch.paths)
+        _log.warning(
+            "node %s: an emergency stop could not be kept in %s; name a folder in $%s",
+            name,
+            folders,
+            STATE,
         )
     if stopped := shell.node.stopped_in_emergency():
-        print(f"node {name}: {', '.join(stopped)}: {IN_EMERGENCY}", file=sys.stderr, flush=True)
+        _log.warning("node %s: %s: %s", name, ", ".join(stopped), IN_EMERGENCY)
     print(f"node {name} ready on {host}:{port}, process {os.getpid()}", flush=True)
     await over.wait()
+    _log.info("node %s ends", name)
     await shell.close()

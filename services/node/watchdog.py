@@ -98,9 +98,7 @@ class Watchdog:
             "time or sleep"
         )
         if attempts > ATTEMPTS:
-            print(
-                f"{text}, and cannot be interrupted; the process ends", file=sys.stderr, flush=True
-            )
+            _log.critical("%s, and cannot be interrupted; the process ends", text)
             os._exit(3)
         stack = "".join(traceback.format_stack(frame)) if frame is not None else ""
         _log.error("%s; it is interrupted\n%s", text, stack)
@@ -139,8 +137,15 @@ def _compiles(frame: FrameType | None) -> bool:
 
 
 _OWN = frozenset(
-    f"services.{name}"
-    for name in ("execution", "runner", "place", "node", "lockstep_node", "watchdog")
+    f"petrobot.services.{name}"
+    for name in (
+        "worker.execution",
+        "worker.runner",
+        "node.inline_host",
+        "node.node",
+        "node.lockstep",
+        "node.watchdog",
+    )
 )
 
 

@@ -9,6 +9,7 @@ unknown; a dead process is started again, at once and then with a growing pause.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -46,6 +47,8 @@ from petrobot.services.worker.runs import (
     flat,
     record,
 )
+
+_log = logging.getLogger(__name__)
 
 SILENT = 0.1
 """Seconds without an answer after which a worker counts as hanging, so that its device is stopped
@@ -138,27 +141,36 @@ class _Watched:
     killed: bool = False
 
 
-Spawn = Callable[[Setup, Callable[[Child, list[Any]], None], Callable[[Child], None], Any], Child]
+Spawn = Callable[
+    [Setup, Callable[[Child, list[list[Any]]], None], Callable[[Child], None], Any], Child
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Hosting:
+    """What a node gives to a host of runs: a `WorkerPlace`, or a `WorkerPool` of them."""
+
+    setup: Setup
+    clock: Callable[[], float]
+    """The node's monotonic clock (s)."""
+    changed: Callable[[], None]
+    """Called when a process has sent something or has ended."""
+    wanted: Callable[[str], None]
+    """Called with the name of a stream whose receiver's address an action wants."""
+    spawn: Spawn = Child
+    """Starts a process; tests start none."""
 
 
 class WorkerPlace:
-    """Implements `services.place.Place` with processes. `changed` is called when something came
-    from one of them."""
+    """Implements `inline_host.Place` with the processes of one device, or with one process of
+    actions that need none."""
 
-    def __init__(
-        self,
-        setup: Setup,
-        *,
-        clock: Callable[[], float],
-        changed: Callable[[], None],
-        wanted: Callable[[str], None],
-        spawn: Spawn = Child,
-    ) -> None:
-        self._setup = setup
-        self._clock = clock
-        self._changed = changed
-        self._wanted = wanted
-        self._spawn = spawn
+    def __init__(self, hosting: Hosting) -> None:
+        self._setup = hosting.setup
+        self._clock = hosting.clock
+        self._changed = hosting.changed
+        self._wanted = hosting.wanted
+        self._spawn = hosting.spawn
         self._stage = Stage.DOWN
         self._owner: Child | None = None
         """Process of the device's driver; None without a device."""
@@ -271,17 +283,19 @@ class WorkerPlace:
         self._stage = stage
         return True
 
-    def _heard(self, child: Child, items: list[Any]) -> None:
-        """A process of this place says something; what a former one has said last counts no
-        more."""
-        if child is self._owner or child is self._worker:
-            try:
-                self._take_words(child, items)
-            except (ValueError, TypeError, IndexError, KeyError, AttributeError):
-                child.kill(
-                    "it wrote into its pipe what is no record, and was killed"
-                )  # user code did, or a copy of it
-            self._changed()
+    def _heard(self, child: Child, received: list[list[Any]]) -> None:
+        """Take what a process has sent; the last words of a former process do not count."""
+        for items in received:
+            if child is self._owner or child is self._worker:
+                try:
+                    self._take_words(child, items)
+                except (ValueError, TypeError, IndexError, KeyError, AttributeError):
+                    # The user's code has written into the pipe, or a copy of the process has.
+                    child.kill("it wrote into its pipe what is no record, and was killed")
+        self._changed()
+
+    def _name(self) -> str:
+        return self._setup.device or "actions"
 
     def _take_words(self, child: Child, items: list[Any]) -> None:
         if items[0] == READY:
@@ -317,6 +331,7 @@ class WorkerPlace:
                 self._start_due()
         elif self._move(Happening.READY):
             self._worker, self._given, self.failed, self._died = child, 0, "", ""
+            _log.info("process %d of %s is ready", child.pid, self._name())
             self._post_waiting(self._clock())
 
     def _post_waiting(self, now: float) -> None:
@@ -395,7 +410,8 @@ class WorkerPlace:
         if child is not None and child.code == LINK_LOST:
             pause = max(pause, DRIVER_GONE)
         self._restart_at = now + pause
-        self._changed()
+        why = self.failed or self._died
+        _log.warning("%s: %s; starting it again in %g s", self._name(), why, pause)
 
     # --- runs ---------------------------------------------------------------------------------
 
@@ -457,7 +473,6 @@ class WorkerPlace:
             )
         self._lost, self._halt_due = [], None
         self._release_if_over()
-        self._changed()
 
     def take(self, now: float, order: Order) -> None:
         """Take an order about a run."""
@@ -519,6 +534,7 @@ class WorkerPlace:
         child = self._owner if self._stage is Stage.DRIVER_STARTS else self._worker
         self._started = now  # once more, should even the kill come to nothing
         if child is not None:
+            _log.warning("%s: not ready after %g s: killed", self._name(), START_LIMIT)
             child.kill(f"it was not ready after {START_LIMIT:g} s, and was killed")
 
     def _chase(self, now: float, run: _Watched) -> None:
@@ -531,30 +547,37 @@ class WorkerPlace:
         patience = GRACE + STOP_LIMIT + MARGIN if run.pong else GRACE
         if since >= patience and not run.killed and self._worker is not None:
             run.killed = True
+            _log.warning("run %s did not end: its process is killed", run.begin.id)
             self._worker.kill()
 
     def due(self) -> float | None:
-        """When `advance` has something to do at the latest (s)."""
-        times = [
-            self._restart_at,
-            self._halt_due,
-            self._started + START_LIMIT if self._stage in STARTING else None,
-        ]
+        """When `advance` has something to do, or there is something to report, at the latest
+        (s)."""
+        if self._reports:
+            return self._clock()
+        soonest = math.inf
+        if self._restart_at is not None:
+            soonest = self._restart_at
+        if self._halt_due is not None:
+            soonest = min(soonest, self._halt_due)
+        if self._stage in STARTING:
+            soonest = min(soonest, self._started + START_LIMIT)
         for run in self._runs.values():
-            if run.posted is None:
-                times.append(self._wait_limit(run))
-            elif run.stop is None:
-                times.append(
-                    run.limit if run.limit < math.inf and self._frozen_since is None else None
-                )
-            elif not run.killed:
-                waits = (
-                    [GRACE + STOP_LIMIT + MARGIN]
-                    if run.pong
-                    else [SILENT] * (not run.halted) + [GRACE]
-                )
-                times.append(run.stopped_at + min(waits))
-        return min((t for t in times if t is not None), default=None)
+            due = self._due_of(run)
+            if due < soonest:
+                soonest = due
+        return soonest if soonest < math.inf else None
+
+    def _due_of(self, run: _Watched) -> float:
+        if run.posted is None:
+            return self._wait_limit(run)
+        if run.stop is None:
+            return run.limit if self._frozen_since is None else math.inf
+        if run.killed:
+            return math.inf
+        if run.pong:
+            return run.stopped_at + GRACE + STOP_LIMIT + MARGIN
+        return run.stopped_at + (GRACE if run.halted else SILENT)
 
     # --- operator -----------------------------------------------------------------------------
 

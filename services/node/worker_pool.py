@@ -9,15 +9,14 @@ Those that nobody has needed for a while retire.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from petrobot.services.action import Status
 from petrobot.services.comm.protocol.messages import Executed
 from petrobot.services.device import PICTURE
 from petrobot.services.node.child import Child
-from petrobot.services.node.worker_host import DONE, Spawn, Stage, WorkerPlace
-from petrobot.services.worker.process import Setup
+from petrobot.services.node.worker_host import DONE, Hosting, Stage, WorkerPlace
 from petrobot.services.worker.runs import (
     Answered,
     Asked,
@@ -46,28 +45,15 @@ class _Gathered:
 
 
 class WorkerPool:
-    """Implements `services.place.Place` for actions without a device, with one `WorkerPlace` for
-    each worker.
+    """Implements `inline_host.Place` for actions without a device, with one `WorkerPlace` for each
+    worker.
 
     `most` is how many workers there may be; a run beyond that is refused: `busy`, executed = no.
     """
 
-    def __init__(
-        self,
-        setup: Setup,
-        *,
-        clock: Callable[[], float],
-        changed: Callable[[], None],
-        wanted: Callable[[str], None],
-        most: int,
-        spawn: Spawn = Child,
-    ) -> None:
-        self._setup = setup
-        self._clock = clock
-        self._changed = changed
-        self._wanted = wanted
+    def __init__(self, hosting: Hosting, most: int) -> None:
+        self._hosting = hosting
         self._most = most
-        self._spawn = spawn
         self._workers: dict[int, WorkerPlace] = {}
         """By number from 1, the lowest first: a node that has little to do uses the same ones again
         and again."""
@@ -134,13 +120,12 @@ class WorkerPool:
 
     def _add(self) -> int:
         number = next(n for n in range(1, self._most + 1) if n not in self._workers)
-        self._workers[number] = WorkerPlace(
-            self._setup,
-            clock=self._clock,
+        hosting = replace(
+            self._hosting,
             changed=lambda: self._touch(number),
             wanted=lambda stream: self._want(number, stream),
-            spawn=self._spawn,
         )
+        self._workers[number] = WorkerPlace(hosting)
         self._workers = dict(sorted(self._workers.items()))
         self._touched.add(number)
         self._workers[number].start()
@@ -148,7 +133,7 @@ class WorkerPool:
 
     def _touch(self, number: int) -> None:
         self._touched.add(number)
-        self._changed()
+        self._hosting.changed()
 
     def _idle(self) -> list[int]:
         """Workers without a run, the best first: ready ones, then those that start, then those that
@@ -252,7 +237,7 @@ class WorkerPool:
             self._touched.clear()
             self._soonest = min(self._due.values(), default=math.inf)
         if self._reports:
-            return self._clock()
+            return self._hosting.clock()
         return self._soonest if self._soonest < math.inf else None
 
     def _learn_due(self, number: int) -> None:
@@ -290,7 +275,7 @@ class WorkerPool:
 
     def _want(self, number: int, stream: str) -> None:
         self._streams.setdefault(stream, set()).add(number)
-        self._wanted(stream)
+        self._hosting.wanted(stream)
 
     def stream_at(self, stream: str, host: str, port: int, ticket: str) -> None:
         """Tell the workers that have asked where a stream is received: another one would take the

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dis
 import inspect
+import logging
 import signal
 import threading
 import traceback
@@ -18,6 +19,8 @@ _OURS = (f"{_SERVICES}/worker/", f"{_SERVICES}/node/", f"{_SERVICES}/device.py")
 """Files whose frames are left out of the traceback that users see."""
 LONGEST = 2_000
 """Characters of a description: what an exception says may be as long as what it is about."""
+FRAMES, CHAIN = 50, 8
+"""Most frames of one traceback in the log, and most exceptions that led to one another."""
 _RAISE = dis.opmap["RAISE_VARARGS"]
 
 
@@ -69,6 +72,29 @@ def describe(fault: BaseException) -> str:
     ][-3:]
     places = " < ".join(f"{f.name} ({Path(f.filename).name}:{f.lineno})" for f in reversed(frames))
     return f"{type(fault).__name__}: {words_of(fault)}" + (f" in {places}" if places else "")
+
+
+def log_fault(log: logging.Logger, fault: BaseException, text: str, *arguments: Any) -> None:
+    """Log an error of the user's code with its traceback. Raise nothing: the exception comes from
+    code that may have used up the memory, or made its exceptions unreadable."""
+    try:
+        trace = _traceback(fault)
+    except Exception as worse:
+        trace = f"(its traceback cannot be had: {type(worse).__name__})"
+    log.error(f"{text}\n%s", *arguments, trace)
+
+
+def _traceback(fault: BaseException) -> str:
+    """The traceback of an exception after those of the exceptions that led to it, as Python prints
+    them, but with each message cut by `words_of`."""
+    parts: list[str] = []
+    found: BaseException | None = fault
+    while found is not None and len(parts) < CHAIN:
+        lines = traceback.format_tb(found.__traceback__, -FRAMES)
+        parts.append(f"{''.join(lines)}{type(found).__name__}: {words_of(found)}")
+        hidden = found.__suppress_context__
+        found = found.__cause__ if found.__cause__ is not None or hidden else found.__context__
+    return "\n-- then --\n".join(reversed(parts))
 
 
 def from_outside(fault: BaseException) -> bool:

@@ -16,9 +16,13 @@ import msgpack
 
 LARGEST = 64 << 20
 """Most bytes of one record, and of what waits to be read."""
-CHUNK = 1 << 18
+CHUNK = 1 << 16
+"""Bytes read at once."""
 _NUMBER = struct.Struct("=Q")
 
+_BUFFER = memoryview(bytearray(CHUNK))
+"""What all pipes of this process read into: what came is copied out before another one is read. A
+fresh buffer for each read would cost more than the read."""
 _ENDS: weakref.WeakSet[socket.socket] = weakref.WeakSet()
 """Sockets of this process that none that it forks may hold: the other side would take it for this
 one."""
@@ -77,9 +81,17 @@ class Pipe:
         """Send a list, or keep what does not fit for `flush`."""
         if _Copy.made:
             os._exit(0)
-        if not self.closed:
-            self._unsent += self._packer.pack(items)
-            self.flush()
+        if self.closed:
+            return
+        data = self._packer.pack(items)
+        if not self._unsent:
+            with contextlib.suppress(OSError):  # met again, and dealt with, by `flush`
+                sent = self.socket.send(data)
+                if sent == len(data):
+                    return
+                data = data[sent:]
+        self._unsent += data
+        self.flush()
 
     def flush(self) -> None:
         """Send what waits, as much as fits."""
@@ -102,21 +114,23 @@ class Pipe:
         with contextlib.suppress(BlockingIOError):
             while not self._ended:
                 try:
-                    data = self.socket.recv(CHUNK)
+                    count = self.socket.recv_into(_BUFFER)
                 except BlockingIOError:
                     raise
                 except OSError:
-                    data = b""
-                if not data:
+                    count = 0
+                if not count:
                     self.closed = self._ended = True
                     break
-                self._feed(data)
+                self._feed(_BUFFER[:count])
                 # Taken out before more is read: several large records that came together are more
                 # than its buffer holds.
                 items += [item for item in self._unpacker if isinstance(item, list)]
+                if count < CHUNK and not self.closed:
+                    break  # all that has come; the end of the pipe wakes its reader once more
         return items
 
-    def _feed(self, data: bytes) -> None:
+    def _feed(self, data: memoryview) -> None:
         try:
             self._unpacker.feed(data)
         except msgpack.BufferFull as fault:

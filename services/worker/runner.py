@@ -13,7 +13,12 @@ from petrobot.services.action import Cancelled, Result, Status
 from petrobot.services.comm.location_file import ActionEntry, resolve
 from petrobot.services.comm.protocol.messages import Executed
 from petrobot.services.comm.protocol.plain import plain
-from petrobot.services.worker.callables import check_arguments, describe, from_outside
+from petrobot.services.worker.callables import (
+    check_arguments,
+    describe,
+    from_outside,
+    log_fault,
+)
 from petrobot.services.worker.context import RunContext, checked_result
 from petrobot.services.worker.execution import Execution, Hung, Phase, Returned
 from petrobot.services.worker.outlets import Outlets
@@ -137,6 +142,8 @@ class Runner:
     def due(self) -> float | None:
         """When `advance` has something to do at the latest (s), None if only something that comes
         in can matter."""
+        if not self._runs:  # nor is a stream open
+            return None
         held = self._held_since is not None
         times = [] if held else [self._outlets.due()]
         times += [run.due() for run in self._runs.values() if not held or run.phase in _AFTER]
@@ -217,6 +224,7 @@ class Runner:
             arguments = plain({**entry.args, **begin.arguments}, "arguments")
             check_arguments(function, arguments)
         except ImportError as fault:
+            log_fault(_log, fault, "%s cannot be imported", entry.run)
             self._drop(run, "import_failed", f"{entry.run}: {fault}")
             return
         except (TypeError, ValueError) as fault:
@@ -263,7 +271,9 @@ class Runner:
                 if isinstance(fault, MemoryError):
                     cause = "out_of_memory"
                 self._give_up(now, run, cause, self._with_refusal(run, describe(fault)))
+                log_fault(_log, fault, "run %s of %s raised", run.begin.id, run.begin.action)
             elif not isinstance(fault, Cancelled):
+                log_fault(_log, fault, "run %s raised while it cleaned up", run.begin.id)
                 run.note(f"while it cleaned up: {describe(fault)}")
         if run.phase is Phase.STOPPING and run.over:
             run.phase = Phase.SETTLING

@@ -3,8 +3,9 @@ that cross a socket."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from operator import attrgetter
 from typing import Any, ClassVar
 
 from petrobot.services.comm.protocol.messages import Executed
@@ -167,14 +168,21 @@ _RECORDS: dict[str, type[Order] | type[Report]] = {
 }
 
 
+# Looking the fields up for each record took a third of the time that packing takes.
+_LENGTHS = {kind.KIND: 1 + len(fields(kind)) for kind in _RECORDS.values()}
+_VALUES: dict[str, Callable[[Order | Report], Any]] = {
+    kind.KIND: attrgetter("KIND", *(f.name for f in fields(kind))) for kind in _RECORDS.values()
+}
+
+
 def flat(record: Order | Report) -> list[Any]:
     """The record as a list that msgpack packs."""
-    return [record.KIND, *(getattr(record, f.name) for f in fields(record))]
+    return list(_VALUES[record.KIND](record))
 
 
 def record(items: list[Any]) -> Order | Report:
     """The record that `flat` made a list of. Raises ValueError for anything else."""
     kind = _RECORDS.get(items[0]) if items else None
-    if kind is None or len(items) != len(fields(kind)) + 1:
+    if kind is None or len(items) != _LENGTHS[kind.KIND]:
         raise ValueError(f"not a record: {items!r:.80}")
     return kind(*items[1:])

@@ -87,3 +87,19 @@ def test_the_stop_of_a_node_that_does_not_run_is_shown_too(
     assert main(["nodes", "--services", services, "--timeout", "0.2"]) == 3
     shown = capsys.readouterr().out
     assert "away" in shown and STOPPED in shown
+
+
+def test_the_log_of_a_node_is_printed_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the folder of logs; without a file there the answer says where to look."""
+    services = str(directory_in(tmp_path).source)
+    command = ["log", "robot", "--services", services, "--logs", str(tmp_path / "logs")]
+    assert main(command) == 2
+    assert "node robot has no log here" in capsys.readouterr().err
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "robot.log").write_text("12:00 INFO run r1 started\nits last word")
+    assert main(command) == 0
+    assert capsys.readouterr().out == "12:00 INFO run r1 started\nits last word\n"
+    assert main(["log", "robots", "--services", services]) == 2
+    assert "no run 'robots'" in capsys.readouterr().err

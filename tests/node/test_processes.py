@@ -164,14 +164,15 @@ def select_nothing() -> None:
 
 
 def start_node(name: str, file: Path, *options: str) -> subprocess.Popen[str]:
-    """Launch a node as a process."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "petrobot.services", name, "--services", str(file), *options],
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    """Launch a node as a process; its log is NAME.log beside the file."""
+    with (file.parent / f"{name}.log").open("a") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "petrobot.services", name, "--services", str(file), *options],
+            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{OUTSIDE}"},
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
 
 
 class Nodes:

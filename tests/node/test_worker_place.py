@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
-from functools import partial
 from itertools import pairwise, product
 from typing import Any
 
@@ -21,9 +20,11 @@ from petrobot.services.node.worker_host import (
     SILENT,
     START_LIMIT,
     Happening,
+    Hosting,
     Stage,
     WorkerPlace,
 )
+from petrobot.services.node.worker_pool import WorkerPool
 from petrobot.services.worker.pipe import NewestLink
 from petrobot.services.worker.process import (
     COMMAND,
@@ -60,12 +61,12 @@ class FakeChild:
     def __init__(
         self,
         setup: Setup,
-        heard: Callable[[Any, list[Any]], None],
+        heard: Callable[[Any, list[list[Any]]], None],
         ended: Callable[[Any], None],
         link: Any,
     ) -> None:
         self.setup = setup
-        self.say = partial(heard, self)
+        self._heard = heard
         self._ended = ended
         self.code: int | None = None
         self.closed = self.dead = False
@@ -78,6 +79,9 @@ class FakeChild:
         self.got: list[list[Any]] = []
         self.passed: list[socket.socket] = []
         self.killed = self.left = False
+
+    def say(self, items: list[Any]) -> None:
+        self._heard(self, [items])
 
     def post(self, items: list[Any]) -> None:
         self.got.append(items)
@@ -118,39 +122,30 @@ class KeepingChild(FakeChild):
     def _drop(self, end: socket.socket | None) -> None: ...
 
 
-class Bench:
-    """A place whose children are fake."""
+class HostBench:
+    """A host of runs whose processes are fake, on a clock of its own."""
 
-    def __init__(self, device: str = "arm", child: type[FakeChild] = FakeChild) -> None:
+    place: WorkerPlace | WorkerPool
+
+    def __init__(self, device: str, child: type[FakeChild] = FakeChild) -> None:
         self.child = child
         self.clock = Clock(100.0)
         self.children: list[FakeChild] = []
         self.wanted: list[str] = []
         self.reports: list[Any] = []
         setup = Setup("services.toml", "", "node", device)
-        self.place = WorkerPlace(
-            setup,
-            clock=self.clock,
-            changed=lambda: None,
-            wanted=self.wanted.append,
-            spawn=self._spawn,
+        self.hosting = Hosting(
+            setup, self.clock, lambda: None, self.wanted.append, spawn=self._spawn
         )
-        self.place.start()
 
     def _spawn(self, *arguments: Any) -> Any:
         self.children.append(self.child(*arguments))
         return self.children[-1]
 
-    def cyclic(self) -> tuple[FakeChild, FakeChild]:
-        """Bring up driver and actions of a cyclic device."""
-        self.children[-1].ready(0.004, points=4711)
-        self.children[-1].ready()
-        return self.children[-2], self.children[-1]
-
     def begin(self, identity: str = "r", deadline: float | None = None) -> None:
         self.place.take(self.clock.now, Begin(identity, "act", {}, deadline))
 
-    def run(self, seconds: float) -> list[Any]:
+    def run(self, seconds: float = 0.0) -> list[Any]:
         """Advance exactly when it says that it is due, as the shell does."""
         until, fresh = self.clock.now + seconds, []
         limit = Limit("nothing more to be due", steps=100_000)
@@ -164,6 +159,23 @@ class Bench:
         self.clock.now = max(until, self.clock.now)
         self.reports += fresh
         return fresh
+
+
+class Bench(HostBench):
+    """A place of one device whose processes are fake."""
+
+    place: WorkerPlace
+
+    def __init__(self, device: str = "arm", child: type[FakeChild] = FakeChild) -> None:
+        super().__init__(device, child)
+        self.place = WorkerPlace(self.hosting)
+        self.place.start()
+
+    def cyclic(self) -> tuple[FakeChild, FakeChild]:
+        """Bring up driver and actions of a cyclic device."""
+        self.children[-1].ready(0.004, points=4711)
+        self.children[-1].ready()
+        return self.children[-2], self.children[-1]
 
     def ended(self, identity: str = "r") -> Ended:
         (end,) = [r for r in self.reports if isinstance(r, Ended) and r.id == identity]

@@ -3,40 +3,24 @@ go, and every run ends once."""
 
 from __future__ import annotations
 
-from typing import Any
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from petrobot.services.node.worker_pool import IDLE_LIMIT, KEPT, WorkerPool
-from petrobot.services.worker.process import COMMAND, STREAM_AT, WANTED, Setup
+from petrobot.services.worker.process import COMMAND, STREAM_AT, WANTED
 from petrobot.services.worker.runs import Answered, Asked, Begin, Ended, Hold, Stop, Told, flat
-from tests.node.conftest import Clock
-from tests.node.test_worker_place import FakeChild
-from tests.waiting import Limit
+from tests.node.test_worker_place import FakeChild, HostBench
 
 
-class Pool:
+class Pool(HostBench):
     """A pool whose workers are fake."""
 
-    def __init__(self, most: int = 4) -> None:
-        self.clock = Clock(100.0)
-        self.children: list[FakeChild] = []
-        self.wanted: list[str] = []
-        self.reports: list[Any] = []
-        self.pool = WorkerPool(
-            Setup("services.toml", "", "node", ""),
-            clock=self.clock,
-            changed=lambda: None,
-            wanted=self.wanted.append,
-            spawn=self._spawn,
-            most=most,
-        )
-        self.pool.start()
+    place: WorkerPool
 
-    def _spawn(self, *arguments: Any) -> Any:
-        self.children.append(FakeChild(*arguments))
-        return self.children[-1]
+    def __init__(self, most: int = 4) -> None:
+        super().__init__("")
+        self.place = WorkerPool(self.hosting, most)
+        self.place.start()
 
     def living(self) -> list[FakeChild]:
         return [child for child in self.children if not child.dead]
@@ -44,9 +28,6 @@ class Pool:
     def make_ready(self) -> None:
         for child in self.living():
             child.ready()
-
-    def begin(self, identity: str, deadline: float | None = None) -> None:
-        self.pool.take(self.clock.now, Begin(identity, "act", {}, deadline))
 
     def of(self, identity: str) -> FakeChild:
         """The worker that was given a run."""
@@ -57,22 +38,8 @@ class Pool:
         ]
         return child
 
-    def run(self, seconds: float = 0.0) -> list[Any]:
-        until, fresh = self.clock.now + seconds, []
-        limit = Limit("the pool to rest", steps=10_000)
-        while limit.left():
-            self.pool.advance(self.clock.now)
-            fresh += self.pool.reports()
-            due = self.pool.due()
-            if due is None or due > until:
-                break
-            self.clock.now = max(due, self.clock.now + 1e-6)
-        self.clock.now = max(until, self.clock.now)
-        self.reports += fresh
-        return fresh
-
     def answer(self, verb: str) -> Told | None:
-        self.pool.command(self.clock.now, verb, verb)
+        self.place.command(self.clock.now, verb, verb)
         return next((report for report in self.run() if isinstance(report, Told)), None)
 
 
@@ -124,11 +91,11 @@ def test_idle_workers_retire_but_a_few() -> None:
     bench.run(2.0)
     left = [child for child in bench.children if child.left]
     assert len(bench.children) - len(left) == KEPT and not bench.children[0].left
-    assert len(bench.pool.children()) == len(bench.children), "the node waits for those, too"
+    assert len(bench.place.children()) == len(bench.children), "the node waits for those, too"
     for child in left:
         child.die(0)
     bench.run()
-    assert len(bench.pool.children()) == KEPT
+    assert len(bench.place.children()) == KEPT
 
 
 def test_answers_and_addresses_go_to_the_worker_that_asked() -> None:
@@ -141,8 +108,8 @@ def test_answers_and_addresses_go_to_the_worker_that_asked() -> None:
     b.say(flat(Asked("b", "b/1", "service")))
     b.say([WANTED, "points"])
     bench.run()
-    bench.pool.take(0.0, Answered("b/1", "success"))
-    bench.pool.stream_at("points", "h", 1, "t")
+    bench.place.take(0.0, Answered("b/1", "success"))
+    bench.place.stream_at("points", "h", 1, "t")
     assert bench.wanted == ["points"]
     assert b.got[-2:] == [flat(Answered("b/1", "success")), [STREAM_AT, "points", "h", 1, "t"]]
     assert not [items for items in a.got if items[0] in (STREAM_AT, "answered")]
@@ -192,7 +159,7 @@ def test_every_run_ends_once_and_the_pool_takes_runs_again(acts: list[tuple[str,
             begun.append(f"r{len(begun)}")
             bench.begin(begun[-1], 5.0)
         elif act == "stop" and begun:
-            bench.pool.take(bench.clock.now, Stop(begun[number % len(begun)]))
+            bench.place.take(bench.clock.now, Stop(begun[number % len(begun)]))
         elif act == "end" and child:
             for order in child.orders():
                 if isinstance(order, Begin):
@@ -203,14 +170,14 @@ def test_every_run_ends_once_and_the_pool_takes_runs_again(acts: list[tuple[str,
             bench.make_ready()
         elif act in ("hold", "release", "stop all"):
             verb = act.partition(" ")[0]
-            bench.pool.command(bench.clock.now, verb, verb)
+            bench.place.command(bench.clock.now, verb, verb)
             for each in living:
                 if [COMMAND, verb, verb] in each.got:
                     each.say(flat(Told(verb, "held" if verb == "hold" else "done")))
         elif act == "wait":
             bench.run(1.0)
         bench.run()
-    bench.pool.command(bench.clock.now, "last release", "release")
+    bench.place.command(bench.clock.now, "last release", "release")
     for _ in range(30):
         for each in bench.living():
             if each.killed or each.left:
@@ -219,6 +186,6 @@ def test_every_run_ends_once_and_the_pool_takes_runs_again(acts: list[tuple[str,
         bench.run(2.0)
     ends = [report.id for report in bench.reports if isinstance(report, Ended)]
     assert sorted(ends) == sorted(begun)
-    assert bench.pool.ready and bench.pool.condition == ("up", "")
+    assert bench.place.ready and bench.place.condition == ("up", "")
     bench.begin("last")
     assert bench.of("last") in bench.living()

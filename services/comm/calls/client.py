@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import logging
 import os
 import random
 import socket
@@ -39,6 +40,8 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.security import UNPROVEN, Keys
 from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError, Side
+
+_log = logging.getLogger(__name__)
 
 OnNotices = Callable[[float, list[Notice]], None]
 NOT_TRUSTED = (
@@ -327,6 +330,7 @@ class Client:
 
     def welcomed(self, now: float, link: _ClientLink, welcome: Welcome) -> None:
         """The peer welcomed a connection."""
+        _log.info("link to %s is up", self.caller.peer)
         self._link = link
         self._up.set()
         self.caller.link_up(now, welcome)
@@ -337,6 +341,8 @@ class Client:
             # In TLS 1.3 the client's handshake ends before the server has checked its certificate.
             link.reason += f"; {NOT_TRUSTED}"
         self.trouble = link.reason
+        level = logging.INFO if link.welcome else logging.DEBUG  # one try after the other may fail
+        _log.log(level, "link to %s is lost: %s", self.caller.peer, link.reason)
         if self._link is link:
             self._link = None
         self._up.clear()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import logging
 import secrets
 import socket
 import time
@@ -27,6 +28,8 @@ from petrobot.services.comm.protocol.messages import (
 )
 from petrobot.services.comm.protocol.security import NONCE_BYTES, Keys
 from petrobot.services.comm.protocol.wire import Connection, ConnectionState, ProtocolError, Side
+
+_log = logging.getLogger(__name__)
 
 READ_BUFFER = 1 << 16
 """Most bytes read at once. They are decoded before another connection is read; in the worst case
@@ -206,6 +209,9 @@ class AsyncLink(asyncio.BufferedProtocol):
         except ProtocolError as fault:
             self._refuse(now, fault)
             return
+        if _log.isEnabledFor(logging.DEBUG):  # kinds and ids alone: results may hold tickets
+            named = [f"{type(one).__name__} {getattr(one, 'id', '')}" for one in messages]
+            _log.debug("received %d bytes: %s", nbytes, ", ".join(named))
         self._unheard += nbytes
         if messages or self._unheard >= HEARD:
             self._heart.heard = now

@@ -13,6 +13,7 @@ Inline services (`Offer.inline`) are answered inside the loop; all other calls b
 from __future__ import annotations
 
 import asyncio
+import logging
 import ssl
 from collections import OrderedDict
 from collections.abc import Callable
@@ -35,6 +36,8 @@ from petrobot.services.comm.protocol.wire import ConnectionState, ProtocolError,
 from petrobot.services.comm.tls.credentials import may_speak_as, name_on
 from petrobot.services.comm.tls.expiry import DAY, look_again
 from petrobot.services.comm.tls.listener import Admission, TlsListener
+
+_log = logging.getLogger(__name__)
 
 # Limits of a listening end (sans-I/O): failed handshakes per address, messages per caller.
 
@@ -403,6 +406,7 @@ class Server:
         self._opening.pop(link, None)
         older = self._links.get(link.peer)
         self._links[link.peer] = link
+        _log.info("link of %s (%s) is up", link.peer, link.address)
         if older is not None:
             older.cut("a newer connection of its name took its place")
 
@@ -421,6 +425,8 @@ class Server:
 
     def gone(self, link: _ServerLink, now: float) -> None:
         """A connection has ended."""
+        level = logging.INFO if link.peer else logging.DEBUG  # strangers must not fill the log
+        _log.log(level, "link of %s (%s) is lost: %s", link.peer, link.address, link.reason)
         if link in self._opening:
             self.failed(link.address)
         self._all.discard(link)
