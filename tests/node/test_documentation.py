@@ -1,4 +1,5 @@
-"""What docs/actions.md tells newcomers is true: its files are written out and run."""
+"""What docs/actions.md and docs/drivers.md tell newcomers is true: their files are written out and
+run."""
 
 from __future__ import annotations
 
@@ -18,15 +19,14 @@ from petrobot.services.scripted import load as load_script
 from tests.node.test_lockstep import Coordinator
 
 ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "actions.md"
+PAGES = [ROOT / "docs" / "actions.md", ROOT / "docs" / "drivers.md"]
 
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with all files of the page."""
-    blocks = re.findall(
-        r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
-    )
+    """A folder with all files of the pages."""
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    blocks = re.findall(r"```(?:python|toml)\n# file: (\S+)\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 6
     for name, text in blocks:
         path = tmp_path / name
