@@ -270,7 +270,7 @@ def _had(what: str) -> Iterator[None]:
     except OSError as fault:
         why = os.strerror(fault.errno) if fault.errno else str(fault)
         raise LaboratoryError(
-            f"{what}: {why}; end the process that listens there, or use another port"
+            f"{what}: {why}; end the process that listens there, or write another port"
         ) from fault
 
 

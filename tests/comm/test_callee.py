@@ -404,7 +404,7 @@ def test_reports_about_what_does_not_go_on_are_the_nodes_own_fault() -> None:
         callee.feedback(0.0, "1", 0.5)
     with pytest.raises(ValueError, match="no active run"):
         callee.raise_event(0.0, "lost", run="1")
-    with pytest.raises(ValueError, match="nobody waits"):
+    with pytest.raises(ValueError, match="waits for an answer"):
         callee.answer(0.0, "k1", True)
 
 

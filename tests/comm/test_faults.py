@@ -91,7 +91,7 @@ async def test_a_node_that_is_lost_is_named_and_its_run_ends_once_with_unknown(
         assert any(one in lost.reason for one in says), lost.reason
         ended = (await told.until(CallEnded)).outcome
         assert (ended.status, ended.cause, ended.executed) == ("error", "lost", Executed.UNKNOWN)
-        assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
+        assert told.order() == ["PeerBack", "CallAccepted", "PeerLost", "CallEnded"]
         await told.client.close()
         cable.close()
 
@@ -111,7 +111,7 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         "lost",
         Executed.UNKNOWN,
     ) and "nothing listens" in ended.text
-    assert told.order() == ["PeerBack", "Accepted", "PeerLost", "Ended"]
+    assert told.order() == ["PeerBack", "CallAccepted", "PeerLost", "CallEnded"]
     told.caller.call(told.client.now(), m.Call("2", "move"))
     told.client.flush()
     late = (await told.until(CallEnded, 2)).outcome
@@ -124,7 +124,7 @@ async def test_the_run_of_a_killed_node_ends_as_soon_as_its_port_refuses() -> No
         told.client.flush()
         await told.until(CallAccepted, 2)
         await told.client.close()
-    assert told.order().count("Ended") >= 2, (
+    assert told.order().count("CallEnded") >= 2, (
         "the first two once each; the third goes on until its caller leaves"
     )
 
@@ -140,7 +140,7 @@ async def test_a_broken_link_to_a_node_that_lives_keeps_its_run() -> None:
             told.client._link.cut("a fault")
             back = await told.until(PeerBack, number)
             assert back.same_boot and back.runs == ("1",)
-        assert "Ended" not in told.order()
+        assert "CallEnded" not in told.order()
         await told.client.close()
 
 
@@ -157,7 +157,7 @@ async def test_a_node_that_thaws_is_back_and_stops_the_run_that_was_given_up() -
         assert (late.id, late.cause, late.executed) == ("1", "cancelled", Executed.YES), (
             "recorded, and moves nothing"
         )
-        assert told.order().count("Ended") == 1
+        assert told.order().count("CallEnded") == 1
         await told.client.close()
 
 

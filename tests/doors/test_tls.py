@@ -105,7 +105,7 @@ async def test_older_tls_is_refused(victim: Start, certificates: Path) -> None:
     old.maximum_version = ssl.TLSVersion.TLSv1_2
     client = server.client(tls=old)
     assert (await outcome_of(client)).status == "error"
-    assert "it takes TLS 1.3" in client.trouble
+    assert "only accepts TLS 1.3" in client.trouble
 
 
 async def test_a_node_cannot_stand_in_for_another(

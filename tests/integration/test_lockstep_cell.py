@@ -77,7 +77,7 @@ def test_a_third_node_changes_nothing(usual: dict[str, Any], tmp_path: Path) -> 
     coordinator, five processes."""
     edits = {
         '[timers.image_tick]\nnode = "vision"': '[timers.image_tick]\nnode = "desk"',
-        'memory.compare_and_set, memory.list\nnode = "vision"': 'memory.compare_and_set, memory.list\nnode = "desk"',
+        '[services.memory]\nnode = "vision"': '[services.memory]\nnode = "desk"',
     }
     assert run(services_file(tmp_path, edits=edits, more=DESK), "--processes", "0") == usual
 

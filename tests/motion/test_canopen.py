@@ -84,7 +84,7 @@ def test_mapping_is_written_in_the_order_of_the_standard() -> None:
 @given(st.integers(0x081, 0x0FF), st.binary(max_size=8))
 def test_emergencies_come_back_or_are_refused(cob_id: int, data: bytes) -> None:
     if len(data) != 8:
-        with pytest.raises(ValueError, match="no emergency"):
+        with pytest.raises(ValueError, match="not an emergency"):
             canopen.parse_emergency(Frame(cob_id, data))
         return
     message = canopen.parse_emergency(Frame(cob_id, data))

@@ -224,8 +224,12 @@ async def test_an_action_that_looks_decides_itself(operator: Operator) -> None:
 
 
 async def test_nodes_shows_what_was_refused_and_missed(
-    node: OneNode, operator: Operator, capsys: pytest.CaptureFixture[str]
+    node: OneNode,
+    operator: Operator,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "400")  # no line of the table is broken, whatever the counts
     for number in range(3):
         await operator.call("good", None, send=[{"odd": number}], seconds=0.05, look=True)
     slow = await operator.call("good", None, send=[{"block": 1.3}], seconds=2.0)

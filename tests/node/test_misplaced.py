@@ -17,12 +17,12 @@ SHIPPED = Path(__file__).parents[2] / "services.toml"
 VISION = 'host = "127.0.0.1"\nport = 7301'
 NO_KEY = "can be reached by other hosts, and there is no key; make one with `petrobot keys`"
 MISTAKES: list[tuple[str, str, str]] = [
-    ("port = 7301", "port = 7301.0", ":20: nodes.vision.port: is 7301.0; write a port"),
-    ("port = 7301", 'port = "7301"', ":20: nodes.vision.port: is '7301'; write a port"),
+    ("port = 7301", "port = 7301.0", ":23: nodes.vision.port: is 7301.0; write a port"),
+    ("port = 7301", 'port = "7301"', ":23: nodes.vision.port: is '7301'; write a port"),
     (
         "port = 7302",
         "port = 7301",
-        ":24: nodes.motion.port: 127.0.0.1:7301 is already node 'vision''s",
+        ":28: nodes.motion.port: 127.0.0.1:7301 is already node 'vision''s",
     ),
     (
         "port = 7302",
@@ -32,113 +32,113 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "schema = 1",
         "schema = 1\n[coordinator]\nport = 7301",
-        ":10: coordinator.port: 127.0.0.1:7301 is already node 'vision''s",
+        ":11: coordinator.port: 127.0.0.1:7301 is already node 'vision''s",
     ),
     (
         VISION,
         'host = "127.0.0.1:7301"\nport = 7301',
-        ":19: nodes.vision.host: is '127.0.0.1:7301'; write a host name or address",
+        ":22: nodes.vision.host: is '127.0.0.1:7301'; write a host name or address",
     ),
     (
         VISION,
         'host = "300.1.2.3"\nport = 7301',
-        ":19: nodes.vision.host: is '300.1.2.3'; write a host name or address",
+        ":22: nodes.vision.host: is '300.1.2.3'; write a host name or address",
     ),
     (
         VISION,
         'host = "the vision pc"\nport = 7301',
-        ":19: nodes.vision.host: is 'the vision pc'; write a host name",
+        ":22: nodes.vision.host: is 'the vision pc'; write a host name",
     ),
-    (VISION, 'host = "192.168.1.5"\nport = 7301', f":19: nodes.vision.host: 192.168.1.5 {NO_KEY}"),
-    (VISION, 'host = "vision-pc"\nport = 7301', f":19: nodes.vision.host: vision-pc {NO_KEY}"),
+    (VISION, 'host = "192.168.1.5"\nport = 7301', f":22: nodes.vision.host: 192.168.1.5 {NO_KEY}"),
+    (VISION, 'host = "vision-pc"\nport = 7301', f":22: nodes.vision.host: vision-pc {NO_KEY}"),
     (
         "schema = 1",
         'schema = 1\n[keys]\nfile = "lost.key"',
-        ":10: keys.file: {folder}/lost.key is not there; make it with `petrobot keys`",
+        ":11: keys.file: {folder}/lost.key is not there; make it with `petrobot keys`",
     ),
     (
         "schema = 1",
         'schema = 1\n[keys]\nshared = "cell.key"',
-        ':10: keys.shared: unknown; write file = "cell.key"',
+        ':11: keys.shared: unknown; write file = "cell.key"',
     ),
     (
         "[actions.locate_mog2]",
         "[actions.locate_background]",
-        ":71: actions.locate_background: is placed twice",
+        ":82: actions.locate_background: is placed twice",
     ),
     (
         'device = "camera"',
         'device = "camera"\nnode = "motion"',
-        ":69: actions.locate_background.node: is on two nodes",
+        ":80: actions.locate_background.node: is on two nodes",
     ),
-    ('device = "camera"', "", ":65: actions.locate_background: is on no node; write device"),
+    ('device = "camera"', "", ":76: actions.locate_background: is on no node; write device"),
     (
         'device = "camera"',
         'device = "camra"',
-        ":68: actions.locate_background.device: no device is named 'camra'; did you mean 'camera'?",
+        ":79: actions.locate_background.device: no device is named 'camra'; did you mean 'camera'?",
     ),
     (
         "vision.camera:Camera",
         "vision.camera:Kamera",
-        ":31: devices.camera.driver: 'petrobot.services.vision.camera' has no 'Kamera'; did "
+        ":36: devices.camera.driver: 'petrobot.services.vision.camera' has no 'Kamera'; did "
         "you mean 'Camera'?",
     ),
     (
         "vision.camera:Camera",
         "vison.camera:Camera",
-        ":31: devices.camera.driver: cannot find 'petrobot.services.vison.camera'",
+        ":36: devices.camera.driver: cannot find 'petrobot.services.vison.camera'",
     ),
     (
         "petrobot.services.vision.camera:Camera",
         "our_lab_camera:Camera",
-        ":31: devices.camera.driver: no module 'our_lab_camera' on this host; install",
+        ":36: devices.camera.driver: no module 'our_lab_camera' on this host; install",
     ),
     (
         "motion.arm:Arm",
         "motion.arm.Arm",
-        ":38: devices.arm.driver: is 'petrobot.services.motion.arm.Arm'; write an import "
+        ":44: devices.arm.driver: is 'petrobot.services.motion.arm.Arm'; write an import "
         'path "module:Class"',
     ),
     (
         "actions:locate_background",
         "actions:locate_backgroud",
-        ":66: actions.locate_background.run: 'petrobot.services.vision.actions' has no",
+        ":77: actions.locate_background.run: 'petrobot.services.vision.actions' has no",
     ),
     (
         "laboratory:make_laboratory",
         "laboratory:make_lab",
-        ":16: nodes.laboratory.sim: 'petrobot.sim.catching.laboratory' has no 'make_lab'",
+        ":19: nodes.laboratory.sim: 'petrobot.sim.catching.laboratory' has no 'make_lab'",
     ),
     (
         "deadline = 10.0",
         'deadline = "10 s"',
-        ":69: actions.locate_background.deadline: is '10 s'; write a number of seconds above 0",
+        ":80: actions.locate_background.deadline: is '10 s'; write a number of seconds above 0",
     ),
     (
         "deadline = 12.0",
         "args = { margn = 5 }",
-        ":131: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did "
+        ":142: actions.follow_and_wait.args: follow_and_wait has no argument 'margn'; did "
         "you mean 'margin'?",
     ),
     (
         "deadline = 10.0",
         "args = 5",
-        ":69: actions.locate_background.args: is 5; write a table of arguments",
+        ":80: actions.locate_background.args: is 5; write a table of arguments",
     ),
     (
         'to = "arm"',
         'to = "army"',
-        ":49: streams.catch_point.to: no device is named 'army'; did you mean 'arm'?",
+        ":55: streams.catch_point.to: no device is named 'army'; did you mean 'arm'?",
     ),
     (
         "period = 0.02 ",
         "period = 0 ",
-        ":50: streams.catch_point.period: is 0; write a number of seconds above 0",
+        ":56: streams.catch_point.period: is 0; write a number of seconds above 0",
     ),
     (
         "period = 0.04 ",
         "perid = 0.04 ",
-        ":57: timers.image_tick.perid: unknown key; did you mean 'period'?",
+        ":64: timers.image_tick.perid: unknown key; did you mean 'period'?",
     ),
     (
         "[services.memory]",
@@ -148,10 +148,10 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         'cell = "services/cell.toml"',
         'cell = "our_cell.toml"',
-        ":166: parameters.cell: {folder}/our_cell.toml is not there; write the path",
+        ":178: parameters.cell: {folder}/our_cell.toml is not there; write the path",
     ),
-    ("[nodes.vision]", "[node.vision]", ":18: node: unknown table; did you mean 'nodes'?"),
-    ("[nodes.vision]", "[nodes.vision", ":18: not valid TOML"),
+    ("[nodes.vision]", "[node.vision]", ":21: node: unknown table; did you mean 'nodes'?"),
+    ("[nodes.vision]", "[nodes.vision", ":21: not valid TOML"),
 ]
 
 

@@ -75,7 +75,7 @@ class CycleBench:
 
     def __init__(self, kind: type[ServoDrive], monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
-            patch.setattr(drives, "Drive", kind)
+            patch.setattr(drives, "ServoDrive", kind)
             self.bus = DriveBus(Joints(), [DriveRating(40.0, 2.0, 1.0)] * 6)
         self.now, self.sent, self.targets = 0.0, list[Frame](), [0.0] * 6
         for node in range(1, 7):

@@ -230,7 +230,7 @@ def test_an_address_in_use_is_reported_with_file_address_and_remedy(
     assert (
         f"python -m petrobot.sim: {file}: " in said
         and str(port) in said
-        and "or use another port" in said
+        and "or write another port" in said
     )
 
 
