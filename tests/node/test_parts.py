@@ -529,7 +529,7 @@ def test_a_rehearsal_shows_what_is_provisional_and_what_was_judged() -> None:
     async def act(ctx: Context, run: str) -> Result:
         await ctx.sleep(0.1)
         ctx.verdict(run, Status.FAILURE, "crooked")
-        with pytest.raises(ValueError, match="pass ctx.run of the run's own context"):
+        with pytest.raises(ValueError, match=r"pass ctx\.run of the run's own context"):
             ctx.verdict("pick#1", Status.FAILURE)
         with pytest.raises(ValueError, match="good"):
             ctx.verdict(run, "good")  # type: ignore[arg-type]

@@ -162,7 +162,7 @@ def flush_all(pipe: Pipe) -> None:
     ids=["large", "many containers", "long name", "half a letter"],
 )
 async def test_a_call_that_cannot_be_sent_never_leaves(
-    operator: Operator, service: str, arguments: Any
+    operator: Operator, node: OneNode, service: str, arguments: Any
 ) -> None:
     client = operator.clients["only"]
     innocent = asyncio.create_task(operator.call("nap", None, seconds=0.1))
@@ -172,7 +172,8 @@ async def test_a_call_that_cannot_be_sent_never_leaves(
         "unencodable",
     ), end
     assert (await innocent).status == "success"
-    assert not [notice for notice in operator.notices if isinstance(notice, PeerLost)]
+    lost = [notice for notice in operator.notices if isinstance(notice, PeerLost)]
+    assert not lost, node.log.read_text()[-3000:]
 
 
 # --- the same rules at both ends --------------------------------------------------------------

@@ -404,6 +404,6 @@ def test_a_run_that_was_sure_or_never_executed_is_not_to_be_judged() -> None:
     "run", ["", "work#1", "m/work", "m/work#1/2", "m/#1", "m" * 255 + "/a#1", None, 7]
 )
 def test_what_is_no_runs_id_is_refused_where_it_is_said(run: Any) -> None:
-    with pytest.raises(ValueError, match="pass ctx.run of the run's own context"):
+    with pytest.raises(ValueError, match=r"pass ctx\.run of the run's own context"):
         mission_of(run)
     assert mission_of("catch_ball/5/locate_ball#3") == "catch_ball/5"
