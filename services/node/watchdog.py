@@ -49,7 +49,7 @@ class Watchdog:
         """Odd while a step is being taken."""
         self._thread: threading.Thread | None = None
         self._over = threading.Event()
-        self._watched = 0
+        self._watched = self._clock = 0
         self._seen, self._used, self._before, self._attempts = 0, 0.0, 0.0, 0
 
     def begin(self) -> None:
@@ -62,6 +62,8 @@ class Watchdog:
             )
             self._thread.start()
         self._watched = threading.get_ident()
+        # Asked for by the thread itself: of a thread that has ended it would crash the process.
+        self._clock = time.pthread_getcpuclockid(self._watched)
         self._step += 1
 
     def end(self) -> None:
@@ -74,7 +76,7 @@ class Watchdog:
 
     def look(self) -> None:
         """Interrupt the step if it has taken too long."""
-        now = _processor_time(self._watched)
+        now = _processor_time(self._clock)
         if self._step != self._seen or self._seen % 2 == 0:
             self._seen, self._used, self._attempts = self._step, 0.0, 0
         else:
@@ -149,10 +151,10 @@ _OWN = frozenset(
 )
 
 
-def _processor_time(thread: int) -> float:
-    """Seconds of processor time that a thread has used."""
+def _processor_time(clock: int) -> float:
+    """Return the seconds of processor time that the thread of this clock has used."""
     try:
-        return time.clock_gettime(time.pthread_getcpuclockid(thread))
+        return time.clock_gettime(clock)
     except OSError:  # it has ended
         return 0.0
 

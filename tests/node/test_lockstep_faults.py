@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from petrobot.services.comm.location_file import ActionEntry
 from petrobot.services.node import watchdog
 from petrobot.services.node.inline_host import InlinePlace
+from petrobot.services.node.watchdog import Watchdog
 from petrobot.services.worker.runs import Begin, Ended, Told
 from tests.node.conftest import OUTSIDE, Clock
 from tests.node.test_heard import FAULTS
@@ -246,3 +248,19 @@ def test_ctrl_c_of_a_person_is_not_taken_for_the_actions(by: str) -> None:
             )
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_a_thread_that_has_ended_crashes_nothing() -> None:
+    """The processor clock of a thread that is gone may only be read, not asked for."""
+    watched = Watchdog("only")
+
+    def step() -> None:
+        watched.begin()
+        watched.end()
+
+    for _ in range(20):
+        thread = threading.Thread(target=step)
+        thread.start()
+        thread.join()
+        watched.look()
+    watched.close()
